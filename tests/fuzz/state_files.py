@@ -24,6 +24,7 @@ from fogft.cli import main
 from fogft.cloud.local import faults
 from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.sky.journal import Entry, Journal
+from fogft.cloud.sky.wheel import LockFolder, Locks
 from fogft.errors import FogftError
 from fogft.model.credentials import Role
 from fogft.model.membership import to_dict
@@ -132,6 +133,10 @@ def _files() -> Mapping[str, tuple[Path, bytes, Callable[[], object]]]:
     journal.open(Entry(ID, PLACE, 0.1, "0" * 16, time.time()), {})
     (entry,) = (home / "sky").glob("*.json")
     found["journal of SkyPilot"] = entry, entry.read_bytes(), journal.entries
+    locks = LockFolder(home / "locks", lambda wheel: Locks({"requirements.txt": "rich==1"}))
+    locks.of("generation", home)
+    (lock,) = (home / "locks").glob("*.json")
+    found["lock of VMs"] = lock, lock.read_bytes(), lambda: locks.of("generation", home)
     spot = home / "traces"
     disk.make_folder(spot)
     zone = spot / "us-west-2b.json"

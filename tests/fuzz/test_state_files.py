@@ -16,7 +16,8 @@ CASES = by_day(12, at_night=2000)
 FILES = (
     "status.json", "proxy-status.json", "pool.json", "intent.json", "trial.json", "membership.json",
     "lease.json", "discovered.json", "records.json", "history.jsonl", "spec.yaml", "issued.json",
-    "latency.json", "claims.json", "faults.json", "journal of SkyPilot", "trace",
+    "latency.json", "claims.json", "faults.json", "journal of SkyPilot", "lock of VMs",
+    "trace",
 )  # fmt: skip
 
 

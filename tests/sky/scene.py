@@ -9,6 +9,7 @@ from typing import Any
 from fogft.cloud.port import Launch
 from fogft.cloud.sky.adapter import SkyCloud
 from fogft.cloud.sky.naming import cluster_name
+from fogft.cloud.sky.wheel import Locks
 from fogft.model.replica import Machine, Placement, ReplicaId
 from tests.sky.scripted_sky import EAST, ScriptedProvider, ScriptedSky, replica
 
@@ -26,6 +27,7 @@ class Scene:
         self._with_provider = with_provider
         self.pending_work: list[Callable[[], None]] = []
         self.repeated_work: list[Callable[[], bool]] = []
+        self.make_lock: Callable[[Path], Locks] = lambda wheel: Locks({})
         self.cloud = self.another_process()
 
     def another_process(self) -> SkyCloud:
@@ -41,6 +43,7 @@ class Scene:
             repeat=lambda step: self.repeated_work.append(step),
             sleep=self.pass_s,
             make_wheel=lambda folder: folder,
+            make_lock=self.make_lock,
         )
 
     def pass_s(self, seconds: float) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.following import ASK_LIMIT_S, JOB_PAUSE_S, LAUNCH_LIMIT_S
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
+from fogft.cloud.sky.wheel import Locks
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
@@ -717,6 +719,47 @@ def test_what_a_machine_need_not_have_is_told(scene: Scene):
     assert scene.cloud.exposures(["gcp"], open_port=None) == [files], "of the clouds asked about"
     scene.sky.uploaded = None
     assert "the API server elsewhere decides" in scene.cloud.exposures(["gcp"], open_port=None)[0]
+
+
+# -- what a machine installs -------------------------------------------------------------------
+
+
+def no_index(wheel: Path) -> Locks:
+    raise CloudError("nobody answers")
+
+
+def resolves(version: str) -> Callable[[Path], Locks]:
+    return lambda wheel: Locks({"requirements.txt": f"rich=={version}"})
+
+
+def test_a_generation_keeps_its_lock_and_the_next_one_gets_what_up_made_last(scene: Scene):
+    """Also in another process, and where no index can be reached any more."""
+    scene.make_lock = resolves("1")
+    cloud = scene.another_process()
+    assert cloud.exposures(["aws"], open_port=None) == []
+    cloud.launch(scene.order())
+    scene.make_lock = resolves("2")
+    cloud = scene.another_process()
+    assert cloud.exposures(["aws"], open_port=None) == []
+    cloud.launch(scene.order(replica(1)))
+    scene.make_lock = no_index
+    cloud = scene.another_process()
+    assert cloud.exposures(["aws"], open_port=None) == []
+    cloud.launch(scene.order(replica(2), spec_hash="next"))
+    locks = [cloud.journal.files(replica(slot)) / "requirements.txt" for slot in range(3)]
+    assert [one.read_text() for one in locks] == ["rich==1", "rich==1", "rich==2"]
+
+
+def test_without_an_index_it_is_told_and_a_whole_generation_has_no_lock(scene: Scene):
+    scene.make_lock = no_index
+    cloud = scene.another_process()
+    [told] = cloud.exposures(["aws"], open_port=None)
+    assert told == "each VM chooses what fogft needs itself, unlocked: nobody answers"
+    cloud.launch(scene.order())
+    scene.make_lock = resolves("1")
+    cloud = scene.another_process()
+    cloud.launch(scene.order(replica(1)))
+    assert not list((scene.folder / "state").rglob("requirements*.txt"))
 
 
 # -- who may connect ----------------------------------------------------------------------------

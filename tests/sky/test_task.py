@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
 import subprocess
 import sys
@@ -258,6 +260,48 @@ def test_what_setup_installs_with_pip_is_there_for_run_and_for_the_server_proxy(
     seen = "python3 -c 'import rclpy, userlib; print(\"run finds\", userlib.version)'\nexec ~/"
     done = on_skypilot(new_vm, run.replace("exec ~/", seen))
     assert done.stdout.splitlines() == ["run finds 1.0", "the proxy finds 1.0"], done.stderr
+
+
+def lock(home: Path, **versions: str) -> None:
+    """Write the lock for a machine without ROS 2: these wheels of the index, with their hashes."""
+    entries = []
+    for name, version in versions.items():
+        content = (home / f"index/{name}-{version}-py3-none-any.whl").read_bytes()
+        entries.append(f"{name}=={version} ; python_version >= '3.10' \\\n"
+                       f"    --hash=sha256:{hashlib.sha256(content).hexdigest()}\n")  # fmt: skip
+    (home / ".fogft/replica").mkdir(parents=True, exist_ok=True)
+    (home / ".fogft/replica/requirements-ros.txt").write_text("".join(entries))
+
+
+def installed(home: Path) -> dict[str, str]:
+    """Return what is in a machine's environment, by name."""
+    words = [home / ".fogft/venv/bin/python", "-m", "pip", "list", "--local", "--format", "json"]
+    done = subprocess.run(words, capture_output=True, check=True)
+    return {one["name"]: one["version"] for one in json.loads(done.stdout)}
+
+
+@pytest.mark.parametrize("first", ["", "pip install -q userlib==2.0"])
+def test_what_fogft_needs_comes_from_the_lock_but_for_what_setup_brought(new_vm: Path, first: str):
+    """In the lock's version, be there a newer one; nothing is asked for that is not in it."""
+    wheel_of(new_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1", extra="rclpy")
+    lock(new_vm, userlib="1.0", rclpy="7.1")
+    done = on_skypilot(new_vm, built({"setup": first})["setup"])
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = installed(new_vm)
+    assert (found["userlib"], found["rclpy"]) == ("2.0" if first else "1.0", "7.1")
+    assert "fogft" in found
+    (told,) = [line for line in done.stdout.splitlines() if "is not locked" in line]
+    assert ("userlib==2.0" in told) == bool(first)
+
+
+def test_a_file_that_the_lock_does_not_name_is_not_installed(new_vm: Path):
+    wheel_of(new_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1")
+    lock(new_vm, userlib="1.0", rclpy="7.1")
+    wheel_of(new_vm / "index", "userlib", "1.0", requires="evil")
+    done = on_skypilot(new_vm, built({})["setup"])
+    assert done.returncode != 0
+    assert "DO NOT MATCH THE HASHES" in done.stderr + done.stdout
+    assert not (new_vm / ".fogft/venv/bin/fogft").exists()
 
 
 def test_a_version_that_does_not_go_with_fogft_is_told(new_vm: Path):

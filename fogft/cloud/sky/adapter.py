@@ -67,11 +67,13 @@ class SkyCloud:
     repeat: Callable[[Callable[[], bool]], object] = _each_second  # until it returns False
     sleep: Callable[[float], object] = time.sleep
     make_wheel: Callable[[Path], Path] = wheel.make
+    make_lock: Callable[[Path], wheel.Locks] = wheel.lock
 
     def __post_init__(self) -> None:
         self._providers = by_name = {provider.cloud: provider for provider in self.providers}
         sky, clock, submit = self.sky, self.clock, self.submit
         self.journal = journal = Journal(self.folder / "launches")
+        self._locks = wheel.LockFolder(self.folder / "locks", self.make_lock)
         self._census = Census(by_name, clock, submit)
         self._presence = Presence(sky, journal, self._census, clock, submit)
         self._ending = Ending(sky, journal, self._census, self.sleep, clock)
@@ -103,11 +105,13 @@ class SkyCloud:
         """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
         group = self._firewall(order)
         instead = self._prices.instead(order.placement, order.limit_usd_per_hour)
+        packed = self.make_wheel(self.folder / "wheels")
+        generation = f"{order.id.pool_uid}-{order.spec_hash}"
         made = task.build(
             order,
             task.read(),
             files=self.journal.files(order.id),
-            wheel=self.make_wheel(self.folder / "wheels"),
+            wheel=packed,
             owner=self.owner,
             base=self.base,
             instead=[offer.placement for offer in instead],
@@ -117,7 +121,8 @@ class SkyCloud:
             port=0 if order.dials_out else order.link_port,
             instead={offer.placement.instance: offer.usd_per_hour for offer in instead},
         )
-        if not self.journal.open(begun, order.files):
+        files = {**order.files, **self._locks.of(generation, packed)}
+        if not self.journal.open(begun, files):
             return
         try:
             request = self.sky.launch(made, cluster_name(order.id), group)
@@ -204,6 +209,10 @@ class SkyCloud:
         """See `Accounts`."""
         files = self.sky.uploaded_credentials(clouds)
         found = [one.warning() for one in self.providers if one.cloud in clouds or not clouds]
+        try:
+            self._locks.renew(self.make_wheel(self.folder / "wheels"))
+        except CloudError as error:
+            found.append(f"each VM chooses what fogft needs itself, unlocked: {error.message}")
         if files is None:
             found.append(
                 "the API server elsewhere decides which of its credentials every VM gets: let it "

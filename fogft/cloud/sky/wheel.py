@@ -1,24 +1,41 @@
-"""Pack the fogft that runs here into a wheel, so that a VM gets the very same one.
+"""What a VM installs: the very fogft that runs here, as a wheel, and a lock of what it needs.
 
-No build tool and no index is needed: the wheel is made of the imported package's own files
+No build tool and no index is needed for the wheel: it is made of the imported package's own files
 and of what pip recorded of it, the same bytes each time.
+
+For the lock `uv` resolves for every platform and Python at once, and marks what is for which: it
+fits every image. `up` makes it; a generation keeps the one of its first launch for all replicas.
+
+Not here: installing (`templates/sky_task.yaml`).
 """
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
 import importlib.metadata
 import io
+import subprocess
+import sys
 import zipfile
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
-from fogft.disk import make_folder, write_whole
+from fogft.disk import locked, make_folder, read_json, write_json, write_whole
 from fogft.errors import CloudError
+from fogft.model.plain import stored, to_plain
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _EPOCH = (2020, 1, 1, 0, 0, 0)
 _KEPT = ("METADATA", "WHEEL", "entry_points.txt")
+FILES = {"requirements.txt": "fogft", "requirements-ros.txt": "fogft[ros]"}
+_COMPILE = ("pip", "compile", "--quiet", "--generate-hashes", "--no-header", "--no-annotate")
+_FOR_ALL = ("--universal", "--python-version", "3.10", "--no-emit-package", "fogft", "-")
+_LIMIT_S = 120.0
+_WORDS = 300  # of what `uv` says
 
 
 def make(folder: Path, package: Path = _PACKAGE) -> Path:
@@ -84,3 +101,79 @@ def _wheel_tag(text: str) -> bytes:
 
 def _digest(content: bytes) -> str:
     return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+
+
+@dataclass(frozen=True)
+class Locks:
+    """By file name: without ROS 2, and with it. None where none could be made."""
+
+    files: Mapping[str, str]
+
+
+def lock(wheel: Path) -> Locks:
+    """Return the locks for the wheel in a folder.
+
+    Raises CloudError: no package index can be asked, or `uv` is not installed.
+    """
+    (file,) = wheel.glob("*.whl")
+    wanted = [f"{name} @ {file.as_uri()}" for name in FILES.values()]
+    with ThreadPoolExecutor(len(wanted)) as both:
+        return Locks(dict(zip(FILES, both.map(_compiled, wanted), strict=True)))
+
+
+def _compiled(wanted: str) -> str:
+    command = [sys.executable, "-m", "uv", *_COMPILE, *_FOR_ALL]
+    try:
+        done = subprocess.run(
+            command, input=wanted, capture_output=True, text=True, timeout=_LIMIT_S, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise CloudError(f"`uv` cannot resolve them here: {error}") from error
+    if done.returncode:
+        said = " ".join(done.stderr.split())[-_WORDS:]
+        raise CloudError(f"`uv` cannot resolve them here: {said}")
+    return done.stdout
+
+
+class LockFolder:
+    """The locks on disk: the newest of each wheel, and each generation's."""
+
+    def __init__(self, folder: Path, resolve: Callable[[Path], Locks]) -> None:
+        self._folder = folder
+        self._resolve = resolve
+
+    def renew(self, wheel: Path) -> None:
+        """Make the lock anew that the next generations of a wheel get.
+
+        Raises CloudError: it cannot be made, and there is none of before.
+        """
+        try:
+            self._write(self._newest(wheel), self._resolve(wheel))
+        except CloudError:
+            if self._read(self._newest(wheel)) is None:
+                raise
+
+    def of(self, generation: str, wheel: Path) -> Mapping[str, bytes]:
+        """Return a generation's lock as files; none where none can be made at its first launch."""
+        make_folder(self._folder)
+        kept = self._folder / f"{generation}-{wheel.name}.json"
+        with locked(self._folder / "locks.lock"):
+            found = self._read(kept)
+            if found is None:
+                found = self._read(self._newest(wheel)) or Locks({})
+                if not found.files:
+                    with contextlib.suppress(CloudError):  # as `up` has told
+                        found = self._resolve(wheel)
+                self._write(kept, found)
+        return {name: content.encode() for name, content in found.files.items()}
+
+    def _newest(self, wheel: Path) -> Path:
+        return self._folder / f"{wheel.name}.json"
+
+    def _read(self, path: Path) -> Locks | None:
+        value = read_json(path)
+        return None if value is None else stored(Locks, value, f"`{path}` is damaged")
+
+    def _write(self, path: Path, locks: Locks) -> None:
+        make_folder(self._folder)
+        write_json(path, to_plain(locks))
