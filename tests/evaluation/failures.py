@@ -168,7 +168,7 @@ class Failures(Defaults):
         axis.set_yscale("log", nonpositive="mask")
         axis.set_xticks(REPLICAS)
         axis.set_xlabel("replicas", fontsize=8)
-        axis.set_ylabel("fraction of time without an answer", fontsize=8)
+        axis.set_ylabel("share of time unanswered", fontsize=8)
         axis.legend(fontsize=7)
         return {"unavailability": figure}
 

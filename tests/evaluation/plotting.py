@@ -12,6 +12,17 @@ from tests.estimates import cumulative
 
 # Told apart by all eyes (Okabe and Ito).
 COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#d55e00", "#56b4e9", "#666666")
+# And on paper without colours: each colour goes with a line and a mark of its own.
+_LINES = ("-", "--", ":", "-.", (0, (5, 1)), (0, (3, 1, 1, 1, 1, 1)), (0, (1, 3)))
+_MARKS = ("o", "s", "^", "D", "v", "x", "*")
+
+
+def _told_apart(colour: str) -> dict[str, Any]:
+    """Return colour, line and mark; what is none of `COLOURS` is plain."""
+    if colour not in COLOURS:
+        return {"color": colour, "linestyle": "-", "marker": "+"}
+    number = COLOURS.index(colour)
+    return {"color": colour, "linestyle": _LINES[number], "marker": _MARKS[number]}
 
 
 def figure(rows: int, columns: int, **options: Any) -> tuple[Any, Any]:
@@ -34,12 +45,13 @@ def histogram(axis: Any, values: Sequence[float], edges: Sequence[float], colour
 def distribution(axis: Any, values: Sequence[float], colour: str, label: str) -> None:
     """Draw the fraction of values that is not above each."""
     places, fractions = cumulative(values)
-    axis.step(places, fractions, where="post", color=colour, label=label, linewidth=1.3)
+    drawn = {**_told_apart(colour), "marker": ""}
+    axis.step(places, fractions, where="post", label=label, linewidth=1.3, **drawn)
 
 
 def series(axis: Any, x: Sequence[float], y: Sequence[float], colour: str, label: str) -> None:
     """Draw a point for each pair."""
-    axis.plot(x, y, "o", color=colour, label=label, markersize=2.5)
+    axis.plot(x, y, label=label, markersize=2.5, **{**_told_apart(colour), "linestyle": ""})
 
 
 def edges(samples: Sequence[Sequence[float]], count: int = 25) -> list[float]:
@@ -59,4 +71,4 @@ def bars(
 
 def curve(axis: Any, x: Sequence[float], y: Sequence[float], colour: str, label: str) -> None:
     """Draw a line through points, with a mark at each."""
-    axis.plot(x, y, "o-", color=colour, label=label, markersize=3, linewidth=1.2)
+    axis.plot(x, y, label=label, markersize=3.5, linewidth=1.2, **_told_apart(colour))

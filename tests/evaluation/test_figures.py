@@ -7,20 +7,26 @@ import random
 
 import pytest
 
+from tests.bench.rig import ROOT
 from tests.evaluation import (
     costs,
     failures,
     markets,
     overhead,
     planning,
+    plotting,
     recovery,
+    registry,
     report,
+    running,
     uplink,
 )
 from tests.evaluation.samples import Store
 from tests.needs import need
 
 need("matplotlib")
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402 - where it is
 
 
 @pytest.fixture
@@ -42,6 +48,38 @@ def column(folder, condition, field):
     """Read a column with nothing of ours."""
     with (folder / f"{condition}.csv").open() as file:
         return [float(row[field]) for row in csv.DictReader(file)]
+
+
+@pytest.mark.parametrize("draw", [plotting.distribution, plotting.series, plotting.curve])
+def test_what_colours_tell_apart_is_told_apart_without_them(draw):
+    seen = set()
+    for colour in plotting.COLOURS:
+        figure, axes = plotting.figure(1, 1)
+        values = [1.0, 2.0, 4.0]
+        draw(axes[0][0], values, *([] if draw is plotting.distribution else [values]), colour, "")
+        for line in axes[0][0].lines:
+            line.set_color("black")
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        seen.add(bytes(canvas.buffer_rgba()))
+    assert len(seen) == len(plotting.COLOURS)
+
+
+@pytest.mark.parametrize("name", ["costs", "failures", "markets", "overhead", "recovery", "uplink"])
+def test_every_label_is_whole(name):
+    """None sticks out of the pictures that docs/results has."""
+    experiment = registry.load(name)
+    folder = ROOT / "docs" / "results"
+    found = running.found(folder, {name: experiment})
+    for figure in experiment.figures(found[name]).values():
+        FigureCanvasAgg(figure).draw()
+        width, height = figure.bbox.size
+        for axis in figure.axes:
+            for text in (axis.xaxis.label, axis.yaxis.label, axis.title):
+                box = text.get_window_extent()
+                if text.get_text():
+                    assert -1 <= box.x0 <= box.x1 <= width + 1, text
+                    assert -1 <= box.y0 <= box.y1 <= height + 1, text
 
 
 def steps(axis):
