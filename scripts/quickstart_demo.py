@@ -154,11 +154,19 @@ def break_things(commands: Commands, story: Story, client: subprocess.Popen[byte
         say(f"\nwhole again {story.whole_after_s[-1][1]:.1f} s after the {action}")
 
 
+def with_three(pool_file: str) -> str:
+    """Return the example's file with three spot replicas, so that two serve beside a broken one."""
+    lines = [line for line in pool_file.splitlines() if "on_demand:" not in line]
+    return "\n".join(lines).replace("replicas: 2", f"replicas: {REPLICAS}") + "\n"
+
+
 def demonstrate(commands: Commands, story: Story, seconds: float) -> None:
     """Run the story up to the end of the client."""
     example = FOLDER / "planner"
     commands.fogft("init", "planner", "--into", str(example))
-    commands.fogft("up", str(example / "pool.yaml"))
+    file = example / "pool.yaml"
+    file.write_text(with_three(file.read_text()))
+    commands.fogft("up", str(file))
     await_whole(story, None)
     commands.fogft("status")
     count = int(seconds / PERIOD_S)

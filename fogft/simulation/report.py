@@ -101,7 +101,8 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"the trace of `{shortest}` is {lengths[shortest]:.0f} s long: too short to simulate",
             "a trace must cover more than an hour",
         )
-    if scenario.days > most:
+    if scenario.days >= most:
         scenario = replace(scenario, days=most)
         notes.append(f"the traces cover {most:.1f} days after the first hour: all are used")
+        notes.append("every seed replays the same days: intervals are of boot times alone")
     return scenario, notes

@@ -313,7 +313,10 @@ def test_recorded_traces_shorter_than_asked_are_used_whole():
     lines = {p: of_samples([1] * 48, HOUR_S) for p in wanted.market(0).timelines}
     report = simulate(replace(wanted, recorded=lines))
     assert report.scenario.days == pytest.approx(47 / 24)
-    assert report.notes == ("the traces cover 2.0 days after the first hour: all are used",)
+    assert report.notes == (
+        "the traces cover 2.0 days after the first hour: all are used",
+        "every seed replays the same days: intervals are of boot times alone",
+    )
 
 
 def test_boots_that_the_pool_file_does_not_wait_for_are_told():

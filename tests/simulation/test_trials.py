@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from fogft import template_files
+from fogft.simulation.run import simulate
 from tests.needs import needs
 from tests.simulation.trials import KINDS, Trial, run
 
@@ -32,6 +34,14 @@ def test_where_spot_machines_hardly_vanish_it_costs_no_more_than_them():
     outcome = run(Trial("rich", "fogft"))
     assert outcome.available == 1.0
     assert outcome.usd_per_hour <= 2 * 0.3 * 1.01
+
+
+def test_the_shipped_planner_is_the_cheapest_that_is_as_available():
+    """Cheaper than one on-demand machine, and up more often than the others that cost less."""
+    report = simulate(template_files.folder() / "planner" / "pool.yaml", days=2.0, seeds=(0, 1))
+    assert report.target >= 0.999
+    assert report.cheapest is not None
+    assert report.cheapest.name == "fogft"
 
 
 @pytest.mark.parametrize("notice_s", [0.0, 120.0])
