@@ -36,10 +36,11 @@ def test_where_spot_machines_hardly_vanish_it_costs_no_more_than_them():
     assert outcome.usd_per_hour <= 2 * 0.3 * 1.01
 
 
+@NIGHT
 def test_the_shipped_planner_is_the_cheapest_that_is_as_available():
     """Cheaper than one on-demand machine, and up more often than the others that cost less."""
-    report = simulate(template_files.folder() / "planner" / "pool.yaml", days=2.0, seeds=(0, 1))
-    assert report.target >= 0.999
+    report = simulate(template_files.folder() / "planner" / "pool.yaml", days=4.0, seeds=(0, 1))
+    assert report.target >= 0.9995
     assert report.cheapest is not None
     assert report.cheapest.name == "fogft"
 

@@ -46,20 +46,26 @@ class PriceTable:
     def __init__(self, file: Path) -> None:
         self._file = file
         self._rows = list(_rows(file))
+        self._places = {(row.cloud, row.region, row.zone) for row in self._rows}
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """List of each place the cheapest machine that suits, the cheapest first."""
-        best: dict[tuple[str, bool], Offer] = {}
+        best: dict[object, Offer] = {}
         for where, entry in alternatives(resources):
             spot = use_spot(where, entry)
+            named = {place for place in self._places if sells(entry, *place)}
             for row in self._rows:
                 price = row.instance.spot_usd_per_hour if spot else row.instance.usd_per_hour
-                if math.isnan(price) or not _suits(where, row, entry):
+                place = row.cloud, row.region, row.zone
+                if math.isnan(price) or place not in named:
                     continue
-                where_sold = Placement(row.cloud, row.region, row.zone, row.instance.name, spot)
-                offer = Offer(where_sold, price, row.source, row.as_of)
-                key = (where_sold.location, spot)
-                best[key] = min(best.get(key, offer), offer, key=_order)
+                known = best.get((place, spot))
+                if (known and price > known.usd_per_hour) or not _suits(where, row, entry):
+                    continue
+                offer = Offer(
+                    Placement(*place, row.instance.name, spot), price, row.source, row.as_of
+                )
+                best[place, spot] = min(known or offer, offer, key=_order)
         if not best:
             raise SpecError(
                 f"resources: nothing in `{self._file}` matches them",
@@ -73,8 +79,7 @@ def _order(offer: Offer) -> tuple[float, Placement]:
 
 
 def _suits(where: str, row: Row, entry: Mapping[str, Any]) -> bool:
-    there = sells(entry, row.cloud, row.region, row.zone)
-    if not there or entry.get("instance_type") not in (None, row.instance.name):
+    if entry.get("instance_type") not in (None, row.instance.name):
         return False
     keys = [key for key in ("accelerators", "cpus", "memory") if entry.get(key) is not None]
     return all(suffices(where, key, entry[key], row.instance) for key in keys)
