@@ -253,7 +253,8 @@ def import_(
 ) -> None:
     """Take over a pool that another machine exported.
 
-    Starts its manager here. The file can be used once, on one machine; it is then deleted.
+    Starts its manager here, and deletes the file. Import it on one machine only: a machine cannot
+    tell that a copy was imported on another, and both would launch replicas.
     """
     from fogft.pool.commands import moving, startup
     from fogft.pool.folder.paths import home
