@@ -295,17 +295,24 @@ def test_machines_cost_what_the_hour_costs():
     )
 
 
-def test_a_replica_leaves_a_location_that_has_become_dear():
-    """It moves once it has stayed for an hour."""
-    steady = always(scenario(spec(1), days=1.0))
+@pytest.mark.parametrize("replicas", [1, 2])
+def test_a_region_that_has_become_dear_is_left(replicas):
+    """Three times the price from the sixth hour on, in all zones of the first replica's region."""
+    steady = always(scenario(spec(replicas), days=1.0))
     chosen, _ = run(steady)
-    [here] = [vm.order.placement for vm in chosen.world.vms.values()]
-    usd = min(o.usd_per_hour for o in steady.find({"use_spot": True}) if o.placement == here)
-    risen = of_changes(
-        [(0, round(PER_USD * usd)), (6 * HOUR_S, round(3 * PER_USD * usd))], 26 * HOUR_S
-    )
-    moved, _ = run(replace(steady, prices={here.location: risen}))
-    assert [vm.order.placement.location for vm in moved.world.vms.values()] != [here.location]
+    region = next(iter(chosen.world.vms.values())).order.placement.region
+    sold = [o for o in steady.find({"use_spot": True}) if o.placement.region == region]
+    prices = {
+        offer.placement.location: of_changes(
+            [(0, round(PER_USD * usd)), (6 * HOUR_S, round(3 * PER_USD * usd))], 26 * HOUR_S
+        )
+        for offer in sorted(sold, key=lambda o: -o.usd_per_hour)
+        for usd in [offer.usd_per_hour]
+    }
+    moved, _ = run(replace(steady, prices=prices))
+    places = [vm.order.placement for vm in moved.world.vms.values()]
+    assert len(places) == replicas
+    assert region not in {place.region for place in places}
 
 
 def test_recorded_traces_shorter_than_asked_are_used_whole():
