@@ -267,7 +267,7 @@ def table(head: Sequence[str], rows: Rows) -> str:
 def text(measured: Mapping[str, Rows], rounds: int, seconds: float) -> str:
     """Return the section of the page."""
     cost = ["p50 / p99 ms", "failed", "copies", "ms of processor"]
-    when = f"{time.strftime('%F')}, two cores, load {machine.describe()['load_before']} before"
+    when = f"{time.strftime('%F')}, two cores, load {machine.describe()['load_before']:.1f} before"
     return f"""{HEADING}
 
 {when}. Three replicas of a service that does one thing at a time, for 20 ms
