@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import time
@@ -115,11 +116,14 @@ def test_a_spare_process_takes_over_when_the_one_at_work_dies(parts, call):
     replica = Replica(parts, 0, 0.02, {}, extra="spare: true\n")
     robot = parts.robot("robot", replica)
     caller = call(robot)
-    at_work, spare = wait_for(
-        lambda: len(pids := replica.run_pids()) == 2 and sorted(pids), "two processes"
-    )
     log = replica.log
-    wait_for(lambda: log.read_text().count("run_started") == 2, "both in the log")
+    at_work, spare = wait_for(
+        lambda: (
+            len(pids := re.findall(r"run_started pid=(\d+)", log.read_text())) == 2
+            and map(int, pids)
+        ),
+        "both in the log, in their order",
+    )
     caller.ask(30)
     caller.spin(0.1)
     os.kill(at_work, signal.SIGKILL)
