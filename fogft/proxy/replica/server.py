@@ -49,6 +49,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _STRANGERS = ("handshakes_refused", "unauthenticated", "kept_out")
+_LOOK_EVERY_S = 0.15  # at services, while all are ready
 
 
 class ServerProxy:
@@ -83,7 +84,7 @@ class ServerProxy:
         self._offering = Offering(services, define, clock)
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
         self._listener, self._make_node, self._supervisor = listener, make_node, supervisor
-        self._clock = clock
+        self._clock, self._look_at = clock, 0.0
         self._lease = HeldLease(clock)
         self._topics = TopicsOnReplica(topics, clock)
         self._incarnation = secrets.token_hex(8)
@@ -142,7 +143,10 @@ class ServerProxy:
             self._leave_ros()
             self._join_ros()
         self._take_up_new()
-        self._look_for_services()
+        now = self._clock()
+        if not self.complete or now >= self._look_at:
+            self._look_at = now + _LOOK_EVERY_S
+            self._look_for_services()
         self._end_stuck()
         self.responder.tick()
         self._goals.tick()

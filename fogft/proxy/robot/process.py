@@ -292,7 +292,6 @@ class _Running(NamedTuple):
                 self.following.renew()
             if announcements is not None and announcements.changed():
                 try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
-            self.seen.diagnose(self._diagnosed, now)
             idle = now - busy > _REPORT_IDLE_EVERY_S
             every_s = _REPORT_IDLE_EVERY_S if idle else _REPORT_EVERY_S
             if now - reported > (_REPORT_AFTER_CHANGE_S if changed else every_s):
@@ -302,7 +301,7 @@ class _Running(NamedTuple):
                     return
                 participant = participant or self._participant()
                 told = {"uptime_s": now - started, "participant": participant.hex()}
-                try_step(functools.partial(self._report, told), config.status)
+                try_step(functools.partial(self._report, told, now), config.status)
                 trace = config.status.with_name(TRACE_NAME)
                 try_step(functools.partial(_trace, trace, proxy, self.spans), trace)
 
@@ -327,23 +326,24 @@ class _Running(NamedTuple):
         if membership is not None:
             self.proxy.follow(membership)
 
-    def _diagnosed(self) -> dict[str, Any]:
-        """Return the report, with what a manager beside it says of credentials."""
+    def _credentials_left_s(self) -> float | None:
+        """Return for how long a manager beside it can call the cloud, as far as it says so."""
         told: Any = None
         with contextlib.suppress(FogftError):
             told = disk.read_json(self.config.lock.parent / "status.json")
         ends_at = told.get("credentials_end_at") if isinstance(told, dict) else None
-        left_s = ends_at - time.time() if isinstance(ends_at, (int, float)) else None
-        return {**self.proxy.report(), "credentials_left_s": left_s}
+        return ends_at - time.time() if isinstance(ends_at, (int, float)) else None
 
-    def _report(self, told: Mapping[str, Any]) -> None:
+    def _report(self, told: Mapping[str, Any], now: float) -> None:
+        seen = self.proxy.report()
+        self.seen.diagnose(lambda: {**seen, "credentials_left_s": self._credentials_left_s()}, now)
         report = {
             "pid": os.getpid(),
             "written_at": time.time(),
             "robot": self.config.robot,
             "version": __version__,
             **told,
-            **self.proxy.report(),
+            **seen,
             **self.following.report(),
             "callers": self.callers(),
         }

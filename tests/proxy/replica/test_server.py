@@ -130,6 +130,7 @@ def test_a_service_that_goes_while_the_command_lives_loses_its_work():
     incoming = FakeIncoming(b"a" * 16)
     scene.listener.on_request(incoming)
     scene.client().there = False
+    scene.clock.now += 0.2
     scene.proxy.run_once()
     assert incoming.outcome == ["refused crashed"]
     assert len(scene.nodes) == 1
@@ -142,11 +143,13 @@ def test_a_service_that_the_command_restarts_by_itself_loses_its_work():
     incoming = FakeIncoming(b"a" * 16)
     scene.listener.on_request(incoming)
     scene.client().count = 2
+    scene.clock.now += 0.2
     scene.proxy.run_once()
     assert incoming.outcome == ["refused crashed"]
     later = FakeIncoming(b"b" * 16)
     scene.listener.on_request(later)
     scene.client().count = 1
+    scene.clock.now += 0.2
     scene.proxy.run_once()
     assert later.outcome == []
 
@@ -288,6 +291,7 @@ def test_a_goal_is_given_once_to_each_life_of_the_command():
     assert first.outcome == give(2).outcome == [ACCEPTED]
     assert calls() == 1
     scene.nodes[-1].clients[name].there = False  # the server alone is gone for a moment
+    scene.clock.now += 0.2
     scene.proxy.run_once()
     scene.nodes[-1].clients[name].there = True
     scene.proxy.run_once()
