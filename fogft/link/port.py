@@ -6,12 +6,13 @@ answers at once whatever the service does.
 
 Law of this port: `Link.offer` never blocks, whatever the peer does; a slow or dead peer
 costs its own link only. Callbacks come from the wire's threads; they must not block.
-Implementations: `fogft.link.zenoh.robot.link` and `replica.listener`, `tests.fakes.link`.
+Implementations: `fogft.link.zenoh.robot.link` and `uplinks`, `tests.fakes.link`. A replica's end is
+`fogft.link.zenoh.replica.listener`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple, Protocol
 
@@ -21,7 +22,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.type_definition import Definition
-from fogft.records.record import Record, SignedRecord
+from fogft.records.record import SignedRecord
 from fogft.requests.load import Handling, Load
 
 
@@ -331,40 +332,3 @@ class Incoming(Protocol):
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal. Never blocks."""
-
-
-class Listener(Protocol):
-    """A replica's end: it hears requests and probes of robots that its CA admits."""
-
-    @property
-    def endpoint(self) -> str:
-        """``host:port`` as bound; the port is the real one where 0 was asked for."""
-
-    def serve(
-        self,
-        services: Mapping[str, str],
-        on_request: Callable[[Incoming], None],
-        on_probe: Callable[[Probe], ProbeAnswer],
-        on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
-    ) -> None:
-        """Begin to listen. Callbacks come from the wire's threads and must not block.
-
-        Args:
-            on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
-                block for a moment, which holds up nothing but probes.
-        """
-
-    def add(self, services: Mapping[str, str]) -> None:
-        """Hear requests for further services too (name -> key); only after `serve`."""
-
-    def revoke(self, names: Collection[str]) -> None:
-        """Let the holders of these certificates (common names) in no more. Repeatable."""
-
-    def lease(self) -> Record | None:
-        """Return the newest lease that the manager signed, of those that robots brought."""
-
-    def counters(self) -> Mapping[str, int]:
-        """Counts by event name: ``malformed``, ``refused``, ``reply_dropped``, ..."""
-
-    def close(self) -> None:
-        """Stop. Repeatable."""

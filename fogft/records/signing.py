@@ -203,10 +203,3 @@ def _attribute(certificate: x509.Certificate, which: str) -> str:
     }[which]
     attributes = certificate.subject.get_attributes_for_oid(oid)
     return str(attributes[0].value) if len(attributes) == 1 else ""
-
-
-def common_name(certificate: bytes) -> str:
-    """Return whom a certificate (DER) names; nothing is verified."""
-    from cryptography import x509
-
-    return _attribute(x509.load_der_x509_certificate(certificate), "CN")

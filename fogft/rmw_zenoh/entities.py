@@ -25,7 +25,8 @@ from fogft.link.zenoh import threads
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.log_limits import worth_logging
 from fogft.rmw_zenoh import naming
-from fogft.ros.pacing.pacer import Pacer, Probes
+from fogft.ros.pacing.client_probes import ServiceProbes
+from fogft.ros.pacing.pacer import Pacer
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +55,7 @@ class Server:
     def __init__(
         self, session: Any, token: Callable[[str], naming.Token], hash: str,
         on_request: Callable[[bytes, Any], None], fault: Callable[[bytes], str],
-        *, probes: Probes | None = None,
+        *, probes: ServiceProbes | None = None,
     ) -> None:  # fmt: skip
         self._pacer = Pacer(self._reply, probes, client_of=lambda handle: handle.client)
         self._answered_ns = OrderedDict[bytes, int]()  # client -> when it got its last answer

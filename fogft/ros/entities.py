@@ -17,7 +17,8 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.log_limits import worth_logging
-from fogft.ros.pacing.pacer import Pacer, Probes
+from fogft.ros.pacing.client_probes import ServiceProbes
+from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import OnBurst
 from fogft.ros.transfer import ClientEnd, ServiceEnd
 
@@ -50,7 +51,7 @@ class Server:
         withdraw: Callable[[Server], None],
         *,
         on_burst: OnBurst | None = None,
-        probes: Probes | None = None,
+        probes: ServiceProbes | None = None,
         mismatch: Callable[[], str] = str,
     ) -> None:
         self.handle = service.handle

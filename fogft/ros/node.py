@@ -153,7 +153,7 @@ class SerialisedNode:
         return self._add(name, create)
 
     def publisher(self, name: str, type_name: str, quality: Quality) -> Publisher:
-        """Make a publisher of a topic."""
+        """Make a publisher of a topic. Raises RosError: the type cannot be loaded."""
         message_type = load_message_type(type_name)
 
         def create() -> Publisher:
@@ -169,7 +169,7 @@ class SerialisedNode:
     def subscribe(
         self, name: str, type_name: str, quality: Quality, on_message: Callable[[bytes], None]
     ) -> Subscription:
-        """Subscribe to a topic."""
+        """Subscribe to a topic: serialised messages. Raises RosError: the type cannot be loaded."""
         message_type = load_message_type(type_name)
 
         def create() -> Subscription:

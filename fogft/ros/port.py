@@ -5,7 +5,7 @@ Callbacks come from that thread and must not block. Responses and requests may b
 from any thread.
 
 Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.rmw_zenoh.node.RmwZenohNode`
-(Zenoh, no ROS installed), `tests.fakes.ros` (tests).
+(Zenoh, no ROS installed), `tests.fakes.ros` (tests). Topics pass by the first alone.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from enum import IntEnum
 from typing import Any, NamedTuple, Protocol
 
 from fogft.errors import RosError
-from fogft.model.topic import Quality
 
 OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where it has ended
 
@@ -76,34 +75,6 @@ class RosClient(Protocol):
         """Withdraw the client."""
 
 
-class RosPublisher(Protocol):
-    """A publisher of serialised messages."""
-
-    def publish(self, payload: bytes) -> None:
-        """Publish a serialised message. Any thread.
-
-        Raises:
-            Unreadable: The bytes are no message of this type.
-            RosError: ROS refused it.
-        """
-
-    def subscribers(self) -> int:
-        """Count the subscriptions that discovery lists."""
-
-    def close(self) -> None:
-        """Withdraw the publisher."""
-
-
-class RosSubscription(Protocol):
-    """A subscription to serialised messages."""
-
-    def mismatch(self) -> str:
-        """Say why a publisher that is there is not heard; empty if all are. Cheap."""
-
-    def close(self) -> None:
-        """Withdraw the subscription."""
-
-
 class RosNode(Protocol):
     """A node of the proxy's own, in one ROS domain."""
 
@@ -139,22 +110,6 @@ class RosNode(Protocol):
 
     def close(self) -> None:
         """Stop the thread and leave ROS. Repeatable."""
-
-
-class RosTopics(Protocol):
-    """A node that can also publish and subscribe."""
-
-    def publisher(self, name: str, type_name: str, quality: Quality) -> RosPublisher:
-        """Make a publisher of a topic. Raises RosError: the type cannot be loaded."""
-
-    def subscribe(
-        self, name: str, type_name: str, quality: Quality, on_message: Callable[[bytes], None]
-    ) -> RosSubscription:
-        """Subscribe to a topic; `on_message` gets serialised messages.
-
-        Raises:
-            RosError: The type cannot be loaded.
-        """
 
 
 class Level(IntEnum):

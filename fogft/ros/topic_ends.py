@@ -53,7 +53,7 @@ class Reader:
 
 
 class Publisher:
-    """A publisher of a node (`fogft.ros.port.RosPublisher`)."""
+    """A publisher of a node. Any thread."""
 
     def __init__(
         self, publisher: Any, reader: Reader, withdraw: Callable[[Publisher], None]
@@ -64,7 +64,12 @@ class Publisher:
         self._open = True
 
     def publish(self, payload: bytes) -> None:
-        """Publish a serialised message. Nothing happens once it is withdrawn."""
+        """Publish a serialised message. Nothing happens once it is withdrawn.
+
+        Raises:
+            Unreadable: The bytes are no message of this type.
+            RosError: ROS refused it.
+        """
         self._reader.check(payload)
         try:
             if self._open:
@@ -93,7 +98,7 @@ class Publisher:
 
 
 class Subscription:
-    """A subscription of a node (`fogft.ros.port.RosSubscription`)."""
+    """A subscription of a node. Any thread."""
 
     def __init__(
         self,

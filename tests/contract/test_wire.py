@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fogft.errors import WireError
-from fogft.link.port import Dialer, Incoming, Link, Listener, Probe, ProbeAnswer
+from fogft.link.port import Dialer, Incoming, Link, Probe, ProbeAnswer
 from fogft.link.window import ATTEMPTS_LIMIT
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.robot.dialer import ZenohDialer
@@ -39,7 +39,7 @@ class MemoryWorld:
         self._wire = MemoryWire()
         self._dialers: list[Dialer] = []
 
-    def listener(self, slot: int, generation: int, endpoint: str = "") -> Listener:
+    def listener(self, slot: int, generation: int, endpoint: str = "") -> ZenohListener:
         return self._wire.listener(ReplicaId(POOL_UID, slot, generation), endpoint)
 
     def dialer(self, **options: object) -> Dialer:
@@ -71,9 +71,9 @@ class ZenohWorld:
 
     def __init__(self, folder: Path) -> None:
         self._authority = Authority(folder)
-        self._made: list[Dialer | Listener] = []
+        self._made: list[Dialer | ZenohListener] = []
 
-    def listener(self, slot: int, generation: int, endpoint: str = "127.0.0.1:0") -> Listener:
+    def listener(self, slot: int, generation: int, endpoint: str = "127.0.0.1:0") -> ZenohListener:
         files = self._authority.replica(slot, generation)
         listener = ZenohListener(endpoint, files, ReplicaId(POOL_UID, slot, generation))
         self._made.append(listener)
@@ -121,7 +121,7 @@ def world(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[World]:
 class Replica:
     """A listener with a service that a test answers by hand, or at once with an echo."""
 
-    def __init__(self, listener: Listener, *, slot: int = 0, generation: int = 1) -> None:
+    def __init__(self, listener: ZenohListener, *, slot: int = 0, generation: int = 1) -> None:
         self.listener = listener
         self.requests: list[Incoming] = []
         self.probes: list[Probe] = []

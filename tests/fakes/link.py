@@ -156,7 +156,7 @@ class MemoryDialer:
 
 
 class MemoryListener:
-    """A replica's end in memory; see `port.Listener`."""
+    """A replica's end in memory; see `ZenohListener`."""
 
     def __init__(self, wire: MemoryWire, id: ReplicaId, endpoint: str) -> None:
         self._wire = wire

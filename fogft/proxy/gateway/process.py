@@ -15,12 +15,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fogft import disk
 from fogft.disk import Watched
 from fogft.errors import CredentialError, FogftError, PoolBusy
-from fogft.link.port import Listener, Probe, ProbeAnswer
+from fogft.link.port import Probe, ProbeAnswer
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.model import names
@@ -37,7 +37,10 @@ from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.process import make_dialer, try_step
-from fogft.records.signing import Signer, common_name
+from fogft.records.signing import Signer
+
+if TYPE_CHECKING:
+    from fogft.link.zenoh.replica.listener import ZenohListener
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +91,7 @@ class _Gateway:
         self._proxy.serve(self._services)
         self._following = Following(config)
         self._revoked: frozenset[str] = frozenset()
-        self._listener: Listener | None = None
+        self._listener: ZenohListener | None = None
         self._holder = self._own_holder()
         self._certificate = Watched(config.credentials.certificate)
         self._certificate.changed()
@@ -96,7 +99,7 @@ class _Gateway:
 
     def _own_holder(self) -> Holder:
         ours = self._config.credentials
-        holder = holder_of(common_name(Signer(ours.certificate, ours.key).certificate))
+        holder = holder_of(Signer(ours.certificate, ours.key).common_name)
         if holder.role is not Role.GATEWAY:
             raise CredentialError(
                 f"`{holder.common_name}` is no gateway's certificate",

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, cast
 from fogft import __version__
 from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.errors import RosError
-from fogft.link.port import Incoming, Listener, Probe, ProbeAnswer
+from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.model import names
 from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
@@ -41,9 +41,11 @@ from fogft.proxy.replica.spare import WithSpare
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
 from fogft.records.record import Record
-from fogft.ros.port import RosClient, RosNode, RosTopics
+from fogft.ros.port import RosClient, RosNode
 
 if TYPE_CHECKING:
+    from fogft.link.zenoh.replica.listener import ZenohListener
+    from fogft.ros.node import SerialisedNode
     from fogft.ros.state_bytes import StateBytes
 
 log = logging.getLogger(__name__)
@@ -69,7 +71,7 @@ class ServerProxy:
         self,
         id: ReplicaId,
         services: tuple[ServiceSpec, ...],
-        listener: Listener,
+        listener: ZenohListener,
         make_node: Callable[[], RosNode],
         supervisor: Supervisor | WithSpare,
         *,
@@ -289,7 +291,7 @@ class ServerProxy:
         self._clients = {}
         self._servers = {}
         if self._topics:
-            self._topics.use(cast(RosTopics, node))
+            self._topics.use(cast("SerialisedNode", node))
         services = self._offering.services
         for service in services:
             self._make_client(service)

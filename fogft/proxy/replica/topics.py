@@ -17,14 +17,18 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
+from typing import TYPE_CHECKING
 
 from fogft.errors import FrameError, RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, TopicSpec
-from fogft.ros.port import RosPublisher, RosSubscription, RosTopics
 from fogft.topics import frames
 from fogft.topics.queues import Ring, Seen
+
+if TYPE_CHECKING:
+    from fogft.ros.node import SerialisedNode
+    from fogft.ros.topic_ends import Publisher, Subscription
 
 log = logging.getLogger(__name__)
 
@@ -106,8 +110,8 @@ class TopicsOnReplica:
             for name, topic in self._topics.items()
             if topic.origin is Origin.REPLICAS
         }
-        self._publishers: dict[str, RosPublisher] = {}
-        self._subscriptions: dict[str, RosSubscription] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._subscriptions: dict[str, Subscription] = {}
         self._looked_at = clock()
         self._seen = {name: Seen() for name in self._topics}
         self._trouble: dict[str, str] = {}
@@ -126,7 +130,7 @@ class TopicsOnReplica:
         """Why one of them cannot pass; empty when all can."""
         return next(iter(self._trouble.values()), "")
 
-    def use(self, node: RosTopics | None) -> None:
+    def use(self, node: SerialisedNode | None) -> None:
         """Publish and subscribe with this node from now on; the one before is gone."""
         self._publishers, self._subscriptions = {}, {}
         if node is None:

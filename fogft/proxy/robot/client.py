@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fogft.errors import RosError
 from fogft.link.port import Answer, Dialer, GatewayView, Link
@@ -28,7 +28,10 @@ from fogft.proxy.robot.proxied_service import ProxiedService
 from fogft.proxy.robot.sending import key_of
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
 from fogft.requests.load import NEVER
-from fogft.ros.port import RosNode, RosTopics
+from fogft.ros.port import RosNode
+
+if TYPE_CHECKING:
+    from fogft.ros.node import SerialisedNode
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +111,7 @@ class ClientProxy:
                 self.links.redial()
         self._change()
 
-    def pass_topics(self, topics: Iterable[TopicSpec], node: RosTopics) -> None:
+    def pass_topics(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> None:
         """Pass these topics and no others; `node` publishes and subscribes on the robot's side."""
         with self._lock:
             if self._topics.serve(topics, node):

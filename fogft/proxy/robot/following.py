@@ -26,7 +26,7 @@ from fogft.model.replica import Member, Membership
 from fogft.records import roster
 from fogft.records.client import Known, RendezvousClient
 from fogft.records.record import RecordKind
-from fogft.records.signing import Signer, Verifier, common_name
+from fogft.records.signing import Signer, Verifier
 
 log = logging.getLogger(__name__)
 
@@ -128,7 +128,7 @@ class Following:
 
     def _holder(self) -> Holder:
         ours = self._config.credentials
-        return holder_of(common_name(Signer(ours.certificate, ours.key).certificate))
+        return holder_of(Signer(ours.certificate, ours.key).common_name)
 
     def _read(self) -> None:
         raw = disk.read_json(self._config.membership)

@@ -43,9 +43,9 @@ from fogft.proxy.robot.manager_restart import ManagerRestart
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning
-from fogft.ros.port import RosTopics
 
 if TYPE_CHECKING:
+    from fogft.ros.node import SerialisedNode
     from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
@@ -115,7 +115,7 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     visible = functools.partial(_make_visible, joined, _node_name("fogft", config.pool))
     seen = SeenFromRos(config.pool, config.robot, visible, check_ok_field)
     proxy.serve(seen.follow(config.services))
-    proxy.pass_topics(config.topics, cast(RosTopics, joined.node))
+    proxy.pass_topics(config.topics, cast("SerialisedNode", joined.node))
     following = Following(config)
     scrape = Scrape(lambda: proxies.of_client(proxy.report()), {"pool": config.pool})
     scrape.at(config.metrics)
@@ -311,7 +311,7 @@ class _Running(NamedTuple):
         if self.dialer.use(new.uplinks, new.services):
             self.proxy.redial()
         self.proxy.serve(self.seen.follow(new.services))
-        self.proxy.pass_topics(new.topics, cast(RosTopics, self.joined.node))
+        self.proxy.pass_topics(new.topics, cast("SerialisedNode", self.joined.node))
         self.following.apply(new)
         self.scrape.at(new.metrics)
         log.info("config_applied services=%d", len(new.services))

@@ -12,17 +12,20 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fogft.errors import FrameError, RosError
 from fogft.link.port import Answer, Link
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, Select, TopicSpec
-from fogft.ros.port import RosPublisher, RosSubscription, RosTopics
 from fogft.topics import frames
 from fogft.topics.queues import Numbered, Outbox
 from fogft.topics.select import Selection
+
+if TYPE_CHECKING:
+    from fogft.ros.node import SerialisedNode
+    from fogft.ros.topic_ends import Publisher, Subscription
 
 log = logging.getLogger(__name__)
 
@@ -66,15 +69,15 @@ class RobotTopic:
         self._selection = Selection(topic.select)
         self._said: dict[int, bytes] = {}
         self._told: bytes | None = None
-        self._publisher: RosPublisher | None = None
-        self._subscription: RosSubscription | None = None
+        self._publisher: Publisher | None = None
+        self._subscription: Subscription | None = None
         self._looked_at = clock()
         self.trouble = ""
         self._unconfirmed: dict[int, None] = {}
         self._rate_hz, self._counted = 0.0, (clock(), 0)
         self.count = dict.fromkeys(("messages", "passed", "dropped", "refused"), 0)
 
-    def open(self, node: RosTopics) -> None:
+    def open(self, node: SerialisedNode) -> None:
         """Publish or subscribe here. Raises RosError."""
         topic = self.topic
         if topic.origin is Origin.ROBOT:
@@ -261,7 +264,7 @@ class TopicsOnRobot:
     def __contains__(self, name: str) -> bool:
         return name in self._topics
 
-    def serve(self, topics: Iterable[TopicSpec], node: RosTopics) -> bool:
+    def serve(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> bool:
         """Pass these topics and no others; return whether they have changed."""
         wanted = {topic.key_name: topic for topic in topics}
         changed = False

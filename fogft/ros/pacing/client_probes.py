@@ -61,7 +61,7 @@ class NodeProbes:
 
 
 class ServiceProbes:
-    """Probes of one service's clients (`fogft.ros.pacing.pacer.Probes`)."""
+    """Probes of one service's clients: how it learns that an executor has had a turn."""
 
     def __init__(self, service: str, nodes: NodeProbes) -> None:
         self._service = service
@@ -91,7 +91,7 @@ class ServiceProbes:
         return found is not None and found.unique
 
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
-        """Send a probe. One that cannot be sent is not answered."""
+        """Send a probe; `on_answer` comes from the take loop, or never. It may not be sent."""
         try:
             self._ends[client].call(_OF_NO_PARAMETER, lambda _: on_answer())
         except (KeyError, RosError):

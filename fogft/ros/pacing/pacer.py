@@ -18,9 +18,10 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from fogft.errors import RosError
+from fogft.ros.pacing.client_probes import ServiceProbes
 from fogft.ros.pacing.pace import EVERY_S, ClientPace, Pace, Probing
 from fogft.ros.port import NotFoundYet
 
@@ -29,19 +30,6 @@ log = logging.getLogger(__name__)
 _ASK_EVERY_S, _ASK_LIMIT_S = 0.02, 1.0  # whether a node answers probes
 _LOOK_EVERY_S = 0.2
 _GUID_BYTES = 16
-
-
-class Probes(Protocol):
-    """How a service learns that a client's executor has had a turn."""
-
-    def answers(self, client: bytes) -> bool | None:
-        """Whether the client's node answers probes; None while discovery does not tell."""
-
-    def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
-        """Send a probe; `on_answer` comes from the take loop, or never."""
-
-    def unique(self, client: bytes) -> bool:
-        """Whether only the client's own node can have answered."""
 
 
 def _client(handle: Any) -> bytes:
@@ -61,7 +49,7 @@ class Pacer:
     def __init__(
         self,
         send: Callable[[Any, bytes], None],
-        probes: Probes | None = None,
+        probes: ServiceProbes | None = None,
         clock: Callable[[], float] = time.monotonic,
         client_of: Callable[[Any], bytes] = _client,
     ) -> None:

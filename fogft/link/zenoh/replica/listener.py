@@ -54,7 +54,7 @@ _CLOSE_WAIT_S = 1.0
 
 
 class ZenohListener:
-    """Listens for robots; see `port.Listener`.
+    """A replica's end: it hears requests and probes of robots that its CA admits.
 
     Args:
         listen: ``host:port``; port 0 for any that is free.
@@ -123,7 +123,11 @@ class ZenohListener:
         on_probe: Callable[[Probe], ProbeAnswer],
         on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
     ) -> None:
-        """Begin to listen.
+        """Begin to listen. Callbacks come from the wire's threads and must not block.
+
+        Args:
+            on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
+                block for a moment, which holds up nothing but probes.
 
         Raises:
             WireError: The port is taken, or the credentials cannot be used.
@@ -154,7 +158,7 @@ class ZenohListener:
         self._declare(session, names.probe_key(*place), partial(self._control.probe, on_probe))
 
     def add(self, services: Mapping[str, str]) -> None:
-        """Hear requests for further services too (name -> key)."""
+        """Hear requests for further services too (name -> key); only after `serve`."""
         self._services.update((key, name) for name, key in services.items())
 
     def _peers(self) -> dict[Address, str]:
