@@ -5,8 +5,6 @@ all it is not what limits. What pays is measured for each service: how far its b
 how long that takes, against how long they would take to leave at the rate that was seen. What
 does not shrink is left alone, and tried again rarely.
 
-Compressed payloads go only to peers that have said that they read them (`ACCEPTED`).
-
 Owns: when and how. Not here: rates (`socket_progress`), headers (`frame`).
 """
 
@@ -16,10 +14,8 @@ import time
 import zlib
 from collections.abc import Callable
 
-ZLIB = "zlib"
-# It finds out by itself for whom answers are to be compressed.
-ZLIB_ANSWERS = "zlib-answers"
-ACCEPTED = frozenset({ZLIB, ZLIB_ANSWERS})  # what this version reads, and does
+# What a replica reads, and finds out by itself for answers: robots of 0.2.0 ask for these words.
+ACCEPTED = frozenset({"zlib", "zlib-answers"})
 LEAST_BYTES = 2048  # smaller ones leave in one packet or two
 LIMIT_BYTES = 64 << 20  # more than a window holds: a frame that claims more is refused
 FASTEST_BYTES_PER_S = 30e6  # a link that drains faster gains nothing by zlib

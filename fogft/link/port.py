@@ -125,7 +125,7 @@ class ProbeAnswer:
         version: Of fogft on the replica; empty before 0.2.0.
         lease_age_s: Since it last heard of the pool's manager; None for never.
         lease_left_s: Until it shuts down unless it hears of it again; None for never.
-        accepts: Names of compressions that it reads, or does by itself.
+        accepts: Names of compressions that it reads, or does by itself; since 0.2.0 all of them.
         hanging: Services that have work, and have answered nothing for far longer than they take.
         strangers: Connections that were turned away, because nobody with a certificate spoke.
     """

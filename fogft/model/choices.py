@@ -26,8 +26,8 @@ from fogft.model.keys import (
     key,
     only,
 )
-from fogft.model.names import is_endpoint
-from fogft.model.ros_names import absolute_service_name
+from fogft.model.names import endpoint
+from fogft.model.ros_names import service_name
 
 MAX_REPLICAS = 100
 MAX_USD_PER_HOUR = 1_000_000
@@ -138,7 +138,7 @@ class AvailabilitySpec(Assumption):
 
 def _metrics(default_port: int) -> Text:
     hint = f"write an address that only your Prometheus reaches, such as `127.0.0.1:{default_port}`"
-    return Text("`host:port`", hint, only(is_endpoint))
+    return endpoint(hint)
 
 
 @dataclass(frozen=True)
@@ -391,7 +391,7 @@ class FallbackSpec:
     """
 
     service: str = key(
-        Text("a service name", "write the name of a service on the robot", absolute_service_name),
+        service_name("write the name of a service on the robot"),
         "Service of the same type that runs on the robot.",
         name="name",
     )

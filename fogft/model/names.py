@@ -15,7 +15,7 @@ import re
 from collections.abc import Mapping
 from typing import Annotated
 
-from fogft.model.keys import only
+from fogft.model.keys import Text, only
 
 REQUEST_ID_BYTES = 16
 GATEWAY_SLOTS = 1 << 32  # from here on, slots are gateways
@@ -104,6 +104,11 @@ def is_endpoint(text: str) -> bool:
     if not host.isascii() or not host.isprintable():
         return False
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
+
+
+def endpoint(hint: str) -> Text:
+    """Return the form of a key that holds an endpoint."""
+    return Text("`host:port`", hint, only(is_endpoint))
 
 
 def network(text: str) -> str:

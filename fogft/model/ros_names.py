@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from functools import partial
 
-from fogft.model.keys import only
+from fogft.model.keys import Text, only
 
 MAX_SERVICE_NAME = 240  # DDS allows 255; ROS adds a prefix and a suffix
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -93,4 +93,19 @@ def is_field_path(name: str) -> bool:
     return all(map(is_field_name, name.split(".")))
 
 
-service_type, message_type = only(is_service_type), only(is_message_type)
+def service_name(hint: str, what: str = "a service name") -> Text:
+    """Return the form of a key that holds a service's name, or what else is named like one."""
+    return Text(what, hint, absolute_service_name)
+
+
+def service_type(hint: str, *, has_parts: bool = False) -> Text:
+    """Return the form of a key that holds a service type."""
+    return Text(
+        *("a service type", hint, only(is_service_type), suggested_service_type),
+        has_parts=has_parts,
+    )
+
+
+def field_path(hint: str) -> Text:
+    """Return the form of a key that holds the path of a field."""
+    return Text("the path of a field", hint, only(is_field_path))

@@ -43,14 +43,8 @@ from fogft.model.keys import (
     key,
     only,
 )
-from fogft.model.names import LINK_PORT, is_endpoint, network
-from fogft.model.ros_names import (
-    absolute_service_name,
-    is_field_name,
-    is_field_path,
-    service_type,
-    suggested_service_type,
-)
+from fogft.model.names import LINK_PORT, endpoint, network
+from fogft.model.ros_names import field_path, is_field_name, service_name, service_type
 from fogft.model.state import StateSpec
 from fogft.model.topic import ActionSpec, TopicSpec
 from fogft.model.topology import Topology
@@ -100,21 +94,16 @@ class ServiceSpec:
     """One proxied service.
 
     Attributes:
-        hedging_budget: Late hedges under `auto`, as a share of requests.
         part: Which part of an action it is.
     """
 
     name: str = key(
-        Text("a service name", "write a name such as `/detect`", absolute_service_name),
+        service_name("write a name such as `/detect`"),
         "Name of the service, on the robot and on the replicas; `detect` is `/detect`.",
     )
     type: str = key(
-        Text(
-            "a service type",
-            "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`",
-            service_type,
-            suggested_service_type,
-            has_parts=True,
+        service_type(
+            "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`", has_parts=True
         ),
         "Its type. It must be installed on the robot; with `rmw: zenoh` only where a policy looks "
         "into responses.",
@@ -146,7 +135,6 @@ class ServiceSpec:
         default=HedgingMode.AUTO,
         parameter=True,
     )
-    hedging_budget: float = 0.1
     traffic: TrafficSpec = key(
         Map(TrafficSpec, "write `{requests_per_s: 10, request_bytes: 100000}`"),
         "Load on the service, for the costs that `fogft plan` shows; measured where it is not set.",
@@ -159,11 +147,7 @@ class ServiceSpec:
         usual="learned",
     )
     cancel: str = key(
-        Text(
-            "a service name",
-            "write a service's name, such as `cancel: /detect_cancel`",
-            absolute_service_name,
-        ),
+        service_name("write a service's name, such as `cancel: /detect_cancel`"),
         "Service (`std_srvs/srv/Trigger`) that cancels the request at work, called when the robot "
         "has its answer from elsewhere.",
         default="",
@@ -178,7 +162,7 @@ class ServiceSpec:
     tolerance: tuple[tuple[str, float], ...] = key(
         Table(
             Number(1e12, "the field's own"),
-            Text("the path of a field", "write a path such as `plan.cost`", only(is_field_path)),
+            field_path("write a path such as `plan.cost`"),
             as_pairs=True,
         ),
         "With `quorum`: how far apart two values of a float field may be, such as "
@@ -277,10 +261,6 @@ class HealthSpec:
     )
 
 
-def _endpoint(hint: str) -> Text:
-    return Text("`host:port`", hint, only(is_endpoint))
-
-
 @dataclass(frozen=True)
 class PoolSpec:
     """A whole pool file.
@@ -308,10 +288,9 @@ class PoolSpec:
         usual="what `run` advertises",
     )
     namespace: str = key(
-        Text(
-            "a namespace",
+        service_name(
             "write where the services are that may be offered, such as `namespace: /planner`",
-            absolute_service_name,
+            "a namespace",
         ),
         "Where `services` is left out: only what is below this namespace is offered on the robot.",
         default="",
@@ -384,13 +363,13 @@ class PoolSpec:
         usual="moves for 30 % less",
     )
     rendezvous: tuple[str, ...] = key(
-        Listed(_endpoint("write a list, such as `rendezvous: [meet.example.org:7450]`"), 4),
+        Listed(endpoint("write a list, such as `rendezvous: [meet.example.org:7450]`"), 4),
         "Where `fogft rendezvous` runs, for pools with several robots, gateways, or replicas whose "
         "address the cloud does not know.",
         default=(),
     )
     dial_in: str = key(
-        _endpoint(
+        endpoint(
             "write the robot's own address and a port, such as `dial_in: robot.example.org:7460`"
         ),
         "Robot's own address, for replicas that cannot be reached: they dial the robot.",

@@ -4,13 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from fogft.model.keys import Map, Text, key, only
-from fogft.model.ros_names import (
-    absolute_service_name,
-    is_field_path,
-    service_type,
-    suggested_service_type,
-)
+from fogft.model.keys import Map, key
+from fogft.model.ros_names import field_path, service_name, service_type
 
 SNAPSHOT_TYPE = "nav_msgs/srv/GetMap"
 RESTORE_TYPE = "nav_msgs/srv/SetMap"
@@ -24,17 +19,17 @@ class StateService:
     """A service that carries a state."""
 
     name: str = key(
-        Text("a service name", "write a name such as `/svc/get_state`", absolute_service_name),
+        service_name("write a name such as `/svc/get_state`"),
         "Name of the service.",
     )
     type: str = key(
-        Text("a service type", _END_HINT, service_type, suggested_service_type),
+        service_type(_END_HINT),
         "Its type.",
         default="",
         usual=f"`{SNAPSHOT_TYPE}`, `{RESTORE_TYPE}`",
     )
     field: str = key(
-        Text("the path of a field", f"write a path such as `field: {FIELD}`", only(is_field_path)),
+        field_path(f"write a path such as `field: {FIELD}`"),
         "The text or byte field that holds the state: of the response for a snapshot, of the "
         "request for a restore.",
         default="",

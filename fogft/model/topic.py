@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from fogft.model.keys import DAY_S, Flag, Number, OneOf, Text, Whole, key, only
-from fogft.model.ros_names import absolute_service_name, is_action_type, message_type
+from fogft.model.ros_names import is_action_type, is_message_type, service_name
 
 PREFIX = "topic "  # of a topic's name on the wire, where it stands beside services
 DEPTH_LIMIT = 1000
@@ -43,14 +43,14 @@ class TopicSpec:
     """One proxied topic."""
 
     name: str = key(
-        Text("the name of a topic", "write a name such as `/topic`", absolute_service_name),
+        service_name("write a name such as `/topic`", "the name of a topic"),
         "Name of the topic, on the robot and on the replicas.",
     )
     type: str = key(
         Text(
             "a message type",
             "write `package/msg/Name`, such as `type: sensor_msgs/msg/Image`",
-            message_type,
+            only(is_message_type),
             has_parts=True,
         ),
         "Its type; it must be installed on the robot.",
@@ -100,7 +100,7 @@ class ActionSpec:
     """One proxied action: three services and two topics."""
 
     name: str = key(
-        Text("the name of an action", "write a name such as `/action`", absolute_service_name),
+        service_name("write a name such as `/action`", "the name of an action"),
         "Name of the action, on the robot and on the replicas.",
     )
     type: str = key(

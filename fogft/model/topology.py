@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from fogft.model.credentials import NAME_PATTERN, Holder, Role
 from fogft.model.keys import Listed, Maps, Text, key, only
-from fogft.model.names import is_endpoint
+from fogft.model.names import endpoint as named_endpoint
 from fogft.model.plain import Generation
 
 GATEWAYS_LIMIT = 64
@@ -32,11 +32,7 @@ class Gateway:
 
     name: str = key(_NAME, "Name of the gateway, as in its certificate.")
     endpoint: str = key(
-        Text(
-            "`host:port`",
-            "write where robots reach it, such as `endpoint: edge.example.org:7470`",
-            only(is_endpoint),
-        ),
+        named_endpoint("write where robots reach it, such as `endpoint: edge.example.org:7470`"),
         "Address where robots and other gateways reach it.",
     )
     through: tuple[str, ...] = key(

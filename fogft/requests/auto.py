@@ -27,7 +27,7 @@ from fogft.model.spec import HedgingMode, Part, ServiceSpec
 from fogft.requests.choose import All, Choose, Failover, Learning
 from fogft.requests.load import Demand, Load
 
-BUDGET_CAPACITY = 10.0
+BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
 _DOUBTED_TRIAL_EVERY_S = 1.0
 FEWEST_SPARES = 0.01
@@ -109,15 +109,11 @@ class Spares:
 
 
 class Auto(Learning):
-    """The policy `auto`; see `choose.Choose`.
+    """The policy `auto`; see `choose.Choose`."""
 
-    Args:
-        budget: Late hedges that are allowed, as a share of requests.
-    """
-
-    def __init__(self, budget: float = 0.1) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._budget = TokenBucket(budget, BUDGET_CAPACITY)
+        self._budget = TokenBucket(BUDGET_SHARE, BUDGET_CAPACITY)
         self._spares = Spares()
         self._demand = Demand()
         # When a spare was first, by the copy that it beat, until that has ended.
@@ -317,4 +313,4 @@ def policy(spec: ServiceSpec) -> Choose:
         return Failover()
     # Where every answer counts, or every replica applies every request, all are asked.
     counts_all = spec.quorum > 1 or spec.state is not None or spec.part is not Part.NONE
-    return All() if counts_all or spec.hedging is HedgingMode.ALL else Auto(spec.hedging_budget)
+    return All() if counts_all or spec.hedging is HedgingMode.ALL else Auto()

@@ -272,7 +272,7 @@ def test_spares_at_a_replica_that_is_gone_are_not_blamed_for_ever():
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2), st.booleans()), max_size=200))
 def test_whatever_happens_late_hedges_stay_within_the_budget(steps):
     """Law: late hedges <= capacity + share * requests; and a request always has a first copy."""
-    policy, now, open_by = Auto(budget=0.1), 100.0, dict[bytes, dict[int, float]]()
+    policy, now, open_by = Auto(), 100.0, dict[bytes, dict[int, float]]()
     for n, (kind, replica, flag) in enumerate(steps):
         now += 0.05
         request = n.to_bytes(16, "big")

@@ -335,7 +335,7 @@ class Dispatcher:
             self._decide.accepts = accepts
             self._ledger.adopt(spec)
             self._delivery.adopt(spec, fallback)
-            if (old.hedging, old.hedging_budget) != (spec.hedging, spec.hedging_budget):
+            if old.hedging is not spec.hedging:
                 self._requests.use(policy(spec))
                 log.info("hedging_changed service=%s to=%s", spec.name, spec.hedging.value)
         self._wake()

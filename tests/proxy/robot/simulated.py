@@ -224,7 +224,6 @@ class World:
     Args:
         hedging: The policy.
         timeout_s: Of each request.
-        budget: Of late hedges.
         beside: Another robot's world, whose time and replicas this one shares.
     """
 
@@ -233,7 +232,6 @@ class World:
         hedging: HedgingMode,
         *,
         timeout_s: float = 10.0,
-        budget: float = 0.1,
         beside: World | None = None,
     ) -> None:
         self.time = Timeline() if beside is None else beside.time
@@ -244,7 +242,7 @@ class World:
         self.asked: dict[int, float] = {}
         self.answers: list[tuple[int, float, bytes]] = []
         self.spec = ServiceSpec(
-            "/s", "t/srv/T", timeout_s=timeout_s, hedging=hedging, hedging_budget=budget
+            "/s", "t/srv/T", timeout_s=timeout_s, hedging=hedging
         )
         self.dispatcher = Dispatcher(
             self.spec,

@@ -96,8 +96,6 @@ class Attempts:
         cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
 
     Attributes:
-        packs: Whether the replica reads what is compressed.
-        packs_answers: Whether it finds out by itself when to compress answers.
         watched: Something large was sent lately: the link's thread looks often.
     """
 
@@ -125,8 +123,6 @@ class Attempts:
         self._on_large = tell.large
         self._ended = ended
         self.window = LinkWindow()
-        self.packs = False
-        self.packs_answers = False
         self.watched = False
         self._large_since = float("-inf")
         self._sending_since: float | None = None
@@ -144,7 +140,7 @@ class Attempts:
             options.timed,
             self._progress.throughput.bytes_per_s,
             self._left_bytes,
-            self._compression,
+            self._compressions.get,
         )
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
@@ -235,9 +231,6 @@ class Attempts:
         since, held = self._held_by_zenoh
         left = max(0.0, held - bytes_per_s * (now - since))
         return left + self._progress.left_bytes(now, bytes_per_s)
-
-    def _compression(self, service: str) -> Compression | None:
-        return self._compressions.get(service) if self.packs else None
 
     def _displace(self, attempt: OpenAttempt) -> bool:
         """Let a newer attempt in for the stalest unsent one, where its service wants that."""
@@ -346,13 +339,11 @@ class Attempts:
             self._on_large()
 
     def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
-        compression = self._compression(attempt.service)
+        compression = self._compressions.get(attempt.service)
         packed = None
         if compression is not None:
             packed = compression.pack(payload, self._progress.bytes_per_s)
-        may_pack = compression is not None and self._flow.thin
-        reads_packed = compression is not None and self.packs_answers
-        attempt.reads_packed = may_pack or reads_packed
+        reads_packed = attempt.reads_packed = compression is not None
         self._unanswered.add(attempt)
         header = frame.encode_request(
             attempt.request_id,
@@ -360,7 +351,7 @@ class Attempts:
             self._origin,
             seen=self._seen,
             packed=packed is not None,
-            may_pack=may_pack,
+            may_pack=reads_packed and self._flow.thin,
             reads_packed=reads_packed,
             handling=attempt.handling,
         )

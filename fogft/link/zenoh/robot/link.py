@@ -19,7 +19,6 @@ import zenoh
 
 from fogft import __version__
 from fogft.errors import CredentialError, WireError
-from fogft.link.compression import ZLIB, ZLIB_ANSWERS
 from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.link.zenoh import settings
 from fogft.link.zenoh.robot.attempts import Callbacks
@@ -379,8 +378,6 @@ class ZenohLink:
         """A connection's replica has answered: from now on it is the live one."""
         news = self._live is not connection or answer != known
         self.ready = answer.ready
-        connection.attempts.packs = ZLIB in answer.accepts
-        connection.attempts.packs_answers = ZLIB_ANSWERS in answer.accepts
         if self._live is not connection:
             self._state = LinkState.UP
             self._detail = ""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from fogft.link import batch_frames, frame
 from fogft.link.cancellations import Cancellations
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
-from fogft.link.port import DEFAULT_OPTIONS, Answer
+from fogft.link.port import DEFAULT_OPTIONS, Answer, SendOptions
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import unpacking
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
@@ -62,7 +62,7 @@ class Outlet:
 
 
 class Scene:
-    def __init__(self) -> None:
+    def __init__(self, options: SendOptions = DEFAULT_OPTIONS) -> None:
         self.outlet = Outlet()
         self.answers: list[Answer] = []
         self.late: list[bytes] = []
@@ -71,7 +71,7 @@ class Scene:
             self.outlet,
             [SERVICE],
             frame.origin("ada", bytes(frame.TOKEN_BYTES)),
-            options=DEFAULT_OPTIONS,
+            options=options,
             gate=LargeSendGate(),
             cancellations=Cancellations(),
             tell=Callbacks(
@@ -182,15 +182,9 @@ def test_an_answer_after_it_was_forgotten_is_late() -> None:
     assert (scene.answers, scene.late) == ([], [request_id(1)])
 
 
-def _thin(scene: Scene) -> None:
-    """Have its requests say that their answers may be compressed."""
-    scene.attempts.packs = scene.attempts.packs_answers = True
-
-
 def test_a_packed_answer_is_unpacked_where_it_was_asked_for() -> None:
     """It ends its attempt as any other does; one that cannot be unpacked is the replica's fault."""
     scene = Scene()
-    _thin(scene)
     for number, packed in enumerate((zlib.compress(b"answer"), b"no zlib"), 1):
         assert scene.attempts.offer(SERVICE, request_id(number), b"x", 60.0)
         scene.attempts.heard(b"once", [Answer(request_id(number), packed)], packed=True)
@@ -205,7 +199,7 @@ def test_a_packed_answer_is_unpacked_where_it_was_asked_for() -> None:
 def test_nothing_is_unpacked_that_was_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither for an unknown id, nor for one that is not wanted, nor where no request allows it."""
     monkeypatch.setattr(unpacking, "unpack", lambda packed: pytest.fail("it was unpacked"))
-    scene = Scene()
+    scene = Scene(SendOptions(plain=frozenset({SERVICE})))
     bomb = zlib.compress(bytes(1 << 20))
     for number in (1, 2):
         assert scene.attempts.offer(SERVICE, request_id(number), b"x", 60.0)
