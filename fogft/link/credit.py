@@ -27,11 +27,6 @@ class Credit:
         self._heard = 0
         self._queued = 0
 
-    @property
-    def on_the_way(self) -> int:
-        """Bytes sent of which no sign has come."""
-        return self._sent - self._heard
-
     def take(self, size: int) -> int | None:
         """Reserve a small send; return its mark, or None where it might block."""
         if size > SMALL_BYTES:

@@ -69,8 +69,35 @@ class Probe:
     version: Line = ""
 
 
-@dataclass(frozen=True)
-class GatewayView:
+@dataclass(frozen=True, kw_only=True)
+class ReplicaWord:
+    """What a replica says of itself, as its probes' answers and gateways tell it.
+
+    Attributes:
+        ready: Names of the services that it can answer now.
+        draining: It asks to be left alone: its machine will be taken.
+        at_risk: Its cloud recommends to move it; it serves on meanwhile.
+        restarts: How often it restarted the user's `run` command.
+        detail: Why it is not ready, in words; empty when it is.
+        version: Of fogft on the replica; empty before 0.2.0.
+        lease_age_s: Since it last heard of the pool's manager; None for never.
+        lease_left_s: Until it shuts down unless it hears of it again; None for never.
+    """
+
+    slot: Count
+    generation: Count
+    ready: frozenset[Line] = frozenset()
+    draining: bool = False
+    at_risk: bool = False
+    restarts: Count = 0
+    detail: Line = ""
+    version: Line = ""
+    lease_age_s: Seconds | None = None
+    lease_left_s: Seconds | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class GatewayView(ReplicaWord):
     """What a gateway sees of one replica behind it. Durations in seconds.
 
     Attributes:
@@ -78,74 +105,41 @@ class GatewayView:
             left out: ``lab`` or ``lab/edge``; empty for none.
     """
 
-    slot: Count
-    generation: Count
     state: LinkState
-    ready: frozenset[Line] = frozenset()
-    draining: bool = False
-    at_risk: bool = False
     silent_for_s: Seconds = 0.0
     rtt_s: Seconds | None = None
-    restarts: Count = 0
-    version: Line = ""
-    lease_age_s: Seconds | None = None
-    lease_left_s: Seconds | None = None
-    detail: Line = ""
     through: Line = ""
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> GatewayView:
         """Return one from what a client proxy reports of a link."""
         known = {field.name: report[field.name] for field in fields(cls) if field.name in report}
-        return cls(
-            **{
-                **known,
-                "state": LinkState(report["state"]),
-                "ready": frozenset(report["ready"]),
-            }
-        )
+        known |= {"state": LinkState(report["state"]), "ready": frozenset(report["ready"])}
+        return cls(**known)
 
 
-@dataclass(frozen=True)
-class ProbeAnswer:
-    """What a replica says of itself with each probe.
+@dataclass(frozen=True, kw_only=True)
+class ProbeAnswer(ReplicaWord):
+    """What a replica answers to each probe.
 
     Attributes:
-        ready: Names of the services that it can answer now.
         incarnation: Random text made when the server proxy started. A new one at the
             same id means that it forgot every request.
-        draining: It asks to be left alone: its machine will be taken.
-        at_risk: Its cloud recommends to move it; it serves on meanwhile.
-        restarts: How often it restarted the user's `run` command.
         work: What became of requests since its start, by name (`Responder.report`).
-        detail: Why it is not ready, in words; empty when it is.
         offered: Service name -> type of what `run` offers, where it is to be found out.
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
-        version: Of fogft on the replica; empty before 0.2.0.
-        lease_age_s: Since it last heard of the pool's manager; None for never.
-        lease_left_s: Until it shuts down unless it hears of it again; None for never.
         accepts: Names of compressions that it reads, or does by itself; since 0.2.0 all of them.
         hanging: Services that have work, and have answered nothing for far longer than they take.
         strangers: Connections that were turned away, because nobody with a certificate spoke.
     """
 
-    slot: Count
-    generation: Count
     incarnation: Line
-    ready: frozenset[Line] = frozenset()
-    draining: bool = False
-    at_risk: bool = False
-    restarts: Count = 0
     in_flight: Count = 0
-    detail: Line = ""
     work: Mapping[Line, Seconds] = field(default_factory=dict)
     offered: Mapping[Line, Line] = field(default_factory=dict)
     types: Mapping[Line, Definition] = field(default_factory=dict)
     behind: tuple[GatewayView, ...] = ()
-    version: Line = ""
-    lease_age_s: Seconds | None = None
-    lease_left_s: Seconds | None = None
     accepts: frozenset[Line] = frozenset()
     hanging: frozenset[Line] = frozenset()
     strangers: Count = 0

@@ -16,7 +16,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
 
 from fogft.link.port import (
     DEFAULT_OPTIONS,
@@ -174,21 +173,16 @@ class UplinksLink:
             in_flight=sum(status.in_flight for status in found),
             in_flight_bytes=sum(status.in_flight_bytes for status in found),
             reopened=sum(status.reopened for status in found),
-            uplinks=tuple(self.uplinks()),
+            uplinks=tuple(
+                {
+                    "interface": link.peer.interface,
+                    "state": status.state.value,
+                    "rtt_s": status.rtt_s,
+                    "detail": status.detail,
+                }
+                for link, status in zip(self._links, found, strict=True)
+            ),
         )
-
-    def uplinks(self) -> list[dict[str, Any]]:
-        """Return how each uplink does, for people."""
-        return [
-            {
-                "interface": link.peer.interface,
-                "state": status.state.value,
-                "rtt_s": status.rtt_s,
-                "detail": status.detail,
-            }
-            for link in self._links
-            for status in (link.status(),)
-        ]
 
     def close(self) -> None:
         """End every uplink's link. Attempts still open end with `Refusal.LOST`."""

@@ -42,9 +42,32 @@ DomainId = Annotated[int, within(0, 232)]
 LastsFor = Annotated[float, within(1e-12, LONGEST_S)]
 
 
-@dataclass(frozen=True)
-class ClientProxyConfig:
-    """All that `fogft proxy` or `fogft gateway` needs to know.
+@dataclass(frozen=True, kw_only=True)
+class ProxyConfig:
+    """What every proxy needs to know.
+
+    Attributes:
+        domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
+        records: What was learned from rendezvous, for the next start.
+        announcements: What the manager signed for every replica.
+    """
+
+    pool: str
+    pool_uid: PoolUid
+    credentials: CredentialPaths
+    services: tuple[ServiceSpec, ...]
+    domain_id: DomainId | None = None
+    rendezvous: tuple[Endpoint, ...] = ()
+    records: Path | None = None
+    announcements: Path | None = None
+    metrics: EndpointOrEmpty = ""
+    topics: tuple[TopicSpec, ...] = ()
+    rmw: Speaks = Speaks.RCLPY
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClientProxyConfig(ProxyConfig):
+    """All that `fogft proxy` or `fogft gateway` needs to know; it passes `announcements` on.
 
     Attributes:
         robot: Name of this robot, or gateway.
@@ -52,76 +75,49 @@ class ClientProxyConfig:
         status: What the proxy reports to the manager.
         suspect_after_s: Nothing more is sent to a replica after so long without a probe reply.
         tell_losers: Whether replicas are told which requests were answered elsewhere.
-        domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
-        records: What was learned from rendezvous, for the next start.
-        announcements: What the manager signed for every replica, to be passed on to them.
         dial_in: Address that replicas which cannot be reached are given; `dial_in_listen` is where
             to listen for them, if not on that port of all addresses.
         uplinks: Network interfaces to use at once, the preferred one first.
         listen: Where a gateway listens for robots.
     """
 
-    pool: str
-    pool_uid: PoolUid
     robot: Robot
     membership: Path
     status: Path
     lock: Path
-    credentials: CredentialPaths
-    services: tuple[ServiceSpec, ...]
     suspect_after_s: LastsFor = 2.0
     tell_losers: bool = True
-    domain_id: DomainId | None = None
-    rendezvous: tuple[Endpoint, ...] = ()
-    records: Path | None = None
-    announcements: Path | None = None
     dial_in: EndpointOrEmpty = ""
     dial_in_listen: EndpointOrEmpty = ""
     uplinks: tuple[Interface, ...] = ()
-    metrics: EndpointOrEmpty = ""
-    topics: tuple[TopicSpec, ...] = ()
-    rmw: Speaks = Speaks.RCLPY
     listen: EndpointOrEmpty = ""
 
 
-@dataclass(frozen=True)
-class ServerProxyConfig:
+@dataclass(frozen=True, kw_only=True)
+class ServerProxyConfig(ProxyConfig):
     """All that `fogft serve` needs to know. Its options override the file.
 
     Attributes:
         run: Command that starts the services in `workdir`; empty where they are started otherwise.
         spare: Whether a second process of it is kept, which takes over when the first dies.
-        domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
         notice: Where preemption notices come from.
         max_in_flight: Most requests held at once.
         advertise: Address at which this replica is reached, where it differs.
-        records: What was learned from rendezvous, for the next start.
         dial_out: Robots that this replica dials, where it cannot be reached.
     """
 
-    pool: str
-    pool_uid: PoolUid
     slot: Annotated[int, within(0, 999_999)]
     generation: Generation
-    services: tuple[ServiceSpec, ...]
-    credentials: CredentialPaths
     run: str = ""
     spare: bool = False
     listen: Endpoint = f"0.0.0.0:{LINK_PORT}"
     workdir: Path = Path()
     envs: Mapping[str, str] = field(default_factory=dict)
-    domain_id: DomainId | None = None
     notice: NoticeSource = "auto"
     max_in_flight: Annotated[int, within(1, 1 << 20)] = 512
     log_level: str = "info"
     advertise: EndpointOrEmpty = ""
-    rendezvous: tuple[Endpoint, ...] = ()
-    records: Path | None = None
-    announcements: Path | None = None
     dial_out: tuple[Endpoint, ...] = ()
-    metrics: EndpointOrEmpty = ""
-    topics: tuple[TopicSpec, ...] = ()
-    rmw: Speaks = Speaks.RCLPY
 
     @property
     def id(self) -> ReplicaId:

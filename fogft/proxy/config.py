@@ -8,7 +8,7 @@ from typing import Any
 
 from fogft.errors import StateError
 from fogft.model.choices import Speaks
-from fogft.model.proxy_config import ClientProxyConfig, ServerProxyConfig
+from fogft.model.proxy_config import ClientProxyConfig, ProxyConfig, ServerProxyConfig
 from fogft.poolfile import config_file
 
 DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
@@ -51,6 +51,6 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
     return replace(config, notice=f"file:{path.resolve().parent / file}")
 
 
-def _check(path: Path, config: ClientProxyConfig | ServerProxyConfig) -> None:
+def _check(path: Path, config: ProxyConfig) -> None:
     if config.rmw is Speaks.ZENOH and config.topics:
         raise StateError(f"`{path}` is not usable: rmw: zenoh passes services only; it has topics")

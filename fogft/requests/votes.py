@@ -70,11 +70,6 @@ class Quorum(Decide):
         self._final: OrderedDict[bytes, Any] = OrderedDict()
         self._record: dict[int, deque[bool]] = {}
 
-    @property
-    def undecided(self) -> int:
-        """How many requests are being voted on."""
-        return len(self._open)
-
     def read(self, payload: bytes) -> Any:
         """Return what it says."""
         return self._read(payload)

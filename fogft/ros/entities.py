@@ -13,14 +13,16 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fogft.errors import RosError
 from fogft.log_limits import worth_logging
 from fogft.ros.pacing.client_probes import ServiceProbes
 from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import OnBurst
-from fogft.ros.transfer import ClientEnd, ServiceEnd
+
+if TYPE_CHECKING:
+    from fogft.ros.transfer import ClientEnd, ServiceEnd
 
 log = logging.getLogger(__name__)
 

@@ -3,7 +3,11 @@
 Two implementations: `serialised` (fast, over rcl), and where that fails its test
 `CONVERTED` (over rclpy's own messages: same bytes, same errors, no ctypes).
 
-Owns: the contract of the two and the choice.
+`take` belongs to the take loop and raises RosError for what could not be read, which is gone;
+sending needs the caller's lock, and raises RosError for bytes that are no such message, or that ROS
+refused.
+
+Owns: the choice.
 Not here: the thread, the wait set and the pending requests (`node`).
 """
 
@@ -11,64 +15,31 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 from fogft.errors import RosError
 from fogft.ros.messages import from_bytes, to_bytes
 
+if TYPE_CHECKING:
+    from fogft.ros.serialised import SerialisedClientEnd, SerialisedServiceEnd
+
 log = logging.getLogger(__name__)
 
 
-class ServiceEnd(Protocol):
-    """Bytes of one service. `take` belongs to the take loop; `respond` needs the caller's lock."""
-
-    def take(self) -> tuple[bytes, Any] | None:
-        """Return the next serialised request and its handle; None when there is none.
-
-        Raises:
-            RosError: It could not be read; it is gone.
-        """
-
-    def respond(self, handle: Any, payload: bytes) -> None:
-        """Send a serialised response.
-
-        Raises:
-            RosError: The bytes are no such message, or ROS refused them.
-        """
-
-    def close(self) -> None:
-        """Free what is held. Nothing may be called afterwards."""
-
-
-class ClientEnd(Protocol):
-    """Bytes of one client. `take` belongs to the take loop; `send` needs the caller's lock."""
-
-    def take(self) -> tuple[int, bytes] | None:
-        """Return the next response: sequence number and bytes; None when there is none.
-
-        Raises:
-            RosError: It could not be read; it is gone.
-        """
-
-    def send(self, payload: bytes) -> int:
-        """Send a serialised request; return its sequence number.
-
-        Raises:
-            RosError: The bytes are no such message, or ROS refused them.
-        """
-
-    def close(self) -> None:
-        """Free what is held. Nothing may be called afterwards."""
-
-
-class _ConvertedServiceEnd(ServiceEnd):
-    """Bytes of a service by way of rclpy's messages."""
-
-    def __init__(self, service: Any, service_type: Any) -> None:
-        self._handle = service.handle
+class _Converted:
+    def __init__(self, entity: Any, service_type: Any) -> None:
+        self._handle = entity.handle
         self._type = service_type
 
+    def close(self) -> None:
+        """Do nothing: nothing is held."""
+
+
+class ConvertedServiceEnd(_Converted):
+    """`SerialisedServiceEnd` by way of rclpy's messages."""
+
     def take(self) -> tuple[bytes, Any] | None:
+        """Return the next serialised request and its handle. Raises RosError."""
         try:
             request, header = self._handle.service_take_request(self._type.Request)
         except Exception as error:
@@ -76,6 +47,7 @@ class _ConvertedServiceEnd(ServiceEnd):
         return None if header is None else (to_bytes(request), header.request_id)
 
     def respond(self, handle: Any, payload: bytes) -> None:
+        """Send a serialised response. Raises RosError."""
         response = from_bytes(payload, self._type.Response)
         try:
             self._handle.service_send_response(response, handle)
@@ -83,14 +55,11 @@ class _ConvertedServiceEnd(ServiceEnd):
             raise RosError(f"a response cannot be sent: {error}") from error
 
 
-class _ConvertedClientEnd(ClientEnd):
-    """Bytes of a client by way of rclpy's messages."""
-
-    def __init__(self, client: Any, service_type: Any) -> None:
-        self._handle = client.handle
-        self._type = service_type
+class ConvertedClientEnd(_Converted):
+    """`SerialisedClientEnd` by way of rclpy's messages."""
 
     def take(self) -> tuple[int, bytes] | None:
+        """Return the next response: sequence number and bytes. Raises RosError."""
         try:
             header, response = self._handle.take_response(self._type.Response)
         except Exception as error:
@@ -100,11 +69,16 @@ class _ConvertedClientEnd(ClientEnd):
         return header.request_id.sequence_number, to_bytes(response)
 
     def send(self, payload: bytes) -> int:
+        """Send a serialised request; return its sequence number. Raises RosError."""
         request = from_bytes(payload, self._type.Request)
         try:
             return int(self._handle.send_request(request))
         except Exception as error:
             raise RosError(f"a request cannot be sent: {error}") from error
+
+
+ServiceEnd: TypeAlias = "SerialisedServiceEnd | ConvertedServiceEnd"
+ClientEnd: TypeAlias = "SerialisedClientEnd | ConvertedClientEnd"
 
 
 class Ends(NamedTuple):
@@ -114,7 +88,7 @@ class Ends(NamedTuple):
     client: Callable[[Any, Any], ClientEnd]
 
 
-CONVERTED = Ends(_ConvertedServiceEnd, _ConvertedClientEnd)
+CONVERTED = Ends(ConvertedServiceEnd, ConvertedClientEnd)
 
 
 def choose(service_type: Any, type_name: str) -> Ends:

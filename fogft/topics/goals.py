@@ -252,11 +252,6 @@ class Goals:
             self.ended(goal)
 
     @property
-    def nothing_kept(self) -> bool:
-        """Whether nothing is remembered of any goal that has not ended."""
-        return not (self._goals or self._of_id or self._awaited or self._bytes)
-
-    @property
     def kept(self) -> int:
         """How many goals are remembered."""
         return len(self._goals)

@@ -126,7 +126,9 @@ class Replica:
         self.requests: list[Incoming] = []
         self.probes: list[Probe] = []
         self.echo = False
-        self.answer = ProbeAnswer(slot, generation, "first", frozenset({SERVICE}))
+        self.answer = ProbeAnswer(
+            slot=slot, generation=generation, incarnation="first", ready=frozenset({SERVICE})
+        )
         self.cancelled: list[bytes] = []
         self.speaks = threading.Event()
         self.speaks.set()
@@ -401,7 +403,9 @@ def test_a_closed_link_loses_what_is_open(
 def test_what_a_probe_says_is_seen_on_the_link(
     world: World, replica: Replica, link: Link, owner: Owner
 ) -> None:
-    replica.answer = ProbeAnswer(0, 1, "first", frozenset(), draining=True, detail="starts")
+    replica.answer = ProbeAnswer(
+        slot=0, generation=1, incarnation="first", ready=frozenset(), draining=True, detail="starts"
+    )
     world.wait_for(lambda: link.draining)
     assert link.ready == frozenset()
     assert link.usable
@@ -422,11 +426,13 @@ def test_definitions_are_asked_for_once_and_kept(
 ) -> None:
     """They are long and do not change while a replica lives."""
     told = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
-    replica.answer = ProbeAnswer(0, 1, "first", frozenset({SERVICE}), types=told)
+    replica.answer = ProbeAnswer(
+        slot=0, generation=1, incarnation="first", ready=frozenset({SERVICE}), types=told
+    )
     link = world.dialer().dial(peer(replica.listener.endpoint), keys(0), owner)
     world.wait_for(lambda: link.usable)
     assert replica.probes[0].describe
-    replica.answer = ProbeAnswer(0, 1, "first", frozenset())
+    replica.answer = ProbeAnswer(slot=0, generation=1, incarnation="first", ready=frozenset())
     world.wait_for(lambda: not link.ready)
     answer = link.status().probe_answer
     assert answer is not None
@@ -457,7 +463,9 @@ def test_a_replica_that_says_it_is_another_never_comes_up(
     world: World, owner: Owner, said: tuple[int, int]
 ) -> None:
     replica = Replica(world.listener(0, 1))
-    replica.answer = ProbeAnswer(*said, "first", frozenset({SERVICE}))
+    replica.answer = ProbeAnswer(
+        slot=said[0], generation=said[1], incarnation="first", ready=frozenset({SERVICE})
+    )
     link = world.dialer().dial(peer(replica.listener.endpoint), keys(0), owner)
     words = f"says that it is {said[0]}.{said[1]}, not 0.1"
     world.wait_for(lambda: words in link.status().detail)

@@ -203,8 +203,23 @@ def targets() -> dict[str, Target]:
     framed, recorded = (FrameError,), (RecordError,)
     types = {"a/srv/B": Definition("RIHS01_0", {"request": (("x", "a/C[2]"),), "a/C": ()})}
     offered = {"/s": "a/srv/B"}
-    answer = ProbeAnswer(0, 1, "x", frozenset({"/s"}), detail="why", types=types, offered=offered)
-    behind = GatewayView(1, 2, LinkState.UP, frozenset({"/s"}), rtt_s=0.01, through="lab/edge")
+    answer = ProbeAnswer(
+        slot=0,
+        generation=1,
+        incarnation="x",
+        ready=frozenset({"/s"}),
+        detail="why",
+        types=types,
+        offered=offered,
+    )
+    behind = GatewayView(
+        slot=1,
+        generation=2,
+        state=LinkState.UP,
+        ready=frozenset({"/s"}),
+        rtt_s=0.01,
+        through="lab/edge",
+    )
     gateway = replace(answer, types={}, behind=(behind, behind), accepts=compression.ACCEPTED)
     plain = [json.dumps(records.to_plain(one)).encode() for one in signed_records()]
     known = Membership("p", UID, 1, 2, (Member(ReplicaId(UID, 0, 1), "h:1"),), frozenset({ROBOT}))

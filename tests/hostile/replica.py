@@ -52,7 +52,9 @@ def main() -> None:
     listener.streams.opened = throws  # type: ignore[method-assign]
 
     def on_probe(probe: Probe) -> ProbeAnswer:
-        return ProbeAnswer(int(slot), 1, "hostile", frozenset({SERVICE}))
+        return ProbeAnswer(
+            slot=int(slot), generation=1, incarnation="hostile", ready=frozenset({SERVICE})
+        )
 
     listener.serve(keys(int(slot)), lambda incoming: None, on_probe)
     print(json.dumps({"endpoint": listener.endpoint}), flush=True)

@@ -220,7 +220,7 @@ def listener(authority: Authority, arrived: list[Incoming]) -> Iterator[ZenohLis
     listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
 
     def answer_probe(probe: Probe) -> ProbeAnswer:
-        return ProbeAnswer(0, 1, "here", frozenset({SERVICE}))
+        return ProbeAnswer(slot=0, generation=1, incarnation="here", ready=frozenset({SERVICE}))
 
     listener.serve(keys(0), arrived.append, answer_probe)
     yield listener
@@ -357,7 +357,13 @@ def test_one_that_is_not_taken_does_not_take_the_others_with_it(
 
     owner.answered = hear  # type: ignore[method-assign]
     listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
-    listener.serve(keys(0), take, lambda probe: ProbeAnswer(0, 1, "i", frozenset({SERVICE})))
+    listener.serve(
+        keys(0),
+        take,
+        lambda probe: ProbeAnswer(
+            slot=0, generation=1, incarnation="i", ready=frozenset({SERVICE})
+        ),
+    )
     try:
         link = dial(listener.endpoint)
         wait_for(lambda: link.usable)

@@ -247,7 +247,7 @@ def test_a_robot_name_that_cannot_travel_is_refused_at_once(robot: str) -> None:
 
 def test_a_long_detail_is_cut_and_the_answer_still_travels() -> None:
     """Detail is for people; it never costs the probe."""
-    answer = ProbeAnswer(0, 1, "i", detail="\ud800" + "x" * 100_000)
+    answer = ProbeAnswer(slot=0, generation=1, incarnation="i", detail="\ud800" + "x" * 100_000)
     decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
     assert len(decoded.detail) == probe_frames.DETAIL_LIMIT
 
@@ -283,7 +283,7 @@ def test_what_would_move_a_cursor_is_refused_wherever_it_stands(hostile: str) ->
 @pytest.mark.parametrize("said", ESCAPES)
 def test_what_a_program_prints_travels_as_one_line(said: str) -> None:
     """The end of a log may hold anything: the replica that tells it is not refused for it."""
-    answer = ProbeAnswer(0, 1, "i", detail=f"`run` ended: {said}")
+    answer = ProbeAnswer(slot=0, generation=1, incarnation="i", detail=f"`run` ended: {said}")
     decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
     assert decoded.detail.startswith("`run` ended:")
     assert decoded.detail.isprintable()
@@ -294,7 +294,14 @@ def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels()
     large = {"a/srv/B": Definition("h", {"request": (("x" * 300_000, "int32"),)})}
     small = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
     for types, told in ((large, {}), (small, small)):
-        answer = ProbeAnswer(0, 1, "i", frozenset({"/s"}), types=types, offered={"/s": "a/srv/B"})
+        answer = ProbeAnswer(
+            slot=0,
+            generation=1,
+            incarnation="i",
+            ready=frozenset({"/s"}),
+            types=types,
+            offered={"/s": "a/srv/B"},
+        )
         decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
         assert (decoded.types, decoded.ready) == (told, {"/s"})
         assert decoded.offered == {"/s": "a/srv/B"}
@@ -305,9 +312,11 @@ def test_the_most_that_a_pool_file_may_name_fits_into_a_probes_answer(count: int
     """As ready and as told of; views of replicas behind a gateway are what is left out."""
     each = NAMES_BYTES_LIMIT // count
     names = [f"/{number:0{each - 1}}" for number in range(count)]
-    behind = (GatewayView(0, 1, LinkState.UP, frozenset(names)),) * 20
+    behind = (GatewayView(slot=0, generation=1, state=LinkState.UP, ready=frozenset(names)),) * 20
     told = dict.fromkeys(names[: count // 3], "std_srvs/srv/SetBool")
-    answer = ProbeAnswer(0, 1, "i", frozenset(names), offered=told, behind=behind)
+    answer = ProbeAnswer(
+        slot=0, generation=1, incarnation="i", ready=frozenset(names), offered=told, behind=behind
+    )
     decoded = probe_frames.decode_probe_answer(probe_frames.encode_probe_answer(answer))
     assert (decoded.ready, decoded.offered) == (frozenset(names), told)
     assert len(decoded.behind) < 20
@@ -315,7 +324,9 @@ def test_the_most_that_a_pool_file_may_name_fits_into_a_probes_answer(count: int
 
 def test_too_many_services_for_a_frame_are_an_error_at_the_sender() -> None:
     """A frame that nobody could read is not sent."""
-    answer = ProbeAnswer(0, 1, "i", ready=frozenset(f"/{n:0100}" for n in range(3000)))
+    answer = ProbeAnswer(
+        slot=0, generation=1, incarnation="i", ready=frozenset(f"/{n:0100}" for n in range(3000))
+    )
     with pytest.raises(ValueError, match="probe's answer"):
         probe_frames.encode_probe_answer(answer)
 

@@ -73,7 +73,7 @@ class Scene:
 def test_each_uplink_is_dialled_through_its_interface():
     scene = Scene("prefer", 3)
     assert [one.peer.interface for one in scene.uplinks] == ["if0", "if1", "if2"]
-    assert [u["interface"] for u in scene.link.uplinks()] == ["if0", "if1", "if2"]
+    assert [u["interface"] for u in scene.link.status().uplinks] == ["if0", "if1", "if2"]
 
 
 def test_all_sends_on_each_and_takes_the_first_answer():

@@ -52,7 +52,7 @@ class Scene:
         self._folder = folder
 
     def wait_up(self) -> None:
-        wait_for(lambda: [u["state"] for u in self.link.uplinks()] == ["up", "up"], LIMIT_S)
+        wait_for(lambda: [u["state"] for u in self.link.status().uplinks] == ["up", "up"], LIMIT_S)
         wait_for(lambda: SERVICE in self.link.ready, LIMIT_S)
 
     def ask(self, numbers: Iterable[int]) -> None:
@@ -116,7 +116,7 @@ def test_an_uplink_that_stalls_or_goes_costs_no_request(tmp_path, policy, fault)
             near.close()
         scene.ask(range(10, 20))
         scene.check(20)
-        wait_for(lambda: scene.link.uplinks()[0]["state"] != "up", LIMIT_S)
+        wait_for(lambda: scene.link.status().uplinks[0]["state"] != "up", LIMIT_S)
         scene.ask(range(20, 30))
         scene.check(30)
     finally:

@@ -96,7 +96,7 @@ def test_without_agreement_nobody_is_blamed():
         votes.closed(bytes([number]), Pending(0.0, None))
     assert not votes.flagged
     assert not votes.disagreed
-    assert not votes.undecided
+    assert not votes.vote(bytes([0]), ballot(2, 1.0))  # no ballot of it is kept
 
 
 def test_a_copy_is_no_second_vote():

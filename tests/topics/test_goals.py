@@ -186,7 +186,8 @@ def test_nothing_is_left_of_goals_that_ended(steps):
     for number in (1, 2, 3):
         made.ended(goal(number))
     assert len(made.over) <= ids
-    assert made.nothing_kept
+    assert made.kept == 0
+    assert made.lacking(1, 1e9) == []
 
 
 @given(st.binary(max_size=80))

@@ -10,20 +10,10 @@ from __future__ import annotations
 
 import heapq
 from collections import OrderedDict
-from typing import NamedTuple
 
 from fogft.proxy.replica.service_queue import Job
 
 _DEADLINES_KEPT = 1024  # of jobs that were forgotten
-
-
-class Remembered(NamedTuple):
-    """How much is remembered."""
-
-    requests: int
-    deadlines: int
-    answers: int  # that copies of their requests would get
-    answer_bytes: int
 
 
 class KnownRequests:
@@ -45,11 +35,9 @@ class KnownRequests:
         self.held = 0
         self.held_bytes = 0
 
-    @property
-    def remembered(self) -> Remembered:
-        """How much is remembered, answered requests included."""
-        deadlines, kept = len(self._deadlines), len(self._kept)
-        return Remembered(len(self._jobs), deadlines, kept, self._kept_bytes)
+    def __len__(self) -> int:
+        """Return how much is remembered: requests, answered ones included, and deadlines."""
+        return len(self._jobs) + len(self._deadlines)
 
     def unanswered(self, service: str | None) -> list[Job]:
         """Return the jobs that somebody waits for, of one service or of all."""

@@ -23,7 +23,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.interruption import Interruptions
-from fogft.proxy.replica.known_requests import KnownRequests, Remembered
+from fogft.proxy.replica.known_requests import KnownRequests
 from fogft.proxy.replica.service_queue import Job, ServiceQueue
 from fogft.requests.load import Handling, Load
 from fogft.ros.port import RosClient
@@ -277,10 +277,9 @@ class Responder:
         return False
 
     @property
-    def remembered(self) -> Remembered:
-        """How much of requests is remembered, answered ones included."""
-        with self._lock:
-            return self._known.remembered
+    def remembered(self) -> int:
+        """How many ids and deadlines of requests are remembered, answered ones included."""
+        return len(self._known)
 
     def _finished(self, job: Job, payload: bytes) -> None:
         now = self._clock()

@@ -97,7 +97,11 @@ def main() -> None:
     def on_probe(probe: Probe) -> ProbeAnswer:
         slot, generation = given["claims"]
         return ProbeAnswer(
-            slot, generation, "test", frozenset(state["ready"]), bool(state["draining"])
+            slot=slot,
+            generation=generation,
+            incarnation="test",
+            ready=frozenset(state["ready"]),
+            draining=bool(state["draining"]),
         )
 
     listener.serve(keys(given["slot"]), service.request, on_probe)

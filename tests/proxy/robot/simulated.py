@@ -241,9 +241,7 @@ class World:
         self.links: list[SimulatedLink] = []
         self.asked: dict[int, float] = {}
         self.answers: list[tuple[int, float, bytes]] = []
-        self.spec = ServiceSpec(
-            "/s", "t/srv/T", timeout_s=timeout_s, hedging=hedging
-        )
+        self.spec = ServiceSpec("/s", "t/srv/T", timeout_s=timeout_s, hedging=hedging)
         self.dispatcher = Dispatcher(
             self.spec,
             lambda handle, payload: self.answers.append((handle, self.now, payload)),

@@ -275,7 +275,9 @@ def test_a_proxy_whose_take_loop_ended_says_so_and_does_not_go_on():
 
 def told(slot: int, kind: str) -> ProbeAnswer:
     types = {SET_BOOL: Definition(fields={"request": (("data", kind),)})}
-    return ProbeAnswer(slot, 1, "i", frozenset({"/s"}), types=types)
+    return ProbeAnswer(
+        slot=slot, generation=1, incarnation="i", ready=frozenset({"/s"}), types=types
+    )
 
 
 def test_a_replica_whose_type_differs_is_not_asked_and_says_which_field():

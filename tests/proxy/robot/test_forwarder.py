@@ -147,12 +147,12 @@ def test_closing_refuses_what_is_under_way(scene):
 
 
 def status(state: LinkState, *behind: GatewayView, detail: str = "") -> LinkStatus:
-    answer = ProbeAnswer(1, 1, "x", behind=behind)
+    answer = ProbeAnswer(slot=1, generation=1, incarnation="x", behind=behind)
     return LinkStatus(state, answer, 0.5, 3.0, 0.01, 0, 0, 0, detail)
 
 
 def test_replicas_are_seen_through_a_gateway_as_if_linked():
-    up = GatewayView(0, 1, LinkState.UP, READY, rtt_s=0.02)
+    up = GatewayView(slot=0, generation=1, state=LinkState.UP, ready=READY, rtt_s=0.02)
     (seen,) = seen_through(status(LinkState.UP, up), "edge")
     assert (seen["state"], seen["ready"], seen["through"]) == ("up", ["/s"], "edge")
     assert seen["rtt_s"] == pytest.approx(0.03)
@@ -163,9 +163,9 @@ def test_replicas_are_seen_through_a_gateway_as_if_linked():
 
 
 def test_the_best_sight_of_a_replica_counts():
-    up = GatewayView(0, 1, LinkState.UP, READY)
-    lost = GatewayView(0, 1, LinkState.SUSPECT)
-    other = GatewayView(1, 2, LinkState.CONNECTING)
+    up = GatewayView(slot=0, generation=1, state=LinkState.UP, ready=READY)
+    lost = GatewayView(slot=0, generation=1, state=LinkState.SUSPECT)
+    other = GatewayView(slot=1, generation=2, state=LinkState.CONNECTING)
     reports = [
         *seen_through(status(LinkState.UP, lost, other), "one"),
         *seen_through(status(LinkState.UP, up), "two"),

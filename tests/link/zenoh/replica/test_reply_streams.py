@@ -86,7 +86,7 @@ def test_a_connection_whose_answers_have_ended_is_replaced(
     listener = ZenohListener("127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1))
 
     def answer_probe(probe: Probe) -> ProbeAnswer:
-        return ProbeAnswer(0, 1, "here", frozenset({SERVICE}))
+        return ProbeAnswer(slot=0, generation=1, incarnation="here", ready=frozenset({SERVICE}))
 
     listener.serve(keys(0), held.append, answer_probe)
     try:
@@ -124,7 +124,11 @@ class Answering:
         id = ReplicaId(POOL_UID, 0, 1)
         self.listener = ZenohListener("127.0.0.1:0", authority.replica(), id)
         self.listener.serve(
-            keys(0), self._take, lambda probe: ProbeAnswer(0, 1, "here", frozenset({SERVICE}))
+            keys(0),
+            self._take,
+            lambda probe: ProbeAnswer(
+                slot=0, generation=1, incarnation="here", ready=frozenset({SERVICE})
+            ),
         )
 
     def _take(self, incoming: Incoming) -> None:

@@ -20,7 +20,7 @@ from fogft.model.type_definition import Definition
 from tests.link.wire_pool import POOL_UID
 
 PEER = Peer(ReplicaId(POOL_UID, 2, 3), "127.0.0.1:7447", "replica")
-ANSWER = ProbeAnswer(2, 3, "first", frozenset({"/s"}))
+ANSWER = ProbeAnswer(slot=2, generation=3, incarnation="first", ready=frozenset({"/s"}))
 TYPES = {"std_srvs/srv/SetBool": Definition("hash")}
 
 
