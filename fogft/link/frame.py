@@ -103,11 +103,7 @@ def origin(robot: str, token: bytes) -> bytes:
 
 @lru_cache(maxsize=256)  # a robot says the same in each request of a connection
 def read_origin(origin: bytes) -> tuple[bytes, str]:
-    """Return the token and the robot's name of what `origin` wrote.
-
-    Raises:
-        FrameError: It is no such thing.
-    """
+    """Return the token and the robot's name of what `origin` wrote."""
     token, name = origin[:TOKEN_BYTES], origin[TOKEN_BYTES:]
     if not 0 < len(name) <= ROBOT_BYTES_LIMIT:
         raise FrameError(f"a robot's name of {len(name)} bytes")
@@ -121,11 +117,7 @@ def read_origin(origin: bytes) -> tuple[bytes, str]:
 
 
 def check_remaining(remaining_s: float) -> None:
-    """Refuse a remaining time that is none.
-
-    Raises:
-        FrameError: It is negative, too long, or no number.
-    """
+    """Refuse a remaining time that is negative, too long, or no number."""
     if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
         raise FrameError(f"a remaining time of {remaining_s} s")
 
@@ -148,7 +140,7 @@ def encode_request(
 
 
 def decode_request(frame: bytes) -> RequestHeader:
-    """Read a request's header. Raises FrameError: it is not one."""
+    """Read a request's header."""
     if len(frame) < _ORIGIN_AT:
         raise FrameError(f"a request's header of {len(frame)} bytes")
     version, flags, request_id, remaining_s, seen = _REQUEST.unpack_from(frame)
@@ -170,7 +162,7 @@ def decode_request(frame: bytes) -> RequestHeader:
 
 
 def read_handling(flags: int) -> Handling:
-    """Return what a replica is asked to do. Raises FrameError: it is nothing that is known."""
+    """Return what a replica is asked to do."""
     handling = _HANDLINGS.get(flags)
     if handling is None:
         raise FrameError(f"a request with flags {flags:#x}")
@@ -188,11 +180,7 @@ def encode_load(load: Load | None) -> bytes:
 
 
 def decode_load(frame: bytes) -> Load | None:
-    """Return what a replica has to do; None where it does not say. `frame` has `LOAD_BYTES`.
-
-    Raises:
-        FrameError: A time in it is negative, too long, or no number.
-    """
+    """Return what a replica has to do; None where it does not say. `frame` has `LOAD_BYTES`."""
     if frame == NO_LOAD:
         return None
     load = Load._make(_LOAD.unpack(frame))
@@ -209,11 +197,7 @@ def encode_answer(
 
 
 def decode_answer(frame: bytes) -> tuple[bytes, bytes, Load | None, bool]:
-    """Return stamp, request id and load of an answer's header, and whether it is compressed.
-
-    Raises:
-        FrameError: It is not one.
-    """
+    """Return stamp, request id and load of an answer's header, and whether it is compressed."""
     if len(frame) != _ANSWER.size:
         raise FrameError(f"an answer's header of {len(frame)} bytes")
     first, stamp, request_id, load = _ANSWER.unpack(frame)
@@ -227,11 +211,7 @@ def encode_refusal(stamp: bytes, request_id: bytes, reason: str, load: bytes = N
 
 
 def decode_refusal(frame: bytes) -> tuple[bytes, bytes, str, Load | None]:
-    """Return the stamp, the request id, the reason and the load of a refusal.
-
-    Raises:
-        FrameError: It is not one.
-    """
+    """Return the stamp, the request id, the reason and the load of a refusal."""
     if len(frame) < _ANSWER.size:
         raise FrameError(f"a refusal of {len(frame)} bytes")
     version, stamp, request_id, load = _ANSWER.unpack_from(frame)
@@ -240,7 +220,7 @@ def decode_refusal(frame: bytes) -> tuple[bytes, bytes, str, Load | None]:
 
 
 def read_reason(said: bytes) -> str:
-    """Return the reason of a refusal. Raises FrameError: it is none."""
+    """Return the reason of a refusal."""
     if not 0 < len(said) <= REASON_LIMIT:
         raise FrameError(f"a reason of {len(said)} bytes")
     try:
@@ -276,7 +256,7 @@ def encode_greeting(greeting: Greeting) -> bytes:
 
 
 def decode_greeting(frame: bytes) -> Greeting:
-    """Read a greeting; nothing in it is verified. Raises FrameError: it is not one."""
+    """Read a greeting; nothing in it is verified."""
     if len(frame) == _TOKEN.size:
         version, token = _TOKEN.unpack(frame)
         check_version(version)
@@ -297,11 +277,7 @@ def encode_cancel(ids: Sequence[bytes]) -> bytes:
 
 
 def decode_cancel(frame: bytes) -> list[bytes]:
-    """Return the ids of requests that are no longer wanted.
-
-    Raises:
-        FrameError: It is not a list of ids.
-    """
+    """Return the ids of requests that are no longer wanted."""
     if not frame or (len(frame) - 1) % REQUEST_ID_BYTES or len(frame) > _CANCEL_BYTES_LIMIT:
         raise FrameError(f"a cancellation of {len(frame)} bytes")
     check_version(frame[0])

@@ -68,20 +68,15 @@ def group_of(groups: Sequence[Group], slot: int) -> Group:
 
 def groups_of(spec: PoolSpec) -> tuple[Group, ...]:
     """Return a pool's groups, in the order of their slots."""
-    if "groups" not in spec.derived:
-        spec.derived["groups"] = _groups_of(spec)
-    groups: tuple[Group, ...] = spec.derived["groups"]
-    return groups
-
-
-def _groups_of(spec: PoolSpec) -> tuple[Group, ...]:
-    if not spec.groups:
+    known: tuple[Group, ...] | None = spec.derived.get("groups")
+    if known is None:
         resources = spec.task.get("resources") or {}
-        return (Group("", 0, spec.replicas, resources, spec.on_demand),)
-    return tuple(
-        Group(g.name, block, g.replicas, g.resources, g.on_demand)
-        for block, g in enumerate(spec.groups)
-    )
+        known = tuple(
+            Group(g.name, block, g.replicas, g.resources, g.on_demand)
+            for block, g in enumerate(spec.groups)
+        ) or (Group("", 0, spec.replicas, resources, spec.on_demand),)
+        spec.derived["groups"] = known
+    return known
 
 
 def replica_hash(spec: PoolSpec, slot: int) -> str:

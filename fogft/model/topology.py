@@ -99,10 +99,6 @@ class Topology:
         """Return a gateway by its name."""
         return next((g for g in self.gateways if g.name == name), None)
 
-    def of_robot(self, name: str) -> tuple[str, ...]:
-        """Return the gateways that a robot goes through; none for the replicas."""
-        return self.robots.get(name, self.through)
-
     def neighbours(self, holder: Holder) -> tuple[Gateway, ...]:
         """Return the gateways that somebody talks to; none for the replicas.
 
@@ -112,7 +108,7 @@ class Topology:
             own = self.of(holder.name)
             listed = own.through if own is not None else ()
         else:
-            listed = self.of_robot(holder.name)
+            listed = self.robots.get(holder.name, self.through)
         return tuple(g for g in self.gateways if g.name in listed and g.generations)
 
 

@@ -61,17 +61,15 @@ def difference(type_name: str, here: Definition, there: Definition) -> str:
     if here.hash and here.hash == there.hash:
         return ""
     if not (here.fields and there.fields):  # on either side only its hash is known
-        return _of_service_hashes(type_name, here.service_hash, there.service_hash)
+        return _of_hashes(type_name, here.service_hash, there.service_hash)
     for part in (REQUEST, RESPONSE):
         found = _first_difference(part, part, here, there, set())
         if found:
             return f"`{type_name}` is not the same: {found}"
-    if here.hash and there.hash and here.hash.partition("_")[0] == there.hash.partition("_")[0]:
-        return f"`{type_name}` is not the same: its hash is {here.hash} here, {there.hash} there"
-    return ""
+    return _of_hashes(type_name, here.hash, there.hash)
 
 
-def _of_service_hashes(type_name: str, here: str, there: str) -> str:
+def _of_hashes(type_name: str, here: str, there: str) -> str:
     comparable = here and there and here.partition("_")[0] == there.partition("_")[0]
     if not comparable or here == there:
         return ""

@@ -206,13 +206,6 @@ class Auto(Learning):
         """Whether the replica is to drop it unless it has nothing else to do."""
         return (request, replica) in self._spares.open
 
-    def _doubts(self, replica: int, begun: float, now: float) -> bool:
-        known = self._of(replica)
-        was = known.doubted
-        if known.doubt(begun, now) and not was:
-            self.news = True  # what else it has goes to another, too
-        return known.doubted
-
     def _look(self, at: float) -> None:
         self.look_at = min(self.look_at, at)
 

@@ -120,6 +120,14 @@ class Learning(Choose):
         self._of(replica).answered(request, load, now)
         return super().answered(request, open, replica, load, now)
 
+    def _doubts(self, replica: int, begun: float, now: float) -> bool:
+        """Whether a replica is doubted, by an attempt that began then."""
+        known = self._of(replica)
+        was = known.doubted
+        if known.doubt(begun, now) and not was:
+            self.news = True  # what else it has goes to another, too
+        return known.doubted
+
     def hangs(self, replica: int) -> None:
         """Doubt it: what it has goes to others at once."""
         self._of(replica).doubted = self.news = True
@@ -156,11 +164,8 @@ class Failover(Learning):
         if not candidates:
             return ()
         for replica, begun in open.items():
-            known = self._of(replica)
-            was = known.doubted
-            self.news |= known.doubt(begun, now) and not was
-            if not known.doubted:
-                overdue_at = known.doubtful_at(begun)
+            if not self._doubts(replica, begun, now):
+                overdue_at = self._of(replica).doubtful_at(begun)
                 if now < overdue_at:
                     self.look_at = min(self.look_at, overdue_at)
                 return ()

@@ -167,7 +167,7 @@ class GoalsOnce:
                 payload, known.payload = known.payload, b""
             client = self._clients.get(service)
             if client is None:
-                self._drop(server, goal, known, Refusal.NOT_READY)
+                self._drop(service, goal, known, Refusal.NOT_READY)
                 continue
             try:
                 answered = partial(self._answered, service, goal, life)
@@ -176,16 +176,14 @@ class GoalsOnce:
                 log.warning("goal_not_passed_on service=%s reason=%r", service, str(error))
                 hopeless = isinstance(error, Unreadable)
                 reason = Refusal.MALFORMED if hopeless else Refusal.OVERLOADED
-                self._drop(server, goal, known, reason)
+                self._drop(service, goal, known, reason)
 
-    def _drop(self, server: _ActionServer, goal: bytes, known: _Open, reason: Refusal) -> None:
+    def _drop(self, service: str, goal: bytes, known: _Open, reason: Refusal) -> None:
         """Forget a goal that the action server was not given after all."""
         with self._lock:
-            if server.open.get(goal) is known:
-                del server.open[goal]
-            waiting, known.waiting = known.waiting, []
-        for _, incoming in waiting:
-            incoming.refuse(reason)
+            if self._servers[service].open.get(goal) is known:
+                del self._servers[service].open[goal]
+        self._refuse(service, (known,), reason)
 
     def _answered(self, service: str, goal: bytes, life: int, answer: bytes) -> None:
         server = self._servers[service]

@@ -372,7 +372,7 @@ class ServerProxy:
 
     def _detail(self) -> str:
         if self.complete:
-            return self._state_detail() or self._topics.trouble or self._hanging_detail()
+            return self._detail_of_complete()
         for why in self._not_usable.values():
             return why
         if self._topics.trouble:
@@ -383,16 +383,13 @@ class ServerProxy:
             return f"`run` {self._supervisor.last_exit}: see `fogft logs {self._id.slot}`"
         return self._offering.missing(self.ready)
 
-    def _state_detail(self) -> str:
+    def _detail_of_complete(self) -> str:
         for name, ordered in self._ordered.items():
             if not ordered.ready:
                 return ordered.detail or f"`{name}` does not have the present state yet"
-        return ""
-
-    def _hanging_detail(self) -> str:
-        for name, seconds in self._hanging().items():
+        for name, seconds in () if self._topics.trouble else self._hanging().items():
             return f"`{name}` has work and has answered nothing for {seconds:.0f} s"
-        return ""
+        return self._topics.trouble
 
     def close(self) -> None:
         """Stop the command, leave the wire and ROS."""

@@ -109,14 +109,14 @@ class ClientProxy:
                 keys_changed = True
             if keys_changed:
                 self.links.redial()
-        self._change()
+        self.look_again()
 
     def pass_topics(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> None:
         """Pass these topics and no others; `node` publishes and subscribes on the robot's side."""
         with self._lock:
             if self._topics.serve(topics, node):
                 self.links.redial()
-        self._change()
+        self.look_again()
 
     def _new_service(self, spec: ServiceSpec) -> ProxiedService:
         service: ProxiedService
@@ -165,7 +165,7 @@ class ClientProxy:
                 self._drop(id)
             for member in members.values():
                 self.links.reach(member)
-        self._change()
+        self.look_again()
         return True
 
     def renew(self) -> None:
@@ -183,15 +183,11 @@ class ClientProxy:
         log.error("robot_revoked certificate=%s", own)
         return True
 
-    def types_changed(self) -> None:
-        """Have routes worked out anew: a type may be known here that was not. Any thread."""
-        self._change()
-
     def redial(self) -> None:
         """Dial everybody anew, by other uplinks; what is in flight is sent again."""
         with self._lock:
             self.links.redial()
-        self._change()
+        self.look_again()
 
     def _keys(self, slot: int) -> dict[str, str]:
         types = {name: service.spec.type for name, service in self._services.items()}
@@ -216,7 +212,7 @@ class ClientProxy:
 
     def changed(self, link: Link) -> None:
         """Wake `run_once`: routes are worked out there, not on a link's thread."""
-        self._change()
+        self.look_again()
 
     def late(self, link: Link, answer: Answer) -> None:
         """Pass on the end of an attempt that nobody awaits."""
@@ -224,7 +220,8 @@ class ClientProxy:
         if found is not None:
             found.dispatcher.late(link, answer)
 
-    def _change(self) -> None:
+    def look_again(self) -> None:
+        """Have routes worked out anew: a type may be known that was not, say. Any thread."""
         self._changed = True
         self._wake.set()
 

@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from fogft import __version__, disk
 from fogft.disk import Watched
@@ -46,6 +46,7 @@ from fogft.ros import memory_tuning
 
 if TYPE_CHECKING:
     from fogft.ros.node import SerialisedNode
+    from fogft.ros.participant.joining import EarlyJoin
     from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
@@ -85,70 +86,19 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
         if stop.is_set():
             return
         config = _same(config, read_client(config_path, metrics), config_path)
-    began = time.monotonic()
     _bury(config)
-    from fogft.ros import goal_status
-    from fogft.ros.messages import check_ok_field
-
-    made: list[ClientProxy] = []  # the node asks the proxy that is made with it
-    joined = middleware.join(
-        config.rmw,
-        _node_name("fogft_proxy", config.pool),
-        config.domain_id,
-        early=early,
-        told=lambda: made[0].links.types() if made else {},
-        noticed=lambda: made[0].types_changed() if made else None,
-    )
-    make = functools.partial(
-        make_dispatcher,
-        marks=config.status.with_suffix(".marks"),
-        pool_uid=config.pool_uid,
-        actions=Actions(),
-        speaks=config.rmw,
-        id_of=in_line.request_ids(config.credentials.key),
-    )
-    dialer = make_dialer(config)
-    proxy = ClientProxy(
-        config.pool_uid, joined.node, dialer, make, define=joined.define, merge=goal_status.merged
-    )
-    made.append(proxy)
-    visible = functools.partial(_make_visible, joined, _node_name("fogft", config.pool))
-    seen = SeenFromRos(config.pool, config.robot, visible, check_ok_field)
-    proxy.serve(seen.follow(config.services))
-    proxy.pass_topics(config.topics, cast("SerialisedNode", joined.node))
-    following = Following(config)
-    scrape = Scrape(lambda: proxies.of_client(proxy.report()), {"pool": config.pool})
-    scrape.at(config.metrics)
-    log.info("proxy_started pool=%s robot=%s pid=%d standby=%s start_s=%.2f", config.pool,
-             config.robot, os.getpid(), early is not None, time.monotonic() - began)  # fmt: skip
     running = _Running(
-        config_path, metrics, config, lock, proxy, following, dialer, seen, scrape, joined,
-        managing, wanted("fogft-robot", config.pool),
-    )  # fmt: skip
+        config_path, config, metrics=metrics, lock=lock, managing=managing, early=early
+    )
     try:
         start.settle()
         notify("READY=1")
         running.loop(stop)
         if stop.is_set():
-            in_line.hand_over(config, proxy, running.callers, running.release)
+            in_line.hand_over(config, running.proxy, running.callers, running.release)
     finally:
-        managing.close()
-        scrape.close()
-        following.close()
-        proxy.close()
-        joined.node.close()
-        lock.release()
+        running.close()
         log.info("proxy_stopped pool=%s", config.pool)
-
-
-def _make_visible(
-    joined: middleware.Joined, name: str, judge: Callable[[Mapping[str, Any]], str]
-) -> VisibleNode | None:
-    try:
-        return joined.make_visible(name, judge)
-    except FogftError as error:
-        log.error("visible_node_off reason=%r", error.message)
-        return None
 
 
 def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
@@ -223,29 +173,78 @@ def _replica_disagrees(service: str, replica: int, count: int) -> None:
               service, replica >> 32, replica & 0xFFFFFFFF, count)  # fmt: skip
 
 
-class _Running(NamedTuple):
+class _Running:
     """A client proxy that runs, with all that its thread sees to."""
 
-    config_path: Path
-    metrics: str | None
-    config: ClientProxyConfig
-    lock: disk.Lock
-    proxy: ClientProxy
-    following: Following
-    dialer: UplinkDialer
-    seen: SeenFromRos
-    scrape: Scrape
-    joined: middleware.Joined
-    managing: ManagerRestart
-    spans: Spans | None
+    def __init__(
+        self,
+        config_path: Path,
+        config: ClientProxyConfig,
+        *,
+        metrics: str | None,
+        lock: disk.Lock,
+        managing: ManagerRestart,
+        early: EarlyJoin | None,
+    ) -> None:
+        from fogft.ros import goal_status
+        from fogft.ros.messages import check_ok_field
+
+        began = time.monotonic()
+        self.config_path, self.metrics, self.config = config_path, metrics, config
+        self.lock, self.managing = lock, managing
+        made: list[ClientProxy] = []  # the node asks the proxy that is made with it
+        joined = self.joined = middleware.join(
+            config.rmw,
+            _node_name("fogft_proxy", config.pool),
+            config.domain_id,
+            early=early,
+            told=lambda: made[0].links.types() if made else {},
+            noticed=lambda: made[0].look_again() if made else None,
+        )
+        make = functools.partial(
+            make_dispatcher,
+            marks=config.status.with_suffix(".marks"),
+            pool_uid=config.pool_uid,
+            actions=Actions(),
+            speaks=config.rmw,
+            id_of=in_line.request_ids(config.credentials.key),
+        )
+        self.dialer, merge = make_dialer(config), goal_status.merged
+        proxy = self.proxy = ClientProxy(
+            config.pool_uid, joined.node, self.dialer, make, define=joined.define, merge=merge
+        )
+        made.append(proxy)
+        self.seen = SeenFromRos(config.pool, config.robot, self._make_visible, check_ok_field)
+        proxy.serve(self.seen.follow(config.services))
+        proxy.pass_topics(config.topics, cast("SerialisedNode", joined.node))
+        self.following = Following(config)
+        self.scrape = Scrape(lambda: proxies.of_client(proxy.report()), {"pool": config.pool})
+        self.scrape.at(config.metrics)
+        self.spans = wanted("fogft-robot", config.pool)
+        log.info(
+            "proxy_started pool=%s robot=%s pid=%d standby=%s start_s=%.2f",
+            config.pool, config.robot, os.getpid(), early is not None, time.monotonic() - began,
+        )  # fmt: skip
+
+    def _make_visible(self, judge: Callable[[Mapping[str, Any]], str]) -> VisibleNode | None:
+        try:
+            return self.joined.make_visible(_node_name("fogft", self.config.pool), judge)
+        except FogftError as error:
+            log.error("visible_node_off reason=%r", error.message)
+            return None
+
+    def close(self) -> None:
+        """Leave, and let another one work."""
+        self.managing.close()
+        self.scrape.close()
+        self.following.close()
+        self.proxy.close()
+        self.joined.node.close()
+        self.lock.release()
 
     def callers(self) -> dict[str, int]:
         """Count who may call each service that is offered, as far as discovery knows."""
         return {name: self.joined.callers(name) for name in self.proxy.offered}
-
-    def _participant(self) -> bytes:
-        """Return the id of this process in DDS, once it offers a service."""
-        return next(filter(None, map(self.joined.participant, self.proxy.offered)), b"")
 
     def release(self) -> None:
         """Let another proxy work: it must not take us for dead, and needs our ports."""
@@ -285,7 +284,8 @@ class _Running(NamedTuple):
             try_step(self.managing.look, config.lock)
             if watched_config.changed():
                 try_step(self._reconfigure, self.config_path)
-            try_step(self._follow_parameters, self.config_path)
+            if (services := self.seen.changed()) is not None:
+                try_step(functools.partial(proxy.serve, services), self.config_path)
             try_step(self._follow, config.membership)
             if watched_certificate.changed():
                 proxy.renew()
@@ -299,7 +299,9 @@ class _Running(NamedTuple):
                 if not folder.exists():  # the pool's: its end is the pool's
                     log.warning("folder_gone path=%s", folder)
                     return
-                participant = participant or self._participant()
+                # The id of this process in DDS, once it offers a service.
+                ids = map(self.joined.participant, proxy.offered)
+                participant = participant or next(filter(None, ids), b"")
                 told = {"uptime_s": now - started, "participant": participant.hex()}
                 try_step(functools.partial(self._report, told, now), config.status)
                 trace = config.status.with_name(TRACE_NAME)
@@ -315,11 +317,6 @@ class _Running(NamedTuple):
         self.following.apply(new)
         self.scrape.at(new.metrics)
         log.info("config_applied services=%d", len(new.services))
-
-    def _follow_parameters(self) -> None:
-        services = self.seen.changed()
-        if services is not None:
-            self.proxy.serve(services)
 
     def _follow(self) -> None:
         membership = self.following.look()

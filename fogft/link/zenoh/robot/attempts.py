@@ -190,8 +190,7 @@ class Attempts:
         try:
             self._publish(attempt, payload, max(remaining_s, 0.0))
         except Exception as error:  # whatever it is, the attempt must end
-            self._outlet.lose(f"sending failed: {error}")
-            self._end(attempt, Refusal.LOST)
+            self._lose(error, attempt)
 
     def send(self) -> None:
         """Send what was offered with `more`. Never blocks: it was small, and reserved."""
@@ -217,9 +216,7 @@ class Attempts:
         try:
             self._outlet.publish(attempts[0].service, content, header)
         except Exception as error:  # whatever it is, the attempts must end
-            self._outlet.lose(f"sending failed: {error}")
-            for attempt in attempts:
-                self._end(attempt, Refusal.LOST)
+            self._lose(error, *attempts)
 
     def _before(self, service: str) -> list[OpenAttempt]:
         if self._queue.overtakes(service):
@@ -294,13 +291,17 @@ class Attempts:
         try:
             self._outlet.cancel(ids)
         except Exception as error:
-            self._outlet.lose(f"sending failed: {error}")
+            self._lose(error)
 
     def _send_or_lose(self, attempt: OpenAttempt) -> None:
         try:
             self._send(attempt)
         except Exception as error:  # whatever it is, the attempt must end
-            self._outlet.lose(f"sending failed: {error}")
+            self._lose(error, attempt)
+
+    def _lose(self, error: Exception, *attempts: OpenAttempt) -> None:
+        self._outlet.lose(f"sending failed: {error}")
+        for attempt in attempts:
             self._end(attempt, Refusal.LOST)
 
     def _send(self, attempt: OpenAttempt) -> None:
@@ -320,7 +321,9 @@ class Attempts:
         began = time.monotonic()
         if large:
             self._large_since = self._sending_since = began
-            self._sends_large()
+            if not self.watched:  # have the link's thread look whether it flows, for a while
+                self.watched = True
+                self._on_large()
         try:
             if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
                 self._publish(attempt, payload, remaining_s)
@@ -331,12 +334,6 @@ class Attempts:
             self._held_by_zenoh = time.monotonic(), min(attempt.size, _ZENOH_HOLDS_BYTES)
         if time.monotonic() - began > _STUCK_S and not self._outlet.alive():
             self._outlet.lose("it took nothing more, and Zenoh gave the session up")
-
-    def _sends_large(self) -> None:
-        """Have the link's thread look whether it flows, from now on and for a while."""
-        if not self.watched:
-            self.watched = True
-            self._on_large()
 
     def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
         compression = self._compressions.get(attempt.service)

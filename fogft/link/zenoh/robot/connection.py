@@ -6,7 +6,8 @@ a third more (its state, two timers and its end, at both ends), and its time-out
 would be sent by the one thread that all else there needs, too.
 
 Everything of Zenoh's that can block (`put`, `close`) is called by the sender thread of its
-attempts, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's threads.
+attempts, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's threads. What
+sends raises `zenoh.ZError` where the session is closed.
 
 Owns: a session. Not here: the requests open on it (`attempts`), when to open and when to give
 up (`link`).
@@ -132,9 +133,6 @@ class Connection:
         """Ask for the answers to come, once the replica has let us in; return whether it hears.
 
         What is published before Zenoh knows that it is heard there would be lost.
-
-        Raises:
-            zenoh.ZError: It could not be asked.
         """
         if self._begun:
             return True
@@ -155,19 +153,11 @@ class Connection:
     # -- for its attempts -----------------------------------------------------------------
 
     def publish(self, service: str, content: bytes, header: bytes) -> None:
-        """Send a message to a service. May block for as long as the peer takes nothing.
-
-        Raises:
-            zenoh.ZError: The session is closed.
-        """
+        """Send a message to a service. May block for as long as the peer takes nothing."""
         self._publishers[service].put(content, attachment=header)
 
     def cancel(self, ids: Sequence[bytes]) -> None:
-        """Tell the replica that these are no longer wanted. May block likewise.
-
-        Raises:
-            zenoh.ZError: The session is closed.
-        """
+        """Tell the replica that these are no longer wanted. May block likewise."""
         self._session.put(
             self._cancel_key,
             frame.encode_cancel(ids),
@@ -206,11 +196,7 @@ class Connection:
     def probe(
         self, key: str, payload: bytes, timeout_s: float, heard: Callable[[bytes], None]
     ) -> None:
-        """Send a probe ahead of all requests; `heard` gets the answer's bytes, if one comes.
-
-        Raises:
-            zenoh.ZError: It could not be sent.
-        """
+        """Send a probe ahead of all requests; `heard` gets the answer's bytes, if one comes."""
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -242,11 +228,7 @@ class Connection:
         self.lose(words)
 
     def tell_records(self, key: str, records: bytes) -> None:
-        """Send signed records; `told` is them once the replica has taken them.
-
-        Raises:
-            zenoh.ZError: They could not be sent.
-        """
+        """Send signed records; `told` is them once the replica has taken them."""
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
