@@ -272,7 +272,8 @@ class FakeListener:
 class FakeSupervisor:
     """A command that lives and dies as the test says."""
 
-    def __init__(self) -> None:
+    def __init__(self, domain_id: int | None = None) -> None:
+        self.domain_id = domain_id
         self.alive = False
         self.restarts = -1
         self.last_exit = ""

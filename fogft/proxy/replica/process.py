@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fogft.cloud import notice
-from fogft.cloud.local.reservations import own_domain, reserve_domain
+from fogft.cloud.local.reservations import Reservation, own_domain, reserve_domain
 from fogft.cloud.notice import Notice, NoticeKind
 from fogft.link.zenoh import runtime
 from fogft.metrics import proxies
@@ -31,7 +31,6 @@ from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.service_queue import Job
-from fogft.proxy.replica.spare import WithSpare
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.records import cache
 from fogft.records.record import RecordKind
@@ -99,7 +98,8 @@ def run(
             moments = (job.arrived, job.begun, ended)
             spans.ran(job.id, job.service, config.id.short, moments)
 
-    proxy = _make(config, answered if spans is not None else None)
+    second = _second_domain(config) if config.spare else None
+    proxy = _make(config, answered if spans is not None else None, second)
     watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
     presence: Presence | None = None
     scrape = Scrape(
@@ -129,7 +129,20 @@ def run(
         log.info("replica_stopped replica=%s", config.id)
 
 
-def _make(config: ServerProxyConfig, answered: Callable[[Job, float], None] | None) -> ServerProxy:
+def _second_domain(config: ServerProxyConfig) -> Reservation | None:
+    """Reserve a ROS domain for the spare process; it is ours while this is kept."""
+    own = config.domain_id
+    reserved = reserve_domain({own_domain(run_environment(config)) if own is None else own})
+    if reserved is None:
+        log.error("spare_off reason='no ROS domain is free here'")
+    return reserved
+
+
+def _make(
+    config: ServerProxyConfig,
+    answered: Callable[[Job, float], None] | None,
+    second: Reservation | None,
+) -> ServerProxy:
     from fogft.link.zenoh.handshakes import HandshakeLog
     from fogft.link.zenoh.replica.listener import ZenohListener
     from fogft.ros.state_bytes import StateBytes
@@ -142,7 +155,7 @@ def _make(config: ServerProxyConfig, answered: Callable[[Job, float], None] | No
 
     def make_node() -> RosNode:
         name = f"fogft_replica_{config.id.slot}"
-        joined[:] = [middleware.join(config.rmw, name, supervisor.domain_id, environ=environ)]
+        joined[:] = [middleware.join(config.rmw, name, proxy.command.domain_id, environ=environ)]
         return joined[0].node
 
     handshakes = HandshakeLog()
@@ -154,21 +167,13 @@ def _make(config: ServerProxyConfig, answered: Callable[[Job, float], None] | No
             config.run, config.workdir, environ, domain_id=domain, stdout=handshakes.stdout
         )
 
-    first = command(config.domain_id)
-    reserved = reserve_domain({own_domain(first.environ)}) if config.spare else None
-    if config.spare and reserved is None:
-        log.error("spare_off reason='no ROS domain is free here'")
-    supervisor = (
-        WithSpare(first, command(reserved.number), lambda: proxy.complete, reserved)
-        if reserved is not None
-        else first
-    )
     proxy = ServerProxy(
         config.id,
         config.services,
         listener,
         make_node,
-        supervisor,
+        command(config.domain_id),
+        spare=command(second.number) if second is not None else None,
         make_state=StateBytes,
         define=define,
         topics=config.topics,

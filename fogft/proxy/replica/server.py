@@ -37,7 +37,6 @@ from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.replica.responder import Responder
 from fogft.proxy.replica.service_queue import Job, limits_of
 from fogft.proxy.replica.serving_lease import HeldLease
-from fogft.proxy.replica.spare import WithSpare
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
 from fogft.records.record import Record
@@ -61,6 +60,7 @@ class ServerProxy:
         services: What it answers; none for whatever the command offers.
         listener: Its end of the wire; `serve` is called here.
         make_node: Joins ROS; called again after each death of the command.
+        spare: A second process of the command, to take over when the first dies.
         make_state: Says how the state of a stateful service travels.
         define: Returns the definition of a service type here, for the robot to compare.
         topics: What passes besides services; then nodes publish and subscribe, too.
@@ -73,8 +73,9 @@ class ServerProxy:
         services: tuple[ServiceSpec, ...],
         listener: ZenohListener,
         make_node: Callable[[], RosNode],
-        supervisor: Supervisor | WithSpare,
+        command: Supervisor,
         *,
+        spare: Supervisor | None = None,
         make_state: Callable[[StateSpec], StateBytes] | None = None,
         define: Callable[[str], Definition] | None = None,
         topics: tuple[TopicSpec, ...] = (),
@@ -85,7 +86,8 @@ class ServerProxy:
         self._id = id
         self._offering = Offering(services, define, clock)
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
-        self._listener, self._make_node, self._supervisor = listener, make_node, supervisor
+        self._listener, self._make_node = listener, make_node
+        self.command, self._spare = command, spare  # the process at work, and the one that waits
         self._clock, self._look_at = clock, 0.0
         self._lease = HeldLease(clock)
         self._topics = TopicsOnReplica(topics, clock)
@@ -125,7 +127,7 @@ class ServerProxy:
         chosen = self._ordered or self._topics or self._goals
         request = self._request if chosen else self.responder.request
         self._listener.serve(keys, request, self._probe, self.responder.cancel)
-        self._supervisor.poll()
+        self._poll()
         log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
 
     def _keys(self, services: tuple[ServiceSpec, ...]) -> dict[str, str]:
@@ -136,7 +138,7 @@ class ServerProxy:
         """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
         lease = self._listener.lease()
         self.renew(() if lease is None else (lease,))
-        died = self._supervisor.poll(at_work=self.responder.at_work > 0)
+        died = self._poll()
         if died or self._node is None or not self._node.alive:
             self.ready = frozenset()
             if died:
@@ -154,10 +156,29 @@ class ServerProxy:
         self._goals.tick()
         self._topics.tick()
         for ordered in self._ordered.values():
-            ordered.tick(self._supervisor.alive)
+            ordered.tick(self.command.alive)
+
+    def _poll(self) -> bool:
+        """See whether the command died, and start it again, or have the spare process take over.
+
+        That is started once this replica is ready: two that start at once both take twice as long.
+        Nothing asks it, in a ROS domain of its own, which the proxy joins when it takes over.
+        """
+        died = self.command.poll(at_work=self.responder.at_work > 0)
+        spare = self._spare
+        if spare is not None and (spare.alive or self.complete):
+            spare.poll()
+        if died and spare is not None and spare.alive:
+            self.command, self._spare = spare, self.command
+            log.info("spare_takes_over domain=%s", spare.domain_id)
+        return died
+
+    @property
+    def _restarts(self) -> int:
+        return sum(max(one.restarts, 0) for one in (self.command, self._spare) if one is not None)
 
     def _take_up_new(self) -> None:
-        if self._node is None or not self._supervisor.alive:
+        if self._node is None or not self.command.alive:
             self._offering.reset()
             return
         complete = len(self.ready) == len(self._offering.services)
@@ -174,15 +195,15 @@ class ServerProxy:
 
     def _look_for_services(self) -> None:
         there = {name for name, client in self._clients.items() if self._can_call(name, client)}
-        ready = frozenset(there if self._supervisor.alive else ())
+        ready = frozenset(there if self.command.alive else ())
         gone = self.ready - ready
         if ready != self.ready:
             log.info("services_ready replica=%s ready=%s", self._id, sorted(ready))
             self.ready = ready
         for name in gone | self._replaced():
             log.warning("service_lost replica=%s service=%s", self._id, name)
-            if name in self._ordered and self._supervisor.alive:
-                self._supervisor.restart()  # what state it is in, nobody knows
+            if name in self._ordered and self.command.alive:
+                self.command.restart()  # what state it is in, nobody knows
             else:
                 self._goals.crashed(name)
                 self.responder.crashed(name)
@@ -206,7 +227,7 @@ class ServerProxy:
         """Start the command anew where a service of it answers nothing any more."""
         for name, seconds in self._hanging(stuck=True).items():
             log.error("service_stuck replica=%s service=%s quiet_s=%.0f", self._id, name, seconds)
-            self._supervisor.restart()
+            self.command.restart()
             return
 
     def _hanging(self, *, stuck: bool = False) -> dict[str, float]:
@@ -282,7 +303,7 @@ class ServerProxy:
             "services": {s.name: s.name in answering for s in self._offering.services},
             "draining": self.draining,
             "lease_left_s": self._lease.left_s,
-            "restarts": max(self._supervisor.restarts, 0),
+            "restarts": self._restarts,
             "wire": dict(self._listener.counters()),
         }
 
@@ -344,7 +365,7 @@ class ServerProxy:
         return self.ready - {name for name, one in self._ordered.items() if not one.ready}
 
     def _passing(self) -> frozenset[str]:
-        return self._topics.ready() if self._topics and self._supervisor.alive else frozenset()
+        return self._topics.ready() if self._topics and self.command.alive else frozenset()
 
     def _probe(self, probe: Probe) -> ProbeAnswer:
         counts = self._listener.counters()
@@ -355,7 +376,7 @@ class ServerProxy:
             ready=self._answering() | self._passing(),
             draining=self.draining,
             at_risk=self._at_risk,
-            restarts=max(self._supervisor.restarts, 0),
+            restarts=self._restarts,
             in_flight=self.responder.in_flight
             + self._goals.in_flight
             + sum(ordered.in_flight for ordered in self._ordered.values()),
@@ -377,10 +398,10 @@ class ServerProxy:
             return why
         if self._topics.trouble:
             return self._topics.trouble
-        if not self._supervisor.alive:
-            if not self._supervisor.last_exit:
+        if not self.command.alive:
+            if not self.command.last_exit:
                 return "`run` has not started"
-            return f"`run` {self._supervisor.last_exit}: see `fogft logs {self._id.slot}`"
+            return f"`run` {self.command.last_exit}: see `fogft logs {self._id.slot}`"
         return self._offering.missing(self.ready)
 
     def _detail_of_complete(self) -> str:
@@ -394,7 +415,8 @@ class ServerProxy:
     def close(self) -> None:
         """Stop the command, leave the wire and ROS."""
         self.ready = frozenset()
-        self._supervisor.stop()
+        for command in filter(None, (self._spare, self.command)):
+            command.stop()
         self._goals.crashed()
         self._crashed()
         self._listener.close()

@@ -24,10 +24,10 @@ ACCEPTED, UNKNOWN, SUCCEEDED = HEADER + b"\1", HEADER + b"\0", HEADER + b"\4"
 
 
 class Scene:
-    def __init__(self, *services: ServiceSpec) -> None:
+    def __init__(self, *services: ServiceSpec, spare: FakeSupervisor | None = None) -> None:
         self.clock = Clock()
         self.listener = FakeListener()
-        self.supervisor = FakeSupervisor()
+        self.supervisor = FakeSupervisor(7)
         self.nodes: list[FakeNode] = []
         self.proxy = ServerProxy(
             ReplicaId(UID, 2, 3),
@@ -35,6 +35,7 @@ class Scene:
             self.listener,
             lambda: self.make_node(),
             self.supervisor,  # type: ignore[arg-type]
+            spare=spare,  # type: ignore[arg-type]
             clock=self.clock,
         )
         self.proxy.start()
@@ -317,3 +318,35 @@ def test_the_end_of_our_own_node_gives_no_goal_a_second_time():
     scene.listener.on_request(again)
     assert again.outcome == [ACCEPTED]
     assert (len(scene.nodes), scene.nodes[-1].clients[name].calls) == (2, [])
+
+
+def test_a_spare_process_waits_for_the_first_and_takes_its_place():
+    spare = FakeSupervisor(8)
+    scene = Scene(spare=spare)
+    scene.client().there = False
+    scene.proxy.run_once()
+    assert (scene.proxy.command, spare.alive) == (scene.supervisor, False)
+    scene.client().there = True
+    scene.proxy.run_once()  # ready, and so the spare one is started next
+    scene.proxy.run_once()
+    assert (scene.proxy.command, spare.alive) == (scene.supervisor, True)
+    scene.supervisor.dies = True
+    scene.proxy.run_once()
+    assert (scene.proxy.command, scene.probe().restarts) == (spare, 1)
+    spare.dies = True
+    scene.proxy.run_once()
+    assert scene.proxy.command is scene.supervisor
+    scene.proxy.close()
+    assert (scene.supervisor.stopped, spare.stopped) == (True, True)
+
+
+def test_without_a_live_spare_process_the_first_is_started_again():
+    spare = FakeSupervisor(8)
+    scene = Scene(spare=spare)
+    scene.supervisor.dies = True
+    scene.proxy.run_once()
+    assert (scene.proxy.command, scene.probe().restarts, spare.alive) == (
+        scene.supervisor,
+        1,
+        False,
+    )

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cloud.local.reservations import reserve_domain
-from fogft.proxy.replica.spare import WithSpare
 from fogft.proxy.replica.supervisor import Supervisor
 from tests.proxy.fakes import Clock
 
@@ -132,35 +130,3 @@ def test_the_command_dies_with_a_supervisor_that_is_killed(tmp_path):
         assert alive(child)
         parent.send_signal(signal.SIGKILL)
     wait_until(lambda: not alive(child))
-
-
-def test_a_spare_process_waits_for_the_first_and_takes_its_place(supervise):
-    settled = False
-    first = supervise("echo $ROS_DOMAIN_ID >> domains; exec sleep 60", domain_id=7)
-    other = supervise("echo $ROS_DOMAIN_ID >> domains; exec sleep 60", domain_id=8)
-    both = WithSpare(first, other, lambda: settled, reserve_domain())
-    assert not both.poll()
-    assert (both.alive, other.alive, both.domain_id) == (True, False, 7)
-    settled = True
-    assert not both.poll()
-    settled = False  # one that runs is looked after all the same
-    assert other.alive
-    both.restart()
-    wait_until(both.poll)
-    assert (both.alive, both.domain_id, both.restarts) == (True, 8, 1)
-    both.restart()
-    wait_until(both.poll)
-    assert (both.alive, both.domain_id) == (True, 7)
-    both.stop()
-    assert not first.alive
-    assert not other.alive
-
-
-def test_without_a_live_spare_process_the_first_is_started_again(supervise):
-    first, other = supervise("exec sleep 60", domain_id=7), supervise("exit 1", domain_id=8)
-    both = WithSpare(first, other, lambda: False, reserve_domain())
-    both.poll()
-    both.restart()
-    wait_until(both.poll)
-    assert (both.alive, both.domain_id, both.restarts) == (True, 7, 1)
-    assert both.last_exit == "died of SIGKILL"
