@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
-def start_log(level: str = "info") -> None:
+def start_log() -> None:
     """Log to standard error, one line each; lines of libraries from warnings on."""
     logging.basicConfig(
         stream=sys.stderr,
@@ -24,7 +24,7 @@ def start_log(level: str = "info") -> None:
         datefmt="%Y-%m-%dT%H:%M:%S",
         force=True,
     )
-    logging.getLogger("fogft").setLevel(level.upper())
+    logging.getLogger("fogft").setLevel(logging.INFO)
 
 
 def notify(state: str, environ: Mapping[str, str] = os.environ) -> None:

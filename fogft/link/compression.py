@@ -36,7 +36,6 @@ class Compression:
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
         self.ratio: float | None = None
-        self.saved_bytes = 0
         self._s_per_byte = 0.0
         self._rest = 0  # so many are left alone before the next trial
         self._pause = _FIRST_PAUSE
@@ -63,7 +62,6 @@ class Compression:
         self._pause = _FIRST_PAUSE
         if len(packed) >= len(payload) * _GAIN:
             return None
-        self.saved_bytes += len(payload) - len(packed)
         return packed
 
     def _compress(self, payload: bytes) -> bytes:

@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fogft.model.choices import OnDemandSpec
+from fogft.model.choices import GroupSpec
 from fogft.model.spec import PoolSpec
 
 BLOCK = 200
@@ -27,19 +27,14 @@ LAST_BY_HAND = 999_999
 
 
 @dataclass(frozen=True)
-class Group:
-    """One kind of replicas.
+class Group(GroupSpec):
+    """One kind of replicas, whose name is empty where the pool file names no groups.
 
     Attributes:
-        name: Empty where the pool file names no groups.
         block: Which slots are its own.
     """
 
-    name: str
-    block: int
-    replicas: int
-    resources: Mapping[str, Any]
-    on_demand: OnDemandSpec
+    block: int = 0
 
     @property
     def first_slot(self) -> int:
@@ -71,10 +66,9 @@ def groups_of(spec: PoolSpec) -> tuple[Group, ...]:
     known: tuple[Group, ...] | None = spec.derived.get("groups")
     if known is None:
         resources = spec.task.get("resources") or {}
-        known = tuple(
-            Group(g.name, block, g.replicas, g.resources, g.on_demand)
-            for block, g in enumerate(spec.groups)
-        ) or (Group("", 0, spec.replicas, resources, spec.on_demand),)
+        known = tuple(Group(**vars(one), block=block) for block, one in enumerate(spec.groups)) or (
+            Group("", spec.replicas, resources, spec.on_demand),
+        )
         spec.derived["groups"] = known
     return known
 

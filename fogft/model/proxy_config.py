@@ -101,7 +101,6 @@ class ServerProxyConfig(ProxyConfig):
         run: Command that starts the services in `workdir`; empty where they are started otherwise.
         spare: Whether a second process of it is kept, which takes over when the first dies.
         notice: Where preemption notices come from.
-        max_in_flight: Most requests held at once.
         advertise: Address at which this replica is reached, where it differs.
         dial_out: Robots that this replica dials, where it cannot be reached.
     """
@@ -114,8 +113,6 @@ class ServerProxyConfig(ProxyConfig):
     workdir: Path = Path()
     envs: Mapping[str, str] = field(default_factory=dict)
     notice: NoticeSource = "auto"
-    max_in_flight: Annotated[int, within(1, 1 << 20)] = 512
-    log_level: str = "info"
     advertise: EndpointOrEmpty = ""
     dial_out: tuple[Endpoint, ...] = ()
 

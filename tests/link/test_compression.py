@@ -40,7 +40,6 @@ def test_text_is_compressed_on_a_thin_link_and_left_alone_on_a_fast_one():
     packed = compression.pack(TEXT, THIN)
     assert packed is not None
     assert len(packed) < len(TEXT) / 10
-    assert compression.saved_bytes == len(TEXT) - len(packed)
     assert compression.pack(TEXT, 0.0) is not None  # it stood still
     assert compression.pack(TEXT, FAST) is None
     assert compression.pack(TEXT, None) is None

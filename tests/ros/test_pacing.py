@@ -333,12 +333,12 @@ def test_a_node_that_was_started_again_releases_nothing_of_its_predecessor(uniqu
 
 
 def test_clients_that_are_gone_are_forgotten():
-    pacer = Pacer(lambda handle, payload: None)
-    for client in range(200):
-        pacer.requested(handle(client, 0))
-        pacer.respond(handle(client, 0), b"")
-    assert pacer.clients <= 64
-    pacer.close()
+    pace = Pace()
+    for n in range(200):
+        client = pace.client(handle(n, 0), float(n))
+        client.requested(float(n))
+        assert pace.take(client, float(n))
+    assert len(pace.clients) <= 64
 
 
 def test_a_response_to_a_client_that_is_not_found_yet_is_sent_again():

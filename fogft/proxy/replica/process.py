@@ -78,7 +78,7 @@ def run(
         advertise=advertise,
         metrics=metrics,
     )
-    start_log(config.log_level)
+    start_log()
     stop = stop_on_signal()
     machine_ends = threading.Event()
 
@@ -177,7 +177,6 @@ def _make(
         make_state=StateBytes,
         define=define,
         topics=config.topics,
-        max_in_flight=config.max_in_flight,
         answered=answered,
     )
     return proxy

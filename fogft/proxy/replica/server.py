@@ -79,7 +79,6 @@ class ServerProxy:
         make_state: Callable[[StateSpec], StateBytes] | None = None,
         define: Callable[[str], Definition] | None = None,
         topics: tuple[TopicSpec, ...] = (),
-        max_in_flight: int = 512,
         answered: Callable[[Job, float], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -105,7 +104,6 @@ class ServerProxy:
         self.draining = self._at_risk = False  # as the machine was told by its cloud
         self.responder = Responder(
             lambda name: name in self.ready,
-            max_in_flight=max_in_flight,
             limits=limits_of(services),
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
             passing=for_the_moment(services),

@@ -66,11 +66,6 @@ class Pacer:
         self._thread: threading.Thread | None = None  # made when there is something to wait for
         self._closed = False
 
-    @property
-    def clients(self) -> int:
-        """How many clients are remembered."""
-        return len(self._pace.clients)
-
     def requested(self, handle: Any, *, together: bool = False) -> None:
         """Note a request as it is taken; `together` with the one before it."""
         now = self._clock()
