@@ -1,4 +1,7 @@
-"""Read the proxies' configuration files; options of a command line replace what they say."""
+"""Read the proxies' configuration files; options of a command line replace what they say.
+
+Each raises StateError where a file cannot be read, or a key is missing or of the wrong type.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +18,7 @@ DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
 
 
 def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
-    """Read a client proxy's configuration; `metrics` replaces what it says.
-
-    Raises:
-        StateError: It cannot be read, or a key is missing or of the wrong type.
-    """
+    """Read a client proxy's configuration; `metrics` replaces what it says."""
     config = config_file.read(ClientProxyConfig, path, {"metrics": metrics})
     _check(path, config)
     return config
@@ -28,21 +27,13 @@ def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
 def read_gateway(
     path: Path, listen: str | None = None, metrics: str | None = None
 ) -> ClientProxyConfig:
-    """Read a gateway's configuration; `listen` and `metrics` replace what it says.
-
-    Raises:
-        StateError: It cannot be read, or a key is missing or of the wrong type.
-    """
+    """Read a gateway's configuration; `listen` and `metrics` replace what it says."""
     config = read_client(path, metrics)
     return replace(config, listen=listen or config.listen or DEFAULT_GATEWAY_LISTEN)
 
 
 def read_server(path: Path, **override: Any) -> ServerProxyConfig:
-    """Read a server proxy's configuration; options that are not None replace what it says.
-
-    Raises:
-        StateError: It cannot be read, or a key is missing or of the wrong type.
-    """
+    """Read a server proxy's configuration; options that are not None replace what it says."""
     config = config_file.read(ServerProxyConfig, path, override)
     _check(path, config)
     kind, _, file = config.notice.partition(":")

@@ -7,7 +7,8 @@ A reply to a frozen robot blocks until Zenoh gives that robot's session up. So e
 connection has its own thread; it ends when it has had nothing to do for a while. What cannot
 block (`reply_streams`) leaves at once, from the thread that brings it, unless that is Zenoh's.
 
-Queries that are to be ended take the same way: that sends something, too.
+Queries that are to be ended take the same way: that sends something, too. What sends raises
+`zenoh.ZError` where the session is closed.
 
 Owns: that there is one answer; how replies become messages, their order and bounds. Not here: what
 is replied (`fogft.proxy.replica`).
@@ -63,11 +64,7 @@ class Reply:
         return len(self.payload) <= SMALL_BYTES and not self.may_pack
 
     def send(self, stamp: bytes) -> None:
-        """Send it. Blocks for as long as its robot takes nothing and the way there is full.
-
-        Raises:
-            zenoh.ZError: The session is closed.
-        """
+        """Send it. Blocks for as long as its robot takes nothing and the way there is full."""
         query = self.stream.query
         if self.refusal:
             query.reply_err(frame.encode_refusal(stamp, self.request_id, self.refusal, self.load))
@@ -82,11 +79,7 @@ class Reply:
 
 
 def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
-    """Send replies of one stream. May block as `Reply.send` does.
-
-    Raises:
-        zenoh.ZError: The session is closed.
-    """
+    """Send replies of one stream. May block as `Reply.send` does."""
     if len(replies) == 1:
         replies[0].send(stamp)
         return

@@ -278,20 +278,19 @@ class ZenohLink:
             self._let_go()
             if not self._flows(connection, now):
                 break
-            if now >= next_probe:
-                connection.attempts.sweep()
-                self._probe(connection, now)
-                if up:
-                    self._tell_records(connection)
-                next_probe = now + self._next_probe_in_s(up=up)
-            left_s = self._suspect_after_s - self._probing.unheard_s(now)
-            if left_s <= 0:
-                connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
-                break
-            often = _LOOK_EVERY_S if connection.attempts.watched else left_s
-            doubt_s = self._doubt(now)
-            self._pause(min(next_probe - now, left_s, often, doubt_s))
             try:
+                if now >= next_probe:
+                    connection.attempts.sweep()
+                    self._probe(connection, now)
+                    if up:
+                        self._tell_records(connection)
+                    next_probe = now + self._next_probe_in_s(up=up)
+                left_s = self._suspect_after_s - self._probing.unheard_s(now)
+                if left_s <= 0:
+                    connection.lost_because = f"no probe answered for {self._suspect_after_s:g} s"
+                    break
+                often = _LOOK_EVERY_S if connection.attempts.watched else left_s
+                self._pause(min(next_probe - now, left_s, often, self._doubt(now)))
                 up = self._listen(connection) or up
             except WireError as error:
                 connection.lost_because = error.message
@@ -330,14 +329,9 @@ class ZenohLink:
 
     def _tell_records(self, connection: Connection) -> None:
         """Send what the replica has not taken yet; with each probe until it has."""
-        records = self._shared.records
-        if records == connection.told:
-            return
-        id = self.peer.id
-        try:
+        records, id = self._shared.records, self.peer.id
+        if records != connection.told:
             connection.tell_records(names.records_key(id.pool_uid, id.slot), records)
-        except zenoh.ZError as error:
-            connection.lost_because = f"sending failed: {error}"
 
     def _renewal_due(self, now: float) -> bool:
         if self._renew_at is not None and now >= self._renew_at:
@@ -349,12 +343,7 @@ class ZenohLink:
         known = self._probing.answer
         # Its types are asked for once a connection: it may be another process at each.
         describe = self._live is not connection or known is None or not known.types
-        probe = Probe(self._shared.robot, describe, __version__)
-        try:
-            self._probing.ask(connection, probe, now)
-        except zenoh.ZError as error:
-            connection.lost_because = f"sending failed: {error}"
-            return
+        self._probing.ask(connection, Probe(self._shared.robot, describe, __version__), now)
         if not connection.alive():
             connection.lost_because = "the connection was lost"
 
