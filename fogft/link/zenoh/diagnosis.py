@@ -14,6 +14,7 @@ import datetime
 import socket
 import ssl
 from dataclasses import dataclass
+from typing import Any
 
 from fogft.errors import CredentialError
 from fogft.link.port import Peer
@@ -72,7 +73,9 @@ def _context(credentials: CredentialPaths) -> ssl.SSLContext:
 
 
 def _after_handshake(link: ssl.SSLSocket, peer: Peer) -> str:
-    found = _common_name(link)
+    certificate: Any = link.getpeercert() or {}
+    subject = dict(entry for part in certificate.get("subject", ()) for entry in part)
+    found = subject.get("commonName")
     if found != peer.certificate_name:
         return wrong_name(found, peer)
     # In TLS 1.3 our own certificate is judged after our side of the handshake: the verdict
@@ -86,16 +89,6 @@ def _after_handshake(link: ssl.SSLSocket, peer: Peer) -> str:
 def wrong_name(found: str | None, peer: Peer) -> str:
     """Return the words for a peer whose certificate is another's."""
     return f"`{peer.endpoint}` has the certificate of `{found}`, not of `{peer.certificate_name}`"
-
-
-def _common_name(link: ssl.SSLSocket) -> str | None:
-    certificate = link.getpeercert() or {}
-    subject = certificate.get("subject", ())
-    for part in subject:
-        for entry in part:
-            if isinstance(entry, tuple) and entry[0] == "commonName":
-                return str(entry[1])
-    return None
 
 
 def _clock_words(

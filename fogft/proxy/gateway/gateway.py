@@ -94,7 +94,10 @@ class Forwarder:
             if known is None:
                 reason = self._reason_to_refuse(incoming)
                 if reason is None:
-                    self._take_up(Job(self._clock(), incoming))
+                    job = Job(self._clock(), incoming)
+                    self._known.add(job)
+                    self._by_robot[job.robot] += 1
+                    self._queue.put(job)
                     return
             else:
                 self.joined += 1
@@ -106,11 +109,6 @@ class Forwarder:
             incoming.reply(answer)
         elif reason is not None:
             self._refuse(incoming, reason)
-
-    def _take_up(self, job: Job) -> None:
-        self._known.add(job)
-        self._by_robot[job.robot] += 1
-        self._queue.put(job)
 
     def _reason_to_refuse(self, incoming: Incoming) -> Refusal | None:
         if incoming.remaining_s <= 0:

@@ -78,13 +78,9 @@ class KnownRequests:
             self._kept_bytes -= len(oldest.answer or b"")
             oldest.answer = None
         if len(self._jobs) > self._kept_ids:
-            self._forget_oldest()
-
-    def _forget_oldest(self) -> None:
-        for job in self._jobs.values():
-            if job.waiting is None:
-                self._drop(job)
-                return
+            oldest_done = next((job for job in self._jobs.values() if job.waiting is None), None)
+            if oldest_done is not None:
+                self._drop(oldest_done)
 
     def _drop(self, job: Job) -> None:
         del self._jobs[job.id]

@@ -99,7 +99,7 @@ class ClientProxy:
             keys_changed = False
             for spec in wanted.values():
                 old = self._services.get(spec.name)
-                if old is not None and _same_kind(old.spec, spec):
+                if old is not None and _kind(old.spec) == _kind(spec):
                     old.spec = spec
                     self._adopt(old)
                     continue
@@ -348,7 +348,6 @@ class ClientProxy:
             self._topics.close()
 
 
-def _same_kind(one: ServiceSpec, other: ServiceSpec) -> bool:
-    """Whether one dispatcher can follow both policies, so that nothing under way is lost."""
-    kinds = [(s.type, s.state, s.quorum, s.tolerance) for s in (one, other)]
-    return kinds[0] == kinds[1]
+def _kind(spec: ServiceSpec) -> object:
+    """Return what two policies have in common that one dispatcher can follow without loss."""
+    return spec.type, spec.state, spec.quorum, spec.tolerance

@@ -168,8 +168,7 @@ class ZenohListener:
 
     def _slow(self, holder: str) -> bool:
         """Whether what a robot is sent was seen to leave slowly."""
-        connection_reaper = self._reaper
-        return connection_reaper is not None and holder in connection_reaper.thin
+        return self._reaper is not None and holder in self._reaper.thin
 
     def _thin(self, token: bytes) -> bool:
         return self._slow(self._sessions.holder(token))
