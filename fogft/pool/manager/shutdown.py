@@ -103,9 +103,11 @@ def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Itera
     Raises:
         FogftError: It does not end.
     """
+    # Its place in line stays free until the proxy has gone: it would wait for us to take over.
+    process_control.end_holder(paths.standby_lock)
     with (
-        _taken(lambda _: None, "standby client proxy", paths.standby_lock),
         _taken(done, "client proxy", paths.proxy_lock),
+        _taken(lambda _: None, "standby client proxy", paths.standby_lock),
     ):
         yield
 

@@ -211,3 +211,37 @@ def test_a_standby_that_is_only_starting_is_ended_too(scene: Scene) -> None:
         for one in line:
             one.kill()
             one.communicate()
+
+
+HAND_OVER = """
+import signal, sys
+from pathlib import Path
+from fogft import disk
+
+def told(number, frame):
+    print("standby" if disk.is_locked(Path(sys.argv[2])) else "nobody", flush=True)
+    sys.exit(0)
+
+signal.signal(signal.SIGTERM, told)
+lock = disk.Lock(Path(sys.argv[1]))
+lock.acquire(wait=True)
+print("works", flush=True)
+signal.pause()
+"""
+
+
+def test_a_proxy_that_is_ended_finds_nobody_to_hand_over_to(scene: Scene) -> None:
+    """Else it would wait for its successor, and be killed."""
+    scene.write()
+    proxy = subprocess.Popen(
+        [sys.executable, "-c", HAND_OVER, scene.paths.proxy_lock, scene.paths.standby_lock],
+        stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        assert proxy.stdout is not None
+        assert proxy.stdout.readline() == "works\n"
+        assert scene.end() == [f"client proxy (pid {proxy.pid})"]
+        assert proxy.stdout.readline() == "nobody\n"
+    finally:
+        proxy.kill()
+        proxy.communicate()
