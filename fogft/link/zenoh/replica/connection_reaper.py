@@ -2,7 +2,7 @@
 
 Zenoh owns the port. It lets a connection that never says who it is stand for as long as it
 likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look ourselves at this
-process's own sockets, once a second and whenever somebody comes: what is connected to the
+process's own sockets, twice a second and whenever somebody comes: what is connected to the
 port and is no authenticated link is ended or kept out as `door` says, a link of a revoked
 holder is ended at once, and one that delivers nothing of what it holds after a while. All are
 counted. Who looks sees, too, which links are thin.
@@ -30,7 +30,7 @@ from fogft.link.zenoh.sockets import Address
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 1.0
+LOOK_EVERY_S = 0.5
 _LOOK_AGAIN_S = 0.01  # while somebody comes, or is kept out
 RUSH_LIMIT = 2  # so many new ones since the last look
 # A robot that is out of reach has long opened another link by then.
