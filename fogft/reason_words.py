@@ -145,6 +145,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.SILENT: "silent for {r.seconds:.0f} s",
     Cause.DISAGREES: "its answers differ from the other replicas'",
     Cause.MISREAD: "its answers cannot be read as responses of the service's type",
+    Cause.IGNORES: "it takes requests and never answers them",
     Cause.AT_RISK: "the cloud recommends moving it (rebalance)",
     Cause.SERVICE_AWAY: "its service has been unavailable for {r.seconds:.0f} s",
     Cause.DRAINED: "drained by the user",

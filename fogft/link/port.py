@@ -202,6 +202,7 @@ class LinkStatus:
 
     Attributes:
         uplinks: How each uplink does, where there are several, for people.
+        ignores: It takes requests and never ends them, though others answer them.
     """
 
     state: LinkState
@@ -214,6 +215,7 @@ class LinkStatus:
     reopened: int
     detail: str
     uplinks: tuple[Mapping[str, Any], ...] = ()
+    ignores: bool = False
 
 
 class Link(Protocol):

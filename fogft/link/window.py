@@ -30,6 +30,7 @@ class OpenAttempt:
         offered: When, and until when it is of use, in monotonic seconds.
         mark: What the connection had sent once this was sent (`credit`).
         reads_packed: The answer may be compressed.
+        elsewhere: It was sent, and another replica answered its request in time.
     """
 
     service: str
@@ -41,6 +42,7 @@ class OpenAttempt:
     handling: Handling = Handling.NORMAL
     mark: int = 0
     reads_packed: bool = False
+    elsewhere: bool = False
 
 
 class LinkWindow:
@@ -126,6 +128,10 @@ class LinkWindow:
 
 # The window holds 512; a replica that never answers what was forgotten holds no more than this.
 UNANSWERED_LIMIT = 8192
+# A replica ends all that it takes, cancelled requests too. One that has ended none of so many in a
+# row that others answered, not even so long past their deadlines, ignores what it is sent.
+IGNORED_LIMIT = 3
+IGNORED_AFTER_S = 10.0
 
 
 class Unanswered:
@@ -137,6 +143,7 @@ class Unanswered:
         self._lock = threading.Lock()
         self._sent = 0
         self._answered = 0  # counted by one thread, Zenoh's
+        self._ignored = 0  # in a row
 
     @property
     def owed(self) -> int:
@@ -158,7 +165,18 @@ class Unanswered:
     def answered(self, request_id: bytes) -> OpenAttempt | None:
         """Return whom an answer is for, once; None if nobody awaits it."""
         self._answered += 1
-        return self._attempts.pop(request_id, None)
+        attempt = self._attempts.pop(request_id, None)
+        if attempt is not None:
+            self._ignored = 0
+        return attempt
+
+    def are_ignored(self, now: float) -> bool:
+        """Whether the replica ends nothing of what it takes, as far as is known now."""
+        for attempt in list(self._attempts.values()):
+            if attempt.elsewhere and now >= attempt.deadline + IGNORED_AFTER_S:
+                attempt.elsewhere = False  # counted once
+                self._ignored += 1
+        return self._ignored >= IGNORED_LIMIT
 
 
 class BatchBuffer:

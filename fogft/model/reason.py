@@ -30,6 +30,7 @@ class Cause(str, Enum):
     SILENT = "silent"
     DISAGREES = "disagrees"
     MISREAD = "misread"  # its answers are no messages of the type
+    IGNORES = "ignores"  # it takes requests and never ends them
     AT_RISK = "at_risk"
     SERVICE_AWAY = "service_away"
 

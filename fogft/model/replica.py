@@ -193,7 +193,7 @@ class LinkReport:
         draining: The replica asked to be left alone (a preemption notice, a drain).
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
         disagrees: Its answers have differed from those of a quorum, repeatedly, or have been
-            `misread`: they were no responses.
+            `misread` (they were no responses), or it `ignores` requests that others answer.
         heard_age_s: Since the server proxy last answered a probe; None if never.
         silent_for_s: How long probes have gone unanswered; 0 while they are answered.
         rtt_s: Round trip of the last probe.
@@ -217,6 +217,7 @@ class LinkReport:
     at_risk: bool = False
     disagrees: bool = False
     misread: bool = False
+    ignores: bool = False
     heard_age_s: float | None = None
     silent_for_s: float = 0.0
     rtt_s: float | None = None

@@ -1,4 +1,4 @@
-"""A whole pool with one replica in wrong hands: it goes, and nothing else changes.
+"""A whole pool under load with hostile parties: they go, or stay outside, and nothing else changes.
 
 The pool's file lists no services: what replicas say decides what the robot is offered.
 """
@@ -6,29 +6,49 @@ The pool's file lists no services: what replicas say decides what the robot is o
 from __future__ import annotations
 
 import os
+import random
 import sys
+import threading
 import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fogft.link.port import Peer
+from fogft.model import names
 from fogft.model.reason import Cause
+from fogft.model.replica import ReplicaId
+from fogft.proxy.config import read_client
 from tests.e2e.conftest import pool
-from tests.e2e.pool import NODES, Pool
+from tests.e2e.pool import NODES, Machine, Pool
 from tests.hostile.orders import CLAIMED, ESCAPES, HOSTILE
+from tests.hostile.robot import Target, greets, sends, session_at
+from tests.hostile.test_flood import stranger
 
 __all__ = ["pool"]
-pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(300)]
 
 ROOT, SITE = Path(__file__).parents[2], Path(__file__).parent / "site"
 LIES_FOR_S = 3.0
+FRAMES = 500  # of the hostile robot, at each replica
+DEADLINE_S = 10.0  # of a request, where the pool's file names none
 
 
-def test_a_hostile_replica_is_replaced_and_costs_nothing_else(pool: Pool, tmp_path: Path) -> None:
-    """It claims services, writes to the terminal, and answers junk first, under load."""
+def test_hostile_parties_cost_a_pool_nothing_but_their_own_machine(
+    pool: Pool, tmp_path: Path
+) -> None:
+    """A replica claims services and writes to the terminal, while a robot and a stranger attack.
+
+    Then it takes requests and answers none. It is replaced, by one that answers junk: so is that.
+    Nothing is lost, wrong, answered twice or too late, and only these two machines are launched.
+    """
     orders = tmp_path / "orders"
     path = os.pathsep.join([str(SITE), str(ROOT), os.environ.get("PYTHONPATH", "")])
-    pool.environ.update({HOSTILE: str(orders), "FOGFT_HOSTILE_MACHINE": "0.1", "PYTHONPATH": path})
+    lying = {HOSTILE: str(orders), "FOGFT_HOSTILE_MACHINES": "0.1 0.2", "PYTHONPATH": path}
+    pool.environ.update(lying)
     pool.file.write_text(
         "name: e2e\n"
         "resources: {any_of: [{infra: local/us-west-1}, {infra: local/us-west-2}]}\n"
@@ -36,31 +56,81 @@ def test_a_hostile_replica_is_replaced_and_costs_nothing_else(pool: Pool, tmp_pa
         "fogft: {replicas: 3}\n"
     )
     pool.up()
-    client = pool.client(60.0, 20.0)
-    for lie in ("claims", "escapes"):
+    eve = Machine(pool, "robot", "eve")
+    whole, usd_per_hour = _generations(pool), _usd_per_hour(pool)
+    client = pool.client(200.0, 20.0, 20.0)
+    with ExitStack() as attacked:
+        for one in pool.status()["replicas"]:
+            attacked.enter_context(_attacked(pool, eve, one))
+        endpoint = next(one["endpoint"] for one in pool.status()["replicas"] if one["slot"] == 1)
+        attacked.enter_context(stranger(endpoint, "junk"))
+        for lie in ("claims", "escapes"):
+            orders.write_text(lie)
+            if lie == "claims":
+                pool.wait(lambda: Cause.OUTVOTED.value in str(pool.status()["reasons"]))
+            time.sleep(LIES_FOR_S)
+            status = pool.status()
+            shown = pool.fogft("status")
+            assert ESCAPES not in shown
+            assert "\x1b" not in shown
+            assert [one["name"] for one in status["services"]] == ["/plan"]
+            honest = [one for one in status["replicas"] if one["slot"] != 0]
+            assert [(one["generation"], one["phase"]) for one in honest] == [(1, "ready")] * 2
+        pool.wait(lambda: [one["strangers"] > 0 for one in _replicas(pool)] == [False, True, False])
+    assert (_generations(pool), _usd_per_hour(pool)) == (whole, usd_per_hour)
+    for generation, lie in enumerate(("swallowed", "junk 11"), 2):
         orders.write_text(lie)
-        if lie == "claims":
-            pool.wait(lambda: Cause.OUTVOTED.value in str(pool.status()["reasons"]))
-        time.sleep(LIES_FOR_S)
-        status = pool.status()
-        shown = pool.fogft("status")
-        assert ESCAPES not in shown
-        assert "\x1b" not in shown
-        assert [one["name"] for one in status["services"]] == ["/plan"]
-        honest = [one for one in status["replicas"] if one["slot"] != 0]
-        assert [(one["generation"], one["phase"]) for one in honest] == [(1, "ready")] * 2
-    orders.write_text("junk 11")
-    pool.wait(lambda: _generations(pool) == {0: 2, 1: 1, 2: 1} and pool.ready() == 3)
+        pool.wait(lambda now=generation: _generations(pool) == whole | {0: now})
+        orders.write_text("honest")
+        pool.wait(lambda: pool.ready() == 3)
     result = client.finish()
     status = pool.status()
     print(result)
     assert (result["failed"], result["wrong"], result["twice"]) == (0, 0, 0)
+    assert result["max_s"] < DEADLINE_S
+    assert Cause.IGNORES.value in str(status["events"])
     assert Cause.MISREAD.value in str(status["events"])
     launched = [one for one in status["events"] if one["event"] == "launched"]
-    assert len(launched) == 4
+    assert len(launched) == 3 + 2
     assert CLAIMED not in str(status["services"])
-    assert _generations(pool) == {0: 2, 1: 1, 2: 1}
+    assert _generations(pool) == {0: 3, 1: 1, 2: 1}
+    assert _usd_per_hour(pool) == usd_per_hour
+
+
+@contextmanager
+def _attacked(pool: Pool, eve: Machine, replica: dict[str, Any]) -> Iterator[None]:
+    """A robot of the pool's own sends a replica damaged frames, at least `FRAMES` of them."""
+    config = read_client(eve.config)
+    id = ReplicaId(config.pool_uid, replica["slot"], replica["generation"])
+    key = names.service_key(config.pool_uid, id.slot, "/plan", "nav_msgs/srv/GetPlan")
+    at = Target(Peer(id, replica["endpoint"], id.certificate_name), key)
+    enough, sent = threading.Event(), 0
+    with session_at(at, config.credentials) as session:
+        send = sends(session, greets(session, config.credentials, at), random.Random(id.slot), at)
+
+        def throw() -> None:
+            nonlocal sent
+            while not enough.wait(0.005) or sent < FRAMES:
+                send()
+                sent += 1
+
+        thread = threading.Thread(target=throw, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            enough.set()
+            thread.join()
+    assert sent >= FRAMES
+
+
+def _replicas(pool: Pool) -> list[dict[str, Any]]:
+    return sorted(pool.status()["replicas"], key=lambda one: int(one["slot"]))
 
 
 def _generations(pool: Pool) -> dict[int, int]:
-    return {one["slot"]: one["generation"] for one in pool.status()["replicas"]}
+    return {one["slot"]: one["generation"] for one in _replicas(pool)}
+
+
+def _usd_per_hour(pool: Pool) -> float:
+    return sum(float(one["usd_per_hour"]) for one in _replicas(pool))

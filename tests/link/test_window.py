@@ -10,7 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from fogft.link.window import LinkWindow
+from fogft.link.window import (
+    IGNORED_AFTER_S,
+    IGNORED_LIMIT,
+    LinkWindow,
+    OpenAttempt,
+    Unanswered,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,3 +114,29 @@ def test_an_attempt_ends_once_whoever_comes_first() -> None:
     assert set(granted.values()) == {1}
     assert len(granted) == len(attempts)
     assert (len(window), window.held_bytes) == (0, 0)
+
+
+@given(
+    steps=st.lists(st.tuples(st.integers(0, 20), st.booleans(), st.floats(0.0, 30.0)), max_size=40)
+)
+def test_a_replica_ignores_what_it_never_ends_though_others_do(
+    steps: list[tuple[int, bool, float]],
+) -> None:
+    """One that ends any of what it was sent, a cancelled one too, ignores nothing until then."""
+    unanswered, now = Unanswered(), 0.0
+    taken: dict[bytes, OpenAttempt] = {}
+    counted: set[bytes] = set()  # since it last ended anything
+    for number, elsewhere, passes_s in steps:
+        id = bytes([number])
+        if id in taken:
+            assert unanswered.answered(id) is taken.pop(id)
+            counted.clear()
+        else:
+            attempt = OpenAttempt("/s", id, None, 1, now, now + 1.0, elsewhere=elsewhere)
+            taken[id] = attempt
+            unanswered.add(attempt)
+        overdue = {id for id, one in taken.items() if one.elsewhere}
+        now += passes_s
+        counted |= {id for id in overdue if now >= taken[id].deadline + IGNORED_AFTER_S}
+        assert unanswered.are_ignored(now) == (len(counted) >= IGNORED_LIMIT)
+        assert unanswered.answered(b"nobody's") is None

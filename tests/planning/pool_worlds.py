@@ -112,6 +112,7 @@ def replica(
     price: float = 0.1,
     at_risk: bool = False,
     disagrees: bool = False,
+    ignores: bool = False,
     of: PoolSpec | None = None,
 ) -> Part:
     """Make a replica.
@@ -145,7 +146,8 @@ def replica(
         silent_for_s=silent_s,
         in_flight=in_flight,
         at_risk=at_risk,
-        disagrees=disagrees,
+        disagrees=disagrees or ignores,
+        ignores=ignores,
     )
     if state in ("provisioning", "failed"):
         link = None

@@ -92,12 +92,14 @@ def test_a_rebalance_waits_where_no_surge_is_allowed() -> None:
     assert (launches(world), ends(world)) == ([], [])
 
 
-def test_a_replica_that_disagrees_with_the_others_is_replaced_new_before_old() -> None:
-    """Voting masks it meanwhile; it is ended once its replacement serves."""
-    world = World(spec(3)).having(replica(0), replica(1), replica(2, disagrees=True))
+@pytest.mark.parametrize("cause", [Cause.DISAGREES, Cause.IGNORES])
+def test_a_replica_that_disagrees_with_the_others_is_replaced_new_before_old(cause: Cause) -> None:
+    """Voting, or others' answers, mask it meanwhile; it is ended once its replacement serves."""
+    bad = replica(2, disagrees=True, ignores=cause is Cause.IGNORES)
+    world = World(spec(3)).having(replica(0), replica(1), bad)
     assert (launches(world), ends(world)) == (["2.2"], [])
     [why] = world.plan().launches[0].reason.because
-    assert why.cause is Cause.DISAGREES
+    assert why.cause is cause
     ready = world.having(replica(2, 2, age_s=50))
     assert launches(ready) == []
     assert [id.short for id in ready.plan().draining] == ["2.1"]

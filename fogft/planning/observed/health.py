@@ -267,7 +267,8 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     if link is not None and silent and context.may_doubt and link.silent_for_s > context.patience_s:
         return Verdict.UNRESPONSIVE, Reason(Cause.SILENT, seconds=link.silent_for_s)
     if link is not None and link.disagrees and context.may_doubt:
-        return Verdict.DISAGREES, Reason(Cause.MISREAD if link.misread else Cause.DISAGREES)
+        ignores = Cause.IGNORES if link.ignores else Cause.DISAGREES
+        return Verdict.DISAGREES, Reason(Cause.MISREAD if link.misread else ignores)
     if serving and link is not None and link.at_risk and _has_settled(record, now):
         return Verdict.AT_RISK, Reason(Cause.AT_RISK)
     if serving or not context.may_doubt:

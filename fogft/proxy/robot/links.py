@@ -50,7 +50,9 @@ def link_report(
         "offered": dict(answer.offered) if answer and link.usable else {},
         "draining": draining,
         "at_risk": bool(answer and answer.at_risk),
-        "disagrees": any(dispatcher.disagrees(key_of(link)) for dispatcher in dispatchers),
+        "disagrees": status.ignores
+        or any(dispatcher.disagrees(key_of(link)) for dispatcher in dispatchers),
+        "ignores": status.ignores,
         "misread": any(dispatcher.misreads(key_of(link)) for dispatcher in dispatchers),
         "heard_age_s": status.heard_age_s,
         "silent_for_s": status.silent_for_s,

@@ -250,6 +250,7 @@ class Attempts:
         ):
             self.flush()
         attempt.payload = None
+        attempt.elsewhere = sent and now < attempt.deadline
         if self.window.regained_room():
             self._room()
 
@@ -414,12 +415,13 @@ class Attempts:
         since = self._sending_since
         return 0.0 if since is None else now - since
 
-    def sweep(self) -> None:
-        """End the attempts whose time is up and of which Zenoh told nothing."""
+    def sweep(self) -> bool:
+        """End the attempts whose time is up; return whether the replica ignores what it is sent."""
         now = time.monotonic()
         for attempt in self.window.attempts():
             if attempt.deadline <= now:
                 self._end(attempt, Refusal.LOST)
+        return self._unanswered.are_ignored(now)
 
     def close(self) -> None:
         """Take nothing more: what is open is lost. Returns at once; `end` must follow."""

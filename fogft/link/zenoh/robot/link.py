@@ -79,6 +79,7 @@ class ZenohLink:
         self._detail = "not reached yet"
         self._opening = Opening(peer, shared.settings)
         self._opened = 0
+        self._ignores = False
         self._renew = threading.Event()
         self._renew_at: float | None = None
         self._retiring: list[Connection] = []  # succeeded, with requests under way
@@ -149,6 +150,7 @@ class ZenohLink:
             in_flight_bytes=live.attempts.window.held_bytes if live else 0,
             reopened=max(self._opened - 1, 0),
             detail=self._detail,
+            ignores=self._ignores,
         )
 
     def close(self) -> None:
@@ -280,7 +282,9 @@ class ZenohLink:
                 break
             try:
                 if now >= next_probe:
-                    connection.attempts.sweep()
+                    said = self._probing.answer  # a service that hangs is started anew for that
+                    hangs = said is not None and bool(said.hanging)
+                    self._ignores |= connection.attempts.sweep() and not hangs
                     self._probe(connection, now)
                     if up:
                         self._tell_records(connection)

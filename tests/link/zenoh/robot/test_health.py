@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft.link import probe_frames
+from fogft.link import probe_frames, window
 from fogft.link.port import Probe
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.model.replica import LinkState
@@ -218,3 +218,20 @@ def test_closing_leaves_no_thread(
         link.close()
     wait_for(lambda: set(threading.enumerate()) <= before)
     assert owner.of(1)[0].payload is None
+
+
+def test_who_ends_nothing_that_others_answer_is_found_out_though_probes_are_answered(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(window, "IGNORED_AFTER_S", 0.1)
+    link = dial(start_replica(delay_s=1e6).endpoint)
+    wait_for(lambda: link.usable)
+    for number in range(window.IGNORED_LIMIT):
+        assert not link.status().ignores
+        assert link.offer(SERVICE, request_id(number), b"x", 1.0)
+        link.forget(request_id(number))  # another replica has answered
+    wait_for(lambda: link.status().ignores)
+    assert link.status().state is LinkState.UP
+    assert link.status().reopened == 0
