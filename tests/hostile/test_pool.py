@@ -82,7 +82,7 @@ def test_hostile_parties_cost_a_pool_nothing_but_their_own_machine(
         orders.write_text(lie)
         pool.wait(lambda now=generation: _generations(pool) == whole | {0: now})
         orders.write_text("honest")
-        pool.wait(lambda: pool.ready() == 3)
+        pool.wait(lambda: [one["phase"] for one in _replicas(pool)] == ["ready"] * 3)
     result = client.finish()
     status = pool.status()
     print(result)
