@@ -155,7 +155,11 @@ class Auto(Learning):
 
     def _takes_spare(self, replica: int, now: float) -> bool:
         known = self._replicas[replica]
-        return known.free(now) or (known.doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S)
+        if known.free(now):
+            return True
+        # What others answered first it may never end: that is not found out in `more`.
+        doubted = self._doubts(replica, known.oldest_begun, now)
+        return doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S
 
     def _stale(self, able: Sequence[int], now: float) -> list[int]:
         """Return those of which nothing was heard for long: one spare copy shows how they do."""

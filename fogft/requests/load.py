@@ -127,11 +127,14 @@ class ReplicaLoad:
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
         return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s())
 
+    @property
+    def oldest_begun(self) -> float:
+        """When the oldest of ours began that it has not ended; infinite for none."""
+        return next((begun for begun, _ in self._at_work.values()), NEVER)
+
     def _spent_s(self, now: float) -> float:
         """Return for how long it has been at the oldest of ours; 0 for none."""
-        for begun, _ in self._at_work.values():
-            return now - max(begun, self.ended_at)
-        return 0.0
+        return now - max(self.oldest_begun, self.ended_at) if self._at_work else 0.0
 
     def avoided(self, now: float) -> bool:
         """Whether others are to be asked, where there are any: it is doubted, or has failed."""

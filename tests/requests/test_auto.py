@@ -220,6 +220,19 @@ def test_what_a_doubted_replica_has_goes_to_another_though_that_is_busy_and_cost
     assert policy.first(B, (1, 2), 31.4)[0] == 2
 
 
+def test_one_that_never_ends_what_another_answers_is_tried_once_a_second_not_once_for_all():
+    """Else it would be found out by nobody: it has had no request alone, and gets no more."""
+    policy = learned(r1=0.01, r2=0.01)
+    asked = []
+    for n in range(100):
+        now, request = 31.0 + n * 0.1, bytes([n]) * 16
+        open = dict.fromkeys(policy.first(request, (1, 2), now), now)
+        asked += [now] if 2 in open else []
+        assert 1 in open
+        policy.answered(request, open, 1, idle(0.01), now + 0.01)
+    assert 9 <= len(asked) <= 12
+
+
 def test_when_nobody_works_on_a_request_the_next_is_asked_at_once_without_a_token():
     """The first was suspect, or refused it: a copy is replaced, not added."""
     policy = learned(r1=0.1, r2=0.2)
