@@ -16,6 +16,7 @@ from tests.hostile.stranger import SAYS
 from tests.link.wire_pool import SERVICE, Owner, ReplicaProcess, request_id, wait_for
 
 COUNT, LASTS_S = 10_000, 8.0
+FEW = 6  # descriptors more than a replica has in calm
 JOINS_WITHIN_S = 2.0
 HERE, ELSEWHERE = "127.0.0.1", "127.0.0.66"  # the robots' address, and another one
 
@@ -94,6 +95,30 @@ def test_a_flood_from_elsewhere_keeps_no_robot_out_and_stops_no_request(
     assert max(took_s) < JOINS_WITHIN_S + 0.1 * let_in
     assert replica.count("kept_out") > 0
     assert {answer.payload for _, answer in owner.answers} == {b"x"}
+    assert link.status().reopened == 0
+
+
+def test_a_notice_is_read_and_state_is_written_while_strangers_hold_all_descriptors(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+    tmp_path: Path,
+) -> None:
+    """The process may open few files more: strangers are ended for those, requests go on."""
+    notice, state = tmp_path / "notice", tmp_path / "state"
+    replica = start_replica()
+    link = dial(replica.endpoint)
+    wait_for(lambda: link.usable)
+    replica.ask(watch={str(notice): str(state)})
+    replica.allow_descriptors(FEW)
+    with stranger(replica.endpoint, "hello"):
+        wait_for(lambda: replica.count("descriptors_short") > 0)
+        notice.write_text("soon")
+        wait_for(state.exists)
+        assert link.offer(SERVICE, request_id(1), b"x", 30.0)
+        wait_for(lambda: len(owner.answers) == 1)
+    late = dial(replica.endpoint, robot="late", owner=Owner())
+    wait_for(lambda: late.usable)
     assert link.status().reopened == 0
 
 

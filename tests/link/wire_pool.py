@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import resource
 import signal
 import subprocess
 import sys
@@ -180,7 +181,9 @@ class ReplicaProcess:
         self._process.stdin.close()
 
     def ask(self, **command: object) -> dict[str, object]:
-        """Send a command: `ready`, `draining`, `delay_s`, `revoke`; none asks for its counters."""
+        """Send a command: `ready`, `draining`, `delay_s`, `revoke`, `watch` (a file for notices, and
+        where to write that one was read); none asks for its counters.
+        """
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(command) + "\n")
         self._process.stdin.flush()
@@ -189,6 +192,12 @@ class ReplicaProcess:
     def descriptors(self) -> int:
         """Return how many files and sockets it has open."""
         return len(list(Path(f"/proc/{self._process.pid}/fd").iterdir()))
+
+    def allow_descriptors(self, more: int) -> None:
+        """Let it open so many more than it has now, and none beyond."""
+        _, hard = resource.prlimit(self._process.pid, resource.RLIMIT_NOFILE)
+        limits = self.descriptors() + more, hard
+        resource.prlimit(self._process.pid, resource.RLIMIT_NOFILE, limits)
 
     def count(self, event: str) -> int:
         return int(self.ask().get(event, 0))  # type: ignore[call-overload]

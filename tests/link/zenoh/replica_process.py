@@ -13,9 +13,11 @@ import random
 import sys
 import threading
 import time
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
+from fogft import disk
+from fogft.cloud import notice
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.listener import ZenohListener
@@ -81,6 +83,11 @@ class Service(threading.Thread):
             incoming.reply(incoming.payload)
 
 
+def noted(state_file: Path, one: notice.Notice) -> None:
+    """Write down that a preemption notice was read."""
+    disk.write_json(state_file, one.kind.value)
+
+
 def main() -> None:
     given = json.loads(sys.argv[1])
     files = CredentialPaths(Path(given["ca"]), Path(given["certificate"]), Path(given["key"]))
@@ -110,6 +117,8 @@ def main() -> None:
         command = json.loads(line)
         service.delay_s = command.pop("delay_s", service.delay_s)
         listener.revoke(command.pop("revoke", ()))
+        for source, state_file in command.pop("watch", {}).items():
+            notice.watch(f"file:{source}", partial(noted, Path(state_file)))
         state.update(command)
         lease = listener.lease()
         told = {"lease": 0 if lease is None else lease.sequence}

@@ -5,7 +5,8 @@ likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look 
 process's own sockets, twice a second and whenever somebody comes: what is connected to the
 port and is no authenticated link is ended or kept out as `door` says, a link of a revoked
 holder is ended at once, and one that delivers nothing of what it holds after a while. All are
-counted. Who looks sees, too, which links are thin.
+counted. Where strangers hold all descriptors that the process may have, all of them are ended.
+Who looks sees, too, which links are thin.
 
 Owns: ending connections, and how they drain. Not here: who has to go (`door`), whose requests are
 refused (`sessions`).
@@ -24,6 +25,7 @@ from fogft.link.counters import Counters
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
+from fogft.link.zenoh.replica.descriptor_reserve import DescriptorReserve
 from fogft.link.zenoh.replica.door import Door
 from fogft.link.zenoh.replica.listen_filter import ListenFilter
 from fogft.link.zenoh.sockets import Address
@@ -44,7 +46,8 @@ class ConnectionReaper:
         port: The port that this process listens at.
         links: Returns the peers' addresses of authenticated links, with their common names.
         revoked: Returns the names whose links are to be ended.
-        counters: Counts ``unauthenticated``, ``revoked_links`` and ``stuck_links`` ended.
+        counters: Counts ``unauthenticated``, ``revoked_links`` and ``stuck_links`` ended, and when
+            the door was shut or no descriptors were left.
         stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.
 
     Attributes:
@@ -71,6 +74,7 @@ class ConnectionReaper:
         self._progress: dict[Address, SocketProgress] = {}
         self._filter = ListenFilter(port)
         self._door = Door()
+        self._reserve = DescriptorReserve()
         self._shut = False
         self._descriptors = sockets.count()
         self._stop = threading.Event()
@@ -92,6 +96,7 @@ class ConnectionReaper:
                 log.exception("doorkeeper_failed port=%d", self._port)
                 self._filter.drop(frozenset())
         self._filter.close()
+        self._reserve.release()
 
     def _await_look(self) -> None:
         """Wait until it is time to look: soon after somebody came, at once where many do."""
@@ -106,6 +111,11 @@ class ConnectionReaper:
 
     def look(self, now: float) -> None:
         """Look once, and end what has to go."""
+        short = not self._reserve.fill()
+        if short:
+            self._filter.drop(None)  # first: what is given back is not for strangers
+            self._reserve.release()
+            self._counters.warn(log, "descriptors_short", "descriptors_short port=%d", self._port)
         with contextlib.ExitStack() as stack:
             found = {
                 peer: stack.enter_context(connection)
@@ -117,10 +127,12 @@ class ConnectionReaper:
                 if name in revoked and peer in found:
                     self._end(found[peer], peer, "revoked_links", name)
             self._watch(links, found, now)
-            stranger = self._door.look(found.keys() - links.keys(), links.keys(), now)
-            if stranger is not None:
+            strangers = found.keys() - links.keys()
+            gone = self._door.look(strangers, links.keys(), now)
+            for stranger in strangers if short else () if gone is None else (gone,):
                 self._end(found[stranger], stranger, "unauthenticated", "")
-            self._keep_out(self._door.kept_out)
+            # Where nobody is left to be ended, it is not strangers who leave too few.
+            self._keep_out(None if short and strangers else self._door.kept_out)
         self._descriptors = sockets.count()
 
     def _keep_out(self, hosts: frozenset[str] | None) -> None:
