@@ -181,8 +181,8 @@ class ReplicaProcess:
         self._process.stdin.close()
 
     def ask(self, **command: object) -> dict[str, object]:
-        """Send a command: `ready`, `draining`, `delay_s`, `revoke`, `watch` (a file for notices, and
-        where to write that one was read); none asks for its counters.
+        """Send a command: `ready`, `draining`, `delay_s`, `revoke`, or `watch` (a file for notices,
+        and where to write that one was read); none asks for its counters.
         """
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(command) + "\n")
