@@ -253,8 +253,8 @@ def import_(
 ) -> None:
     """Take over a pool that another machine exported.
 
-    Starts its manager here, and deletes the file. Import it on one machine only: a machine cannot
-    tell that a copy was imported on another, and both would launch replicas.
+    Starts its manager here, and deletes the file. If copies are imported on several machines, all
+    but one step back once a replica tells them, within a minute.
     """
     from fogft.pool.commands import moving, startup
     from fogft.pool.folder.paths import home

@@ -291,6 +291,9 @@ class Dialer(Protocol):
     def tell(self, records: Sequence[SignedRecord]) -> None:
         """Tell every replica these records, now and whenever a link comes up."""
 
+    def newer(self) -> list[SignedRecord]:
+        """Return what replicas said last in place of what they were told; nothing is verified."""
+
     def certificate(self) -> str:
         """Return the common name of the certificate that every link uses.
 

@@ -254,7 +254,7 @@ class UplinkDialer:
     def __init__(self, inner: Dialer) -> None:
         self.inner = inner
         self.adopt, self.renew, self.tell = inner.adopt, inner.renew, inner.tell
-        self.certificate, self.close = inner.certificate, inner.close
+        self.certificate, self.close, self.newer = inner.certificate, inner.close, inner.newer
         self.interfaces: tuple[str, ...] = ()
         self.policies: Mapping[str, UplinkPolicy] = {}
         self._options = DEFAULT_OPTIONS

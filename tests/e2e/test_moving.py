@@ -17,9 +17,9 @@ SECRET = "a passphrase that unknown"
 class Elsewhere(Pool):
     """Another machine with a home of its own, which reaches the same (local) cloud."""
 
-    def __init__(self, pool: Pool) -> None:
+    def __init__(self, pool: Pool, name: str = "elsewhere") -> None:
         super().__init__(pool.folder, int(pool.environ["ROS_DOMAIN_ID"]))
-        self.home = pool.folder / "elsewhere"
+        self.home = pool.folder / name
         self.home.mkdir()
         (self.home / "local").symlink_to(pool.folder / "home" / "local")
         self.environ["FOGFT_HOME"] = str(self.home)
@@ -39,7 +39,10 @@ def machines(pool: Pool) -> set[str]:
 
 
 def test_a_pool_moves_under_load_and_is_managed_by_one_machine_only(pool: Pool) -> None:
-    """No request is lost, no replica replaced, and the old machine can do nothing to it."""
+    """No request is lost, no replica replaced, and the old machine can do nothing to it.
+
+    Nor can another one that imports a copy: either that or the first is told, and steps back.
+    """
     pool.write(replicas=2)
     pool.up()
     secret, file = pool.folder / "secret", pool.folder / "e2e.pool"
@@ -61,7 +64,7 @@ def test_a_pool_moves_under_load_and_is_managed_by_one_machine_only(pool: Pool) 
     ):
         assert "exported from this machine" in pool.fogft(*words, ok=False), words
 
-    other = Elsewhere(pool)
+    other, third = Elsewhere(pool), Elsewhere(pool, "third")
     try:
         wrong = pool.folder / "wrong"
         wrong.write_text("another passphrase\n")
@@ -74,6 +77,14 @@ def test_a_pool_moves_under_load_and_is_managed_by_one_machine_only(pool: Pool) 
         assert "already used" in other.fogft("import", str(copy), *given, ok=False)
         other.wait(other.manages)
         assert other.epoch() > epoch
+        third.fogft("import", str(copy), *given)
+        exported = [one.home / "pools/e2e/exported.json" for one in (other, third)]
+        other.wait(lambda: any(path.exists() for path in exported))
+        if exported[0].exists():
+            other, third = third, other
+        other.wait(other.manages)
+        assert "imported on another later" in third.fogft("scale", "up", "1", ok=False)
+        third.fogft("down", "e2e")
         pool.fogft("down", "e2e")
         assert not (pool.folder / "home/pools/e2e").exists()
         assert machines(pool) == before, "the old machine ended nothing, the new one kept all"
@@ -84,5 +95,6 @@ def test_a_pool_moves_under_load_and_is_managed_by_one_machine_only(pool: Pool) 
         other.fogft("scale", "up", "1", "--wait")
         assert machines(pool) > before
     finally:
+        third.fogft("down", "e2e", ok=False)
         other.fogft("down", ok=False)
     assert machines(pool) == set()

@@ -145,6 +145,10 @@ class MemoryDialer:
     def tell(self, records: Sequence[SignedRecord]) -> None:
         """Do nothing: this wire has no certificates to take back."""
 
+    def newer(self) -> list[SignedRecord]:
+        """Return nothing: this wire tells nobody anything."""
+        return []
+
     def certificate(self) -> str:
         """Return nothing: this wire has no certificates."""
         return ""

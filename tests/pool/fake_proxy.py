@@ -34,6 +34,8 @@ def main(folder: str) -> None:
             for m in members
         ]
         report = {"pid": os.getpid(), "written_at": time.time(), "links": links, "services": {}}
+        heard = paths.folder / "heard"
+        report["manager_epoch"] = int(heard.read_text()) if heard.exists() else 0
         partial = paths.folder / ".proxy-status"
         try:
             partial.write_text(json.dumps(report))

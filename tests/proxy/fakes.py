@@ -115,6 +115,9 @@ class FakeDialer:
     def tell(self, records) -> None:
         self.told = list(records)
 
+    def newer(self):
+        return []
+
     def close(self) -> None:
         for link in self.links:
             link.close()

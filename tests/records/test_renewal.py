@@ -11,8 +11,10 @@ import pytest
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.model.credentials import CredentialPaths
+from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import LinkState
 from fogft.pool.credentials.authority import Role
+from fogft.proxy.robot.following import Following
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
 from fogft.records.signing import Signer
 from tests import certificate_names
@@ -181,3 +183,35 @@ def test_a_robot_passes_the_managers_revocation_on_and_no_other(
         assert replica.count("records") == told, "what was taken is not told again"
     finally:
         dialer.close()
+
+
+def _lease(files: CredentialPaths, epoch: int) -> SignedRecord:
+    record = Record(POOL_UID, RecordKind.LEASE, "", epoch, 1, {"at": 1e9, "lasts_s": 60.0})
+    return sign_record(record, Signer(files.certificate, files.key))
+
+
+def test_a_robot_hears_of_a_later_manager_from_replicas_and_of_none_that_they_make_up(
+    authority: Authority, start_replica: Callable[..., ReplicaProcess], tmp_path: Path
+) -> None:
+    """A replica answers an older lease with the newer one, whose signature counts."""
+    replica = start_replica()
+    manager = authority.issue(certificate_names.manager(POOL_UID), Role.MANAGER)
+    ada = authority.robot("ada")
+    config = ClientProxyConfig("p", POOL_UID, "ada", (), ada, *[tmp_path / n for n in "abc"])
+    following = Following(config)
+    dialers = [ZenohDialer(ada, robot="ada", pool_uid=POOL_UID) for _ in range(2)]
+    try:
+        for dialer, epoch in zip(dialers, (2, 1), strict=True):
+            dialer.tell([_lease(manager, epoch)])
+            dialer.dial(peer(replica.endpoint), keys(0), Owner())
+            wait_for(lambda epoch=epoch: replica.count("records") >= 3 - epoch)  # type: ignore[misc]
+        wait_for(lambda: dialers[1].newer())
+        assert following.report(dialers[0].newer())["manager_epoch"] == 0
+        assert following.report(dialers[1].newer())["manager_epoch"] == 2
+        forged = [_lease(liar, 9) for liar in (ada, authority.replica(1))]
+        replayed = _lease(manager, 1)
+        assert following.report([*forged, replayed])["manager_epoch"] == 2
+    finally:
+        following.close()
+        for dialer in dialers:
+            dialer.close()

@@ -1,8 +1,9 @@
 """Move a pool to another machine: its CA, its history and what it aims for, in one sealed file.
 
 Replicas are not touched and go on answering. From the export on no manager starts for the pool on
-the old machine and no command changes it. The first manager on the new one takes an epoch above
-all before, so what the old machine may still say is out of date to everybody who hears both.
+the old machine and no command changes it. Managers on the new one take epochs of a later term, so
+what the old machine may still say is out of date to everybody who hears both. Where copies of a
+file were imported on two machines, the manager of the earlier term hears of it and steps back.
 
 Owns: what is in the file, and the order of steps. Not here: sealing (`bundle`).
 """
@@ -15,14 +16,14 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 from fogft import disk
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.model.credentials import Holder, Role
-from fogft.model.plain import stored, to_plain
+from fogft.model.plain import Count, stored, to_plain
 from fogft.pool.commands import joining, startup
 from fogft.pool.commands.composition import make_store
 from fogft.pool.credentials import bundle
@@ -40,6 +41,7 @@ _check_name = functools.partial(joining.check_name, depth=4)
 class _Moved:
     identity: Identity
     files: Mapping[Annotated[str, _check_name], str]
+    epoch: Count = 0
 
 
 def export(
@@ -81,13 +83,12 @@ def export(
             with contextlib.ExitStack() as ended:
                 ended.enter_context(shutdown.without_manager(paths, told))
                 proxy_supervisor.forbid_restart(paths)
-                if any(service.state is not None for service in store.spec().services):
-                    ended.enter_context(shutdown.without_client_proxy(paths, told))
-                epoch = lease.read_epoch(paths) + 1
-                holder = Holder(Role.MANAGER, "manager", epoch, identity.uid)
+                ended.enter_context(shutdown.without_orders(paths, store.spec(), told))
+                holder = Holder(Role.MANAGER, "manager", 1, identity.uid)
                 until = now + open_for_s
                 label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, until)
-                moved = _Moved(identity, dict(_files(paths, identity, root)))
+                files = dict(_files(paths, identity, root))
+                moved = _Moved(identity, files, lease.read_epoch(paths))
                 disk.write_whole(unfinished, bundle.seal(label, to_plain(moved), passphrase))
                 os.replace(paths.identity, paths.exported)
         except (FogftError, OSError):
@@ -174,8 +175,9 @@ def import_(
             if folder in folders and rest:
                 disk.make_folder((folders[folder] / rest).parent)
                 disk.write_whole(folders[folder] / rest, text.encode("latin-1"))
-        lease.write_epoch(paths, max(label.holder.generation, lease.read_epoch(paths)))
-        write_identity(paths, Identity(was.name, was.uid, was.cloud, str(place), was.created_at))
+        before = max(brought.epoch, label.holder.generation, lease.read_epoch(paths))
+        here = replace(was, file=str(place), first_epoch=lease.next_term(before))
+        write_identity(paths, here)
         paths.exported.unlink(missing_ok=True)
     joining.destroy(file, len(data))
     return make_store(was.name)

@@ -2,19 +2,23 @@
 
 The lock keeps two managers of one folder apart; the epoch, which goes into every
 membership, fences off what an earlier one may still write; the beat tells the proxies
-(and through them the replicas) that somebody looks after the pool.
+(and through them the replicas) that somebody looks after the pool. A machine that imports a pool
+counts from a random later term, so of two that import copies one is the later one, for everybody.
 
 Owns: `manager.lock` and `lease.json`.
 """
 
 from __future__ import annotations
 
+import secrets
 from dataclasses import dataclass
 
 from fogft import disk
 from fogft.errors import PoolBusy, StateError
 from fogft.model.plain import Count, stored, to_plain
 from fogft.pool.folder.paths import PoolPaths
+
+TERM = 1 << 20  # epochs of one machine; as many terms may be skipped
 
 
 @dataclass(frozen=True)
@@ -73,9 +77,14 @@ def read_epoch(paths: PoolPaths) -> int:
     return _read(paths).epoch
 
 
-def write_epoch(paths: PoolPaths, epoch: int) -> None:
-    """Have the next manager take an epoch above this one."""
-    disk.write_json(paths.lease, to_plain(_Held(epoch)))
+def next_term(after: int) -> int:
+    """Return the epoch from which a machine counts that imports a pool."""
+    return (after // TERM + 1 + secrets.randbelow(TERM)) * TERM
+
+
+def supersedes(heard: int, ours: int) -> bool:
+    """Whether an epoch is that of a machine which took the pool over later than ours did."""
+    return heard // TERM > ours // TERM
 
 
 def _read(paths: PoolPaths) -> _Held:

@@ -17,7 +17,7 @@ from fogft.errors import PoolBusy, PoolNotFound, SpecError, StateError
 from fogft.model.intent import Intent
 from fogft.model.membership import from_dict, to_dict
 from fogft.model.names import PoolUid
-from fogft.model.plain import from_plain, stored, to_plain
+from fogft.model.plain import Count, from_plain, stored, to_plain
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import Event, History
@@ -33,6 +33,7 @@ class Identity:
 
     Attributes:
         file: Absolute path of the pool file.
+        first_epoch: Managers on this machine take epochs above it; see `lease`.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Identity:
     cloud: str
     file: str
     created_at: float
+    first_epoch: Count = 0
 
 
 class Store(Protocol):
@@ -258,8 +260,8 @@ def read_identity(paths: PoolPaths) -> Identity:
     if raw is None and paths.exported.exists():
         name = paths.folder.name
         raise PoolBusy(
-            f"pool `{name}` was exported from this machine",
-            f"manage it where it was imported; `fogft down {name}` ends what is left here",
+            f"pool `{name}` was exported from this machine, or imported on another later",
+            f"manage it where it was imported last; `fogft down {name}` ends what is left here",
         )
     if raw is None:
         raise PoolNotFound(f"there is no pool `{paths.folder.name}`", "`fogft up FILE` starts one")

@@ -125,6 +125,12 @@ class ManagerRecords:
         self._certified_at = now
 
     @property
+    def newest_epoch(self) -> int:
+        """Return the newest manager's epoch that a rendezvous knows; 0 where none does."""
+        known = [] if self._client is None else self._client.known.of(RecordKind.LEASE)
+        return max((lease.generation for lease in known), default=0)
+
+    @property
     def trouble(self) -> Reason | None:
         """Return what is wrong; None when at least one rendezvous is there."""
         if self._client is None or self._client.known.connected:

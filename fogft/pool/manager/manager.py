@@ -31,7 +31,7 @@ from fogft.planning.planner import PlannedLaunch
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.costs import CostBook, path_of
 from fogft.pool.folder.discovered import Discovery
-from fogft.pool.folder.lease import Lease
+from fogft.pool.folder.lease import Lease, supersedes
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import (
@@ -94,7 +94,8 @@ class Manager:
         self._paths = store.paths
         self._identity = store.identity()
         published = store.membership()
-        self._lease = Lease.take(self._paths, at_least=published.epoch if published else 0)
+        first = max(self._identity.first_epoch, published.epoch if published else 0)
+        self._lease = Lease.take(self._paths, at_least=first)
         self._wake = threading.Event()
         self._proxy = ProxySupervisor(
             self._paths, time.monotonic, proxy_command, ended=self._wake.set
@@ -166,6 +167,7 @@ class Manager:
         """
         self._trouble = []
         self._attempt(self._lease.beat)
+        self._attempt(self._step_back)
         self._attempt(self._bound_logs)
         self._attempt(self._keep_proxy)
         tick = self._attempt_tick()
@@ -183,6 +185,22 @@ class Manager:
                 return not self._trouble
         self._attempt(lambda: self._write_status(tick))
         return False
+
+    def _step_back(self) -> None:
+        """Leave the pool, as an export does, where another machine took it over later.
+
+        Raises:
+            PoolBusy: It did.
+        """
+        report = self._fresh_report(time.time())
+        heard = max(self._records.newest_epoch, report.manager_epoch if report else 0)
+        if not supersedes(heard, self._lease.epoch):
+            return
+        log.error("pool_superseded pool=%s epoch=%d", self._identity.name, heard)
+        proxy_supervisor.forbid_restart(self._paths)
+        with shutdown.without_orders(self._paths, self._store.spec(), lambda _: None):
+            os.replace(self._paths.identity, self._paths.exported)
+        self._store.identity()  # which says so
 
     def _bound_logs(self) -> None:
         for path in (self._paths.manager_log, self._paths.proxy_log):

@@ -87,6 +87,7 @@ class ProxyReport:
     Attributes:
         written_at: Seconds since the epoch, by the same machine's clock.
         services: Service name -> its counters, as the proxy wrote them.
+        manager_epoch: The newest that it has heard of, on this machine or another.
     """
 
     pid: int
@@ -99,6 +100,7 @@ class ProxyReport:
     topics: Mapping[str, TopicCounted] = field(default_factory=dict)
     uplink_suspected: bool = False
     gateways: tuple[GatewayLink, ...] = ()
+    manager_epoch: Count = 0
 
     def fresh(self, now: float) -> bool:
         """Whether it still says something about now. A clock that jumped makes it say nothing."""

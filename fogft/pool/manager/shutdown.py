@@ -22,6 +22,7 @@ from fogft import disk
 from fogft.cloud.port import Cloud
 from fogft.errors import FogftError, PoolNotFound, StateError
 from fogft.model.intent import Intent
+from fogft.model.spec import PoolSpec
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import process_control, teardown
@@ -109,6 +110,15 @@ def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Itera
         _taken(done, "client proxy", paths.proxy_lock),
         _taken(lambda _: None, "standby client proxy", paths.standby_lock),
     ):
+        yield
+
+
+@contextlib.contextmanager
+def without_orders(paths: PoolPaths, spec: PoolSpec, done: Callable[[str], None]) -> Iterator[None]:
+    """As `without_client_proxy` where a service is stateful: only one robot may order requests."""
+    with contextlib.ExitStack() as ended:
+        if any(service.state is not None for service in spec.services):
+            ended.enter_context(without_client_proxy(paths, done))
         yield
 
 

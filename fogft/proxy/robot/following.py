@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -25,8 +25,9 @@ from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import Member, Membership
 from fogft.records import roster
 from fogft.records.client import Known, RendezvousClient
-from fogft.records.record import RecordKind
-from fogft.records.signing import Signer, Verifier
+from fogft.records.record import RecordKind, SignedRecord
+from fogft.records.record_set import RecordSet
+from fogft.records.signing import LazyVerifier, Signer, Verifier
 
 log = logging.getLogger(__name__)
 
@@ -46,6 +47,7 @@ class Following:
         self._changed = threading.Event()
         self._client: RendezvousClient | None = None
         self.door: DialIn | None = None
+        self._signed = RecordSet(config.pool_uid, LazyVerifier(config.credentials.ca))
         self._open_door()
         self._call()
 
@@ -154,9 +156,16 @@ class Following:
         named = self._from_file.revoked if self._from_file is not None else frozenset()
         return named | self._known().revoked
 
-    def report(self) -> Mapping[str, Any]:
-        """Return what people should know: each rendezvous, and the door."""
-        found: dict[str, Any] = {}
+    def report(self, newer: Iterable[SignedRecord] = ()) -> Mapping[str, Any]:
+        """Return the newest manager's epoch, of what replicas said too, each rendezvous, the door.
+
+        Nobody counts here but who signed: a replica that lies is refused.
+        """
+        for one in newer:
+            self._signed.offer(one)
+        leases = [*self._signed.of(RecordKind.LEASE), *self._known().of(RecordKind.LEASE)]
+        epoch = max((lease.generation for lease in leases), default=0)
+        found: dict[str, Any] = {"manager_epoch": epoch}
         if self._client is not None:
             found["records"] = self._client.status()
         if self.door is not None:

@@ -341,7 +341,7 @@ class _Running:
             "version": __version__,
             **told,
             **seen,
-            **self.following.report(),
+            **self.following.report(self.dialer.newer()),
             "callers": self.callers(),
         }
         disk.write_json(self.config.status, report, durable=False)

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fogft import disk
 from fogft.errors import PoolNotFound, StateError
@@ -16,7 +18,7 @@ from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Membership
 from fogft.planning.observed.history import Event, EventKind
-from fogft.pool.folder import history_file
+from fogft.pool.folder import history_file, lease
 from fogft.pool.folder.store import read_identity
 from tests.pool.scene import Scene, store_of
 
@@ -141,3 +143,15 @@ def test_spec_is_read_again_when_it_changes(pool: Scene) -> None:
     assert pool.store.spec() is first
     pool.write(replicas=3)
     assert pool.store.spec().replicas == 3
+
+
+@given(after=st.integers(0, 2**50), restarts=st.integers(0, lease.TERM - 1))
+def test_of_two_imports_one_is_the_later_and_no_restart_is(after: int, restarts: int) -> None:
+    """Each supersedes what was before; a machine never supersedes itself."""
+    one, other = lease.next_term(after), lease.next_term(after)
+    assert lease.supersedes(one, after)
+    assert lease.supersedes(other, after)
+    assert one == other or lease.supersedes(max(one, other), min(one, other) + restarts)
+    assert not lease.supersedes(min(one, other), max(one, other))
+    assert not lease.supersedes(one + restarts, one)
+    assert max(one, other) < 2**53  # what a record may count to

@@ -12,7 +12,7 @@ from fogft import disk, logfile
 from fogft.errors import PoolBusy
 from fogft.model import intent as intents
 from fogft.pool.commands import startup
-from fogft.pool.folder.lease import Lease
+from fogft.pool.folder.lease import TERM, Lease
 from tests.pool.scene import Scene
 
 
@@ -230,3 +230,21 @@ def test_logs_of_the_pool_stay_bounded(scene: Scene) -> None:
         os.truncate(log, logfile.LIMIT_BYTES + 1)
     scene.start_manager()
     scene.wait(lambda: all(log.stat().st_size <= logfile.LIMIT_BYTES for log in logs))
+
+
+def test_a_manager_steps_back_from_a_later_import_and_from_no_other(scene: Scene) -> None:
+    """It ends no replica and starts no more; a later epoch of this machine's own is no reason."""
+    scene.write(replicas=2)
+    heard = scene.paths.folder / "heard"
+    heard.write_text(str(TERM - 1))
+    process = scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    before = scene.status()["written_at"]
+    scene.wait(lambda: scene.status()["written_at"] > before)
+    disk.write_whole(heard, str(TERM).encode())
+    assert process.wait(30) == 1
+    assert not scene.paths.manager_start.exists()
+    with pytest.raises(PoolBusy, match="imported on another later"):
+        scene.store.identity()
+    assert len(list(scene.cloud.folder.glob("*.json"))) == 2
+    assert scene.start_manager().wait(30) == 1

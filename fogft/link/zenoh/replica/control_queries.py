@@ -27,7 +27,7 @@ from fogft.link.zenoh.replica.sessions import AuthenticatedSessions, NotAdmitted
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model.refusal import Refusal
 from fogft.records import frames
-from fogft.records.record import RecordError, SignedRecord
+from fogft.records.record import RecordError, SignedRecord, read_body
 from fogft.records.record_set import RecordSet, Verdict
 
 log = logging.getLogger(__name__)
@@ -139,13 +139,18 @@ class ControlQueries:
         if not self._greeted(greeting, asked):
             return
         try:
-            self.take(offered)
-            asked.query.reply(asked.query.key_expr, b"")
+            newer = self.take(offered)
+            asked.query.reply(asked.query.key_expr, frames.pack(newer) if newer else b"")
         finally:
             self._queues.end(greeting.token, "probe", asked)
 
-    def take(self, offered: Sequence[SignedRecord]) -> None:
-        """Judge records by their own signatures, and do what those that are good say."""
+    def take(self, offered: Sequence[SignedRecord]) -> list[SignedRecord]:
+        """Judge records by their own signatures, and do what those that are good say.
+
+        Returns:
+            What stands in place of those that are out of date.
+        """
+        newer: list[SignedRecord] = []
         for one in offered:
             verdict = self._records.offer(one)
             if verdict is Verdict.REFUSED:
@@ -153,7 +158,10 @@ class ControlQueries:
                 log.warning("record_refused reason=%r", self._records.last_refusal)
             elif verdict is Verdict.OLDER:
                 self._counters.add("records_older")
+                record = read_body(one)
+                newer += filter(None, [self._records.signed(record.kind, record.subject)])
         self._sessions.revoke(self._records.revoked)
+        return newer
 
     def _greeted(self, greeting: frame.Greeting, asked: QueryEnd) -> bool:
         """Whether this is somebody who is let in; else it is told why not."""

@@ -227,12 +227,17 @@ class Connection:
         )
         self.lose(words)
 
-    def tell_records(self, key: str, records: bytes) -> None:
-        """Send signed records; `told` is them once the replica has taken them."""
+    def tell_records(self, key: str, records: bytes, newer: Callable[[bytes], object]) -> None:
+        """Send signed records; `told` is them once the replica has taken them.
+
+        `newer` is given what it says in place of those that are out of date, from any thread.
+        """
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 self.told = records
+                if content := reply.ok.payload.to_bytes():
+                    newer(content)
 
         self._ask(
             key,

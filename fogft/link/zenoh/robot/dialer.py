@@ -6,6 +6,7 @@ life (`link`).
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -17,7 +18,7 @@ from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
-from fogft.records.record import SignedRecord
+from fogft.records.record import RecordError, SignedRecord
 
 _CLOSE_WAIT_S = 3.0
 
@@ -80,6 +81,14 @@ class ZenohDialer:
     def tell(self, records: Sequence[SignedRecord]) -> None:
         """Tell every replica these records, with the next probe of each link."""
         self._shared.records = frames.pack(records) if records else b""
+
+    def newer(self) -> list[SignedRecord]:
+        """Return what replicas said last in place of what they were told; nothing is verified."""
+        said: list[SignedRecord] = []
+        for packed in list(self._shared.newer.values()):
+            with contextlib.suppress(RecordError):
+                said += frames.unpack(packed)
+        return said
 
     def certificate(self) -> str:
         """Return the common name of the certificate that every open link uses, or nothing."""

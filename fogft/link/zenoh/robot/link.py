@@ -14,6 +14,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import zenoh
 
@@ -335,7 +336,8 @@ class ZenohLink:
         """Send what the replica has not taken yet; with each probe until it has."""
         records, id = self._shared.records, self.peer.id
         if records != connection.told:
-            connection.tell_records(names.records_key(id.pool_uid, id.slot), records)
+            newer = partial(self._shared.newer.__setitem__, id.slot)
+            connection.tell_records(names.records_key(id.pool_uid, id.slot), records, newer)
 
     def _renewal_due(self, now: float) -> bool:
         if self._renew_at is not None and now >= self._renew_at:

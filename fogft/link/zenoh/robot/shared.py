@@ -19,6 +19,7 @@ class Shared:
         suspect_after_s: Probes unanswered for so long make a link suspect.
         tell_losers: Whether replicas are told which requests are no longer wanted.
         records: Signed records for every replica, packed; empty for none.
+        newer: Slot -> what its replica said last in place of records that are out of date.
     """
 
     credentials: CredentialPaths
@@ -29,6 +30,7 @@ class Shared:
     options: SendOptions = DEFAULT_OPTIONS
     gate: LargeSendGate = field(default_factory=LargeSendGate)
     records: bytes = b""
+    newer: dict[int, bytes] = field(default_factory=dict)
     _signer: Signer | None = None
 
     @property
