@@ -83,7 +83,7 @@ def test_a_pool_moves_under_load_and_is_managed_by_one_machine_only(pool: Pool) 
         if exported[0].exists():
             other, third = third, other
         other.wait(other.manages)
-        assert "imported on another later" in third.fogft("scale", "up", "1", ok=False)
+        assert "imported on another later" in third.fogft("scale", "up", "1", "-p", "e2e", ok=False)
         third.fogft("down", "e2e")
         pool.fogft("down", "e2e")
         assert not (pool.folder / "home/pools/e2e").exists()
