@@ -197,7 +197,10 @@ def test_a_robot_hears_of_a_later_manager_from_replicas_and_of_none_that_they_ma
     replica = start_replica()
     manager = authority.issue(certificate_names.manager(POOL_UID), Role.MANAGER)
     ada = authority.robot("ada")
-    config = ClientProxyConfig("p", POOL_UID, "ada", (), ada, *[tmp_path / n for n in "abc"])
+    config = ClientProxyConfig(
+        pool="p", pool_uid=POOL_UID, credentials=ada, services=(), robot="ada",
+        membership=tmp_path / "a", status=tmp_path / "b", lock=tmp_path / "c",
+    )  # fmt: skip
     following = Following(config)
     dialers = [ZenohDialer(ada, robot="ada", pool_uid=POOL_UID) for _ in range(2)]
     try:

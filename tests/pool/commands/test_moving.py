@@ -12,6 +12,7 @@ from fogft.pool.credentials.authority import create_authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.lease import read_epoch
 from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import read_identity
 from tests.cli.pools import UID, lay_down
 
 SECRET = "correct horse battery staple"
@@ -48,7 +49,7 @@ def test_what_is_moved_is_the_same_pool_under_a_later_epoch(made, tmp_path):
         assert (paths.credentials / name).read_bytes() == content
         assert (paths.credentials / name).stat().st_mode & 0o777 == 0o600
     assert paths.spec.read_bytes() == store.paths.spec.read_bytes()
-    assert read_epoch(paths) > read_epoch(store.paths)
+    assert read_identity(paths).first_epoch > read_epoch(store.paths)
     assert not file.exists()
 
 

@@ -239,8 +239,8 @@ def test_a_manager_steps_back_from_a_later_import_and_from_no_other(scene: Scene
     heard.write_text(str(TERM - 1))
     process = scene.start_manager()
     scene.wait(lambda: scene.whole(2))
-    before = scene.status()["written_at"]
-    scene.wait(lambda: scene.status()["written_at"] > before)
+    before = scene.status()["observed_at"]
+    scene.wait(lambda: scene.status()["observed_at"] > before)
     disk.write_whole(heard, str(TERM).encode())
     assert process.wait(30) == 1
     assert not scene.paths.manager_start.exists()
