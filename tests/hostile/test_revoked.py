@@ -120,6 +120,7 @@ def test_only_the_manager_prolongs_a_replica_s_life(
     forged = Record(POOL_UID, RecordKind.LEASE, "", 7, 7, content)
     signed = sign_record(forged, Signer(eve.certificate, eve.key))
     dial(replica.endpoint, eve, "eve", Owner(), (*genuine, signed))
+    wait_for(lambda: replica.count("records_refused") == 1)
     wait_for(lambda: replica.count("lease") == 2)
     assert replica.count("records_refused") == 1
 
