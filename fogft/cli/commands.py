@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import keyword
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -107,25 +107,37 @@ def _elsewhere(name: str) -> Any:
     return typer.main.get_command(alone)
 
 
+class Group(TyperGroup):
+    """A group of commands whose descriptions are folded, never cut."""
+
+    def sections(self) -> Iterable[tuple[str, Iterable[str]]]:
+        """Return the titles of the lists, with the names of the commands in each."""
+        return [("Commands", self.commands)]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write one list a section."""
+        for title, names in self.sections():
+            with formatter.section(title):
+                formatter.write_dl(
+                    [(n, self.commands[n].get_short_help_str(_WHOLE)) for n in names]
+                )
+
+
 def group(help: str) -> typer.Typer:
     """Return a group of commands, to which a module adds its own."""
-    return typer.Typer(rich_markup_mode=None, add_completion=False, help=help)
+    return typer.Typer(cls=Group, rich_markup_mode=None, add_completion=False, help=help)
 
 
-class Commands(TyperGroup):
+class Commands(Group):
     """The root of all commands, listed by section."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.commands: Any = _Loaded()
 
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write one list a section."""
-        for title, names in SECTIONS.items():
-            with formatter.section(title):
-                formatter.write_dl(
-                    [(n, self.commands[n].get_short_help_str(_WHOLE)) for n in names]
-                )
+    def sections(self) -> Iterable[tuple[str, Iterable[str]]]:
+        """Return the sections by what people want to do."""
+        return SECTIONS.items()
 
 
 class Command(TyperCommand):

@@ -159,7 +159,8 @@ def _show_costs(found: Sequence[Costs]) -> None:
     rows: MutableSequence[Sequence[str]] = []
     for costs in found:
         if costs.before_usd:
-            rows.append([costs.pool, "earlier", "", "", "", "", f"{costs.before_usd:.2f}"])
+            before = price(costs.before_usd).removeprefix("$")
+            rows.append([costs.pool, "earlier", "", "", "", "", before])
         rows.extend(
             [
                 costs.pool,
@@ -167,8 +168,8 @@ def _show_costs(found: Sequence[Costs]) -> None:
                 one.replica,
                 one.location,
                 f"{one.instance}{' spot' if one.spot else ''}",
-                f"{one.hours:.1f}",
-                f"{one.usd:.2f}",
+                f"{one.hours:.2f}",
+                price(one.usd).removeprefix("$"),
             ]
             for one in costs.spent
         )
@@ -177,4 +178,4 @@ def _show_costs(found: Sequence[Costs]) -> None:
     output.show(table(names, rows, width=width, right=("HOURS", "$"), folds=("LOCATION",)))
     output.data("")
     for costs in found:
-        output.data(f"{costs.pool}: ${costs.usd:.2f}")
+        output.data(f"{costs.pool}: {price(costs.usd)}")

@@ -16,11 +16,11 @@ def test_what_was_spent_is_shown_by_day_and_replica(home: Path, capsys):
         kept.look(NOON + 18 * 3600, [machine(0, STEADY, usd_per_hour=price)], [], 600.0)
     assert main.run(["cost", "perception"]) == 0
     shown = capsys.readouterr().out
-    assert "perception: $9.00" in shown
+    assert "perception: $9.000" in shown
     assert "planner" not in shown
     assert [line.split()[-2:] for line in shown.splitlines()[1:3]] == [
-        ["12.0", "6.00"],
-        ["6.0", "3.00"],
+        ["12.00", "6.000"],
+        ["6.00", "3.000"],
     ]
     assert main.run(["cost", "--json"]) == 0
     first, second = json.loads(capsys.readouterr().out)

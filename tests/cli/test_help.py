@@ -48,8 +48,13 @@ def test_the_list_of_commands_is_complete():
 
 def test_the_list_fits_on_one_screen(capsys):
     main.run(["--help"])
+    assert len(capsys.readouterr().out.splitlines()) <= 56
+
+
+@pytest.mark.parametrize("words", ["", "chaos", "credentials", "scale", "service"])
+def test_no_description_is_cut(words, capsys):
+    main.run([*words.split(), "--help"])
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) <= 56
     assert not [line for line in lines if "..." in line and "ARGS" not in line]
 
 

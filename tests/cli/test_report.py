@@ -33,7 +33,7 @@ def test_a_screen_has_trends_events_and_cost(home, capsys):
     assert "1 of 3 ready" in shown
     assert re.search(r"P99 /plan +█ +148 ms", shown)
     assert re.search(r"RTT 0\.1 +█ +0\.42 ms", shown)
-    assert "spent $0.00 so far" in shown
+    assert "spent $0.000 so far" in shown
     assert "local/<west>/a" in shown
 
 
@@ -57,6 +57,7 @@ def test_a_page_tells_a_pools_life(home, capsys, tmp_path):
     page = (tmp_path / "page.html").read_text()
     assert page.startswith("<!doctype html>")
     assert "At least one replica was ready for" in page
+    assert "days before this page was written" in page, "a time has the unit that fits it"
     assert "<svg" in page
     assert "local/&lt;west&gt;/a" in page, "what comes from elsewhere is escaped"
     assert "148 ms" in page

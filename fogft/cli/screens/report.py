@@ -14,7 +14,7 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import PoolArgument, PoolOption
-from fogft.cli.status_text import milliseconds, utc
+from fogft.cli.status_text import age, milliseconds, price, utc
 from fogft.errors import FogftError
 from fogft.pool.commands import composition
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from fogft.planning.observed.history import Event
 
 _EVENTS_SHOWN = 500
+_UNITS = (("days", 86400.0), ("hours", 3600.0), ("minutes", 60.0))
 _STYLE = """
 :root { color-scheme: light dark; }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem; }
@@ -76,9 +77,9 @@ def _page(store: Any, now: float) -> str:
     parts = [
         f"<h1>Pool {html.escape(status.pool)}</h1>",
         f"<p>{status.ready} of {status.target} replicas ready on {html.escape(status.cloud)}; "
-        f"${sum(one.usd for one in costs):.2f} spent; written {utc(now)}.</p>",
+        f"{price(sum(one.usd for one in costs))} spent; written {utc(now)}.</p>",
         "<h2>Availability</h2>",
-        f"<p>At least one replica was ready for {up_s / known_s:.4%} of {known_s / 3600:.1f} h "
+        f"<p>At least one replica was ready for {up_s / known_s:.4%} of the last {age(known_s)}, "
         "of which events are kept.</p>"
         if known_s
         else "<p>No replica was ready so far.</p>",
@@ -154,11 +155,13 @@ def _steps(spans: Sequence[tuple[str, float, float]]) -> list[tuple[float, int]]
 
 def _draw_spans(axes: Any, spans: Sequence[tuple[str, float, float]], now: float) -> None:
     names = sorted({name for name, _, _ in spans}, key=lambda name: [*map(int, name.split("."))])
+    longest_s = now - min(at for _, at, _ in spans)
+    unit, unit_s = next((row for row in _UNITS if longest_s >= 2 * row[1]), _UNITS[-1])
     for name, at, until in spans:
         row = names.index(name)
-        axes.hlines(row, (at - now) / 3600, (until - now) / 3600, color="k", linewidth=6)
+        axes.hlines(row, (at - now) / unit_s, (until - now) / unit_s, color="k", linewidth=6)
     axes.set_yticks(range(len(names)), names)
-    axes.set(xlabel="hours before this page was written", title="replicas that were ready")
+    axes.set(xlabel=f"{unit} before this page was written", title="replicas that were ready")
 
 
 def _draw_costs(axes: Any, days: dict[str, float]) -> None:

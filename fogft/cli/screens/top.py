@@ -77,7 +77,7 @@ def _screen(
     parts: list[RenderableType] = [
         status_text.rendered(seen, width=width),
         "",
-        output.cell(f"spent ${seen.status.usd_to_date:.2f} so far"),
+        output.cell(f"spent {status_text.price(seen.status.usd_to_date)} so far"),
     ]
     if trends:
         parts += ["", table(("LATENCY", "LAST MINUTE", "NOW"), trends, width=width, right=("NOW",))]
