@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING
 
 import fogft
 
 if TYPE_CHECKING:
-    from prometheus_client import Metric
+    from prometheus_client import CollectorRegistry, Metric
 
 Labels = Mapping[str, str]
 Values = Iterable[tuple[float, Labels]]
@@ -72,11 +72,11 @@ def _printable(labels: Labels) -> dict[str, str]:
     return {key: value.encode(errors="replace").decode() for key, value in labels.items()}
 
 
-class Collector:
+class _Collector:
     """What one process tells: its families as measured now, each with the process's labels."""
 
-    def __init__(self, families: Iterable[Metric], labels: Labels) -> None:
-        self._families = families
+    def __init__(self, measure: Callable[[], Iterable[Metric]], labels: Labels) -> None:
+        self._measure = measure
         self._labels = dict(labels)
 
     def collect(self) -> Iterator[Metric]:
@@ -88,7 +88,7 @@ class Collector:
         )
         from prometheus_client import ProcessCollector
 
-        for family in chain(self._families, ProcessCollector(registry=None).collect()):
+        for family in chain(self._measure(), ProcessCollector(registry=None).collect()):
             family.samples = [
                 sample._replace(labels={**self._labels, **sample.labels})
                 for sample in family.samples
@@ -97,10 +97,10 @@ class Collector:
                 yield family
 
 
-def text(families: Iterable[Metric], labels: Labels) -> str:
-    """Return families in Prometheus's text format."""
-    from prometheus_client import CollectorRegistry, generate_latest
+def registry(measure: Callable[[], Iterable[Metric]], labels: Labels) -> CollectorRegistry:
+    """Return the registry of a process: what is measured at each look, with these labels."""
+    from prometheus_client import CollectorRegistry
 
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(Collector(families, labels))
-    return generate_latest(registry).decode()
+    made = CollectorRegistry(auto_describe=False)
+    made.register(_Collector(measure, labels))
+    return made

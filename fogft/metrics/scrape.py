@@ -1,7 +1,7 @@
-"""Serve metrics to Prometheus: ``GET /metrics`` over plain HTTP, answered by `prometheus-client`.
+"""Serve metrics to Prometheus over plain HTTP, by `prometheus-client`'s own application.
 
-Few threads, short limits: a scraper that is slow or hostile costs one of them for a moment.
-Whatever goes wrong here harms nothing else in the process.
+A scraper that is slow or hostile costs a thread for seconds. Whatever goes wrong here harms nothing
+else in the process.
 """
 
 from __future__ import annotations
@@ -9,10 +9,11 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterable
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING, Any
+from socketserver import ThreadingMixIn
+from typing import TYPE_CHECKING
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from fogft.metrics.families import Labels, text
+from fogft.metrics.families import Labels, registry
 from fogft.model.names import host_and_port
 
 if TYPE_CHECKING:
@@ -20,9 +21,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _LIMIT_S = 5.0
-_AT_ONCE = 4
 
 Measure = Callable[[], "Iterable[Metric]"]
 
@@ -31,9 +30,10 @@ class Scrape:
     """Metrics at an endpoint, which may change or be none; measured for each request."""
 
     def __init__(self, measure: Measure, labels: Labels) -> None:
-        self._tell = lambda: text(measure(), labels)
+        self._measure = measure
+        self._labels = labels
         self._wanted = ""
-        self._server: _Server | None = None
+        self._server: WSGIServer | None = None
 
     @property
     def endpoint(self) -> str:
@@ -54,8 +54,11 @@ class Scrape:
         self._wanted = endpoint
         if not endpoint:
             return
+        from prometheus_client import make_wsgi_app
+
+        app = make_wsgi_app(registry(self._measure, self._labels))
         try:
-            self._server = _Server(host_and_port(endpoint), self._tell)
+            self._server = make_server(*host_and_port(endpoint), app, _Server, _Request)
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))
             return
@@ -72,52 +75,13 @@ class Scrape:
             server.server_close()
 
 
-class _Server(ThreadingHTTPServer):
+class _Server(ThreadingMixIn, WSGIServer):
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 16
-
-    def __init__(self, address: tuple[str, int], tell: Callable[[], str]) -> None:
-        super().__init__(address, _Request)
-        self.tell = tell
-        self.room = threading.BoundedSemaphore(_AT_ONCE)
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        if not self.room.acquire(blocking=False):
-            self.shutdown_request(request)
-            return
-        super().process_request(request, client_address)
-
-    def process_request_thread(self, request: Any, client_address: Any) -> None:
-        try:
-            super().process_request_thread(request, client_address)
-        finally:
-            self.room.release()
-
-    def handle_error(self, request: Any, client_address: Any) -> None:
-        log.debug("scrape_failed client=%s", client_address, exc_info=True)
 
 
-class _Request(BaseHTTPRequestHandler):
+class _Request(WSGIRequestHandler):
     timeout = _LIMIT_S
-    server: _Server
 
-    def do_GET(self) -> None:
-        """Answer a scrape."""
-        if self.path.partition("?")[0] != "/metrics":
-            self.send_error(404)
-            return
-        try:
-            body = self.server.tell().encode()
-        except Exception:
-            log.exception("metrics_not_measured")
-            self.send_error(500)
-            return
-        self.send_response(200)
-        self.send_header("Content-Type", _CONTENT_TYPE)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, format: str, *arguments: Any) -> None:
+    def log_message(self, format: str, *arguments: object) -> None:
         """Log no line for each scrape."""

@@ -93,11 +93,10 @@ class Listed:
 
 @dataclass(frozen=True)
 class Table:
-    """A map from texts to numbers; kept as pairs where `as_pairs` says so."""
+    """A map from texts to numbers."""
 
     of: Number
     name: Text
-    as_pairs: bool = False
 
 
 @dataclass(frozen=True)

@@ -80,7 +80,7 @@ def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
         omits = omit_defaults or getattr(value, "omits_defaults", False)
         held = [(one, getattr(value, one.field)) for one in _entries(type(value))]
         kept = [(one, it) for one, it in held if not omits or it != one.default]
-        return {one.name: again(dict(it) if one.is_pairs else it) for one, it in kept}
+        return {one.name: again(it) for one, it in kept}
     if isinstance(value, Mapping):
         return {str(key): again(one) for key, one in value.items()}
     if isinstance(value, (set, frozenset)):
@@ -118,11 +118,6 @@ class _Entry(NamedTuple):
     field: str
     default: Any
     form: keys.Form | None
-
-    @property
-    def is_pairs(self) -> bool:
-        """Whether a map in plain data is kept as pairs."""
-        return isinstance(self.form, keys.Table) and self.form.as_pairs
 
 
 def _entries(cls: Any) -> list[_Entry]:
@@ -262,8 +257,6 @@ def _of_key(entry: _Entry, read: Read) -> Read:
     form = entry.form
     if form is None:
         return read
-    if entry.is_pairs:
-        return lambda raw: read([list(pair) for pair in _items(raw)])
 
     def checked(raw: Any) -> Any:
         value = read(raw)

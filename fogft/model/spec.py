@@ -159,15 +159,14 @@ class ServiceSpec:
         default=1,
         usual="the first",
     )
-    tolerance: tuple[tuple[str, float], ...] = key(
+    tolerance: Mapping[str, float] = key(
         Table(
             Number(1e12, "the field's own"),
             field_path("write a path such as `plan.cost`"),
-            as_pairs=True,
         ),
         "With `quorum`: how far apart two values of a float field may be, such as "
         "`{plan.poses.pose.position.x: 0.01}`. All else must be equal.",
-        default=(),
+        default_factory=dict,
     )
     state: StateSpec | None = key(
         Map(StateSpec, "write `state: {snapshot: /svc/get_state, restore: /svc/set_state}`"),
@@ -486,35 +485,21 @@ class PoolSpec:
 
     def hash_with(self, resources: Any) -> str:
         """Return the `replica_hash` of a replica with such `resources`."""
-        asked: dict[str, Any] = {
+        asked = {
             "fogft": __version__,
-            "services": sorted(_run_by_replica(s) for s in self.services),
+            "services": sorted(
+                str((one.name, one.type, one.concurrency, one.cancel, one.state))
+                for one in self.services
+            ),
+            "topics": sorted(map(str, self.topics)),
+            "connectivity": (self.rendezvous, self.dial_in, self.link_port, self.allow_from),
+            "spare": self.spare,
+            "rmw": self.rmw.replica,
             "task": {k: v for k, v in self.task.items() if k not in ("name", "resources")},
+            "machine": _kinds_of_machine(resources),
         }
-        if self.topics:
-            asked["topics"] = sorted(str(topic) for topic in self.topics)
-        if self.rendezvous or self.dial_in:
-            asked["connectivity"] = [self.rendezvous, self.dial_in]
-        if self.link_port != LINK_PORT:
-            asked["link_port"] = self.link_port
-        if self.allow_from:
-            asked["allow_from"] = self.allow_from
-        if self.spare:
-            asked["spare"] = True
-        if self.rmw.replica is not Speaks.RCLPY:
-            asked["rmw"] = self.rmw.replica.value
-        kinds = _kinds_of_machine(resources)
-        if kinds != ["{}"]:
-            asked["machine"] = kinds
         canonical = json.dumps(asked, sort_keys=True, default=str)
         return hashlib.sha256(canonical.encode()).hexdigest()[:16]
-
-
-def _run_by_replica(service: ServiceSpec) -> tuple[str, ...]:
-    """Return what of a service concerns its replicas; no more than was always there if unset."""
-    policy = (str(service.concurrency), service.cancel)
-    state = () if service.state is None else (str(service.state),)
-    return (service.name, service.type, *(policy if policy != ("0", "") else ()), *state)
 
 
 def _kinds_of_machine(resources: Any) -> list[str]:

@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-from enum import Enum
+from collections.abc import Mapping
 from typing import Any
 
-from fogft.model import keys
 from fogft.model.groups import groups_of, replica_hash
 from fogft.model.keys import keys_of
+from fogft.model.plain import to_plain
 from fogft.model.spec import PoolSpec
 
 
 def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
-    """Return one sentence for each difference, in the file's order; empty when there is none."""
-    found = _task(before, after) + _services(before, after)
-    for entry in keys_of(PoolSpec):
-        old, new = getattr(before, entry.field), getattr(after, entry.field)
-        if entry.name == "health":
-            found += _fields("health.{}", old, new)
-        elif old == new or entry.name == "services":
-            continue
-        elif isinstance(entry.key.form, (keys.Number, keys.Whole, keys.Text)):
-            found.append(_one(entry.name, old, new))
-        elif old and new:
-            found.append(f"`{entry.name}` changed")
-        else:
-            found.append(f"`{entry.name}` {'added' if new else 'removed'}")
-    return found
+    """Return one sentence for each difference; empty when there is none."""
+    old, new = _ours(before), _ours(after)
+    services = [{one["name"]: one for one in ours.pop("services")} for ours in (old, new)]
+    return [
+        *_differences(before.task, after.task),
+        *_differences(*services, "service ", inside=True),
+        *_differences(old, new, inside=True),
+    ]
 
 
 def replaces_replicas(before: PoolSpec, after: PoolSpec) -> bool:
@@ -36,52 +28,36 @@ def replaces_replicas(before: PoolSpec, after: PoolSpec) -> bool:
     return any(replica_hash(before, slot) != replica_hash(after, slot) for slot in slots)
 
 
-def _task(before: PoolSpec, after: PoolSpec) -> list[str]:
-    keys = [*after.task, *(key for key in before.task if key not in after.task)]
+def _ours(spec: PoolSpec) -> dict[str, Any]:
+    plain = to_plain(spec)
+    return {entry.name: plain[entry.name] for entry in keys_of(PoolSpec)}
+
+
+def _differences(
+    before: Mapping[str, Any], after: Mapping[str, Any], kind: str = "", *, inside: bool = False
+) -> list[str]:
+    """Return what differs between two maps, and in maps within them where `inside` is set."""
     found = []
-    for key in keys:
-        old, new = before.task.get(key), after.task.get(key)
+    for key in [*after, *(key for key in before if key not in after)]:
+        old, new = before.get(key), after.get(key)
         if old == new:
             continue
-        if old is None or new is None:
-            found.append(f"`{key}` {'added' if old is None else 'removed'}")
+        what = f"{kind}`{key}`"
+        if inside and isinstance(old, Mapping) and isinstance(new, Mapping):
+            found += [f"{what}: {one}" for one in _differences(old, new)]
         elif _is_short(old) and _is_short(new):
-            found.append(_one(key, old, new))
+            found.append(f"{what}: {_shown(old)} -> {_shown(new)}")
         else:
-            found.append(f"`{key}` changed")
+            found.append(f"{what} {'changed' if old and new else 'added' if new else 'removed'}")
     return found
-
-
-def _services(before: PoolSpec, after: PoolSpec) -> list[str]:
-    old = {service.name: service for service in before.services}
-    new = {service.name: service for service in after.services}
-    found = [f"service `{name}` added" for name in new if name not in old]
-    found += [f"service `{name}` removed" for name in old if name not in new]
-    for name in [name for name in new if name in old]:
-        found += _fields(f"service `{name}`: {{}}", old[name], new[name])
-    return found
-
-
-def _fields(what: str, before: Any, after: Any) -> list[str]:
-    return [
-        _one(what.format(f.name), was, is_)
-        for f in fields(before)
-        if (was := getattr(before, f.name)) != (is_ := getattr(after, f.name))
-    ]
-
-
-def _one(what: str, before: Any, after: Any) -> str:
-    name = what if "`" in what else f"`{what}`"
-    return f"{name}: {_shown(before)} -> {_shown(after)}"
 
 
 def _shown(value: Any) -> str:
     if value is None or value == "":
         return "none"
-    if isinstance(value, Enum):
-        return str(value.value)
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _is_short(value: Any) -> bool:
-    return isinstance(value, (str, int, float)) and len(str(value)) <= 40 and "\n" not in str(value)
+    is_one = value is None or isinstance(value, (str, int, float))
+    return is_one and len(str(value)) <= 40 and "\n" not in str(value)

@@ -114,7 +114,7 @@ def _judge_types(section: Section, service: ServiceSpec, spec: PoolSpec, checks:
     if service.ok_field:
         _judge(section, "ok_field", checks.fields(service.type, service.ok_field))
     if service.tolerance:
-        _judge(section, "tolerance", checks.tolerances(service.type, dict(service.tolerance)))
+        _judge(section, "tolerance", checks.tolerances(service.type, service.tolerance))
     if service.state is not None:
         _judge(section, "state", checks.states(service.state))
 

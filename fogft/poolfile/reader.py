@@ -149,8 +149,7 @@ def _table(form: keys.Table, section: Section) -> Any:
             what = f"{shown(name)} is not {form.name.what}"
             raise section.error(name, what, form.name.hint, at_key=True) from None
     unit, zero = form.of.unit, form.of.from_zero
-    found = {n: section.number(n, form.of.most, unit, zero=zero) for n in section.children}
-    return tuple(found.items()) if form.as_pairs else found
+    return {n: section.number(n, form.of.most, unit, zero=zero) for n in section.children}
 
 
 def _special(form: keys.Special, section: Section, key: str) -> Any:

@@ -150,11 +150,9 @@ class Section:
         below = advanced.value if advanced is not None else None
         return isinstance(below, Mapping) and key in below and below[key].value is not None
 
-    def text(self, key: str, hint: str, default: str | None = None) -> str:
-        """Return a text that is not blank; without a default it is required."""
+    def text(self, key: str, hint: str) -> str:
+        """Return a text that is not blank."""
         if key not in self.children:
-            if default is not None:
-                return default
             raise self.error(key, "is missing", hint)
         node = self.children[key]
         if not isinstance(node.value, str):

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
+from prometheus_client import Metric, generate_latest
+
 from fogft.metrics import proxies
-from fogft.metrics.families import text
+from fogft.metrics.families import Labels, registry
 from fogft.metrics.outcomes import BUCKETS_S, OUTCOMES_COUNTED
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
@@ -60,6 +64,11 @@ RENDEZVOUS = {
     "offered": {"new": 1},
 }
 POOL = {"pool": "p"}
+
+
+def text(families: Iterable[Metric], labels: Labels) -> str:
+    """Return families in Prometheus's text format, as a scraper gets them."""
+    return generate_latest(registry(lambda: families, labels)).decode()
 
 
 def tally() -> Tally:

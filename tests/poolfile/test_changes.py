@@ -21,7 +21,7 @@ def test_numbers_are_told_with_old_and_new():
     assert changes(POOL, after) == [
         "`replicas`: 2 -> 3",
         "`max_usd_per_hour`: none -> 1",
-        "`health.suspect_after_s`: 2 -> 0.5",
+        "`health`: `suspect_after_s`: 2 -> 0.5",
     ]
     assert not replaces_replicas(POOL, after)
 
@@ -30,11 +30,11 @@ def test_services_are_told_by_name():
     slower = replace(PLAN, timeout_s=30.0, on_timeout=OnTimeout.EMPTY)
     after = replace(POOL, services=(slower, ServiceSpec("/scan", "std_srvs/srv/Trigger")))
     assert changes(POOL, after) == [
+        "service `/plan`: `timeout_s`: 10 -> 30",
+        "service `/plan`: `on_timeout`: silent -> empty",
         "service `/scan` added",
-        "service `/plan`: timeout_s: 10 -> 30",
-        "service `/plan`: on_timeout: silent -> empty",
     ]
-    assert changes(after, POOL)[0] == "service `/scan` removed"
+    assert changes(after, POOL)[-1] == "service `/scan` removed"
     assert replaces_replicas(POOL, after)
 
 

@@ -118,7 +118,7 @@ def test_a_quorum_and_its_tolerances_reach_the_client_proxy():
     (service,) = pool_file.parse(
         VOTING + "      tolerance: {plan.cost: 0.5, x: 1}\n", file="p.yaml"
     ).services
-    assert (service.quorum, service.tolerance) == (2, (("plan.cost", 0.5), ("x", 1.0)))
+    assert (service.quorum, service.tolerance) == (2, {"plan.cost": 0.5, "x": 1.0})
     assert from_plain(ServiceSpec, to_plain(service)) == service
 
 

@@ -162,7 +162,7 @@ def make_dispatcher(
         make = functools.partial(make, id_of=id_of)
     ok_of = functools.partial(messages.bool_field, spec.type)
     if spec.quorum > 1:
-        comparison = Comparison(spec.type, dict(spec.tolerance))
+        comparison = Comparison(spec.type, spec.tolerance)
         flagged = functools.partial(_replica_disagrees, spec.name)
         return make(decide=Quorum(spec.quorum, comparison, flagged), ok_of=ok_of)
     return make(ok_of=ok_of)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from fogft.metrics.families import text
 from fogft.pool.manager import tally
 from fogft.pool.manager.tally import Tally
 from tests.cli.pools import STATUS
+from tests.metrics.samples import text
 
 
 def test_a_pool_is_told_as_its_status_says():

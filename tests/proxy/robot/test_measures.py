@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from fogft.metrics import proxies
-from fogft.metrics.families import text
 from fogft.model.spec import ServiceSpec
 from fogft.proxy.gateway.gateway import Forwarder
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from tests.proxy.fakes import UID, Clock, FakeDialer, FakeLink
+from tests.metrics.samples import text
 
 
 def dispatcher(clock: Clock) -> tuple[Dispatcher, FakeLink]:
