@@ -226,7 +226,6 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
         "schedules follow in a minute"
     ),
     Cause.SLEPT: "this machine slept for {r.seconds:.0f} s",
-    Cause.NO_MANAGER: "no manager is running: asked the cloud directly",
     Cause.NO_PROXY_REPORT: "the client proxy has not reported yet",
     Cause.STALE_PROXY_REPORT: "the client proxy has not reported lately",
     Cause.PROXY_KEEPS_ENDING: (

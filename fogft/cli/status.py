@@ -61,10 +61,10 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
         output.json_data(status_schema())
         return
     pool = pool or named
-    from fogft.pool.commands.status import checked, read, refreshed
+    from fogft.pool.commands.status import checked, read, renewed
 
     paths = composition.paths_of(pool)
-    seen = refreshed(composition.store_of(pool)) if refresh else read(paths, time.time())
+    seen = renewed(paths) if refresh else read(paths, time.time())
     if check:
         seen = checked(paths, CHECK_LIMIT_S)
     if watch:

@@ -2,28 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
 from functools import partial
 from pathlib import Path
 
-from fogft import disk
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
 from fogft.errors import CredentialError, StateError
 from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
-from fogft.model.replica import LinkReport, LinkState
+from fogft.model.replica import LinkState
 from fogft.pool.commands import status
 from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
-from fogft.pool.folder.store import read_identity
-from fogft.pool.manager import proxy_report
 
 _EXPIRY_WARNING = timedelta(days=3)
-# The client proxy reports twice a second.
-_REPORT_LIMIT_S = proxy_report.STALE_S
-_UP = "run `fogft up FILE`"
+_UP = "`fogft up FILE`"
 
 
 def pool_file(situation: Situation) -> Iterator[Finding]:
@@ -101,18 +96,19 @@ def judge_folder(pool: str, folder: Path, now: datetime) -> Iterator[Finding]:
 
 
 def processes(situation: Situation) -> Iterator[Finding]:
-    """Every pool has a manager and a client proxy, and a request would be answered now."""
+    """Every pool has a manager and a client proxy whose links are up, and would answer now."""
     for pool in situation.pools:
         try:
             seen = status.read(PoolPaths.of(pool, situation.home), situation.now)
         except StateError as error:
-            yield fail("manager", f"pool `{pool}`: {error.message}", error.hint or _UP)
+            yield fail("manager", f"pool `{pool}`: {error.message}", error.hint or f"run {_UP}")
             continue
         if seen.status.ended and not seen.manager_alive:
             yield ok("manager", f"pool `{pool}`: ended {seen.status.ended}")
             continue
         yield from judge_processes(pool, seen)
         yield from judge_traffic(pool, seen)
+        yield from judge_links(pool, seen)
 
 
 def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
@@ -155,51 +151,40 @@ def judge_traffic(pool: str, seen: Seen) -> Iterator[Finding]:
             )
 
 
-def links(situation: Situation) -> Iterator[Finding]:
-    """Every link of a running client proxy is up and its replica ready."""
-    for pool in situation.pools:
-        paths = PoolPaths.of(pool, situation.home)
-        if not disk.is_locked(paths.proxy_lock):
-            continue
-        report = proxy_report.read(paths.proxy_status, read_identity(paths).uid)
-        age_s = situation.now - report.written_at if report else 0.0
-        if report is None:
-            yield fail(
-                "links",
-                f"pool `{pool}`: its client proxy has not written a readable report",
-                f"see `{paths.proxy_log}`",
-            )
-        elif age_s > _REPORT_LIMIT_S:
-            yield fail(
-                "links",
-                f"pool `{pool}`: its client proxy last reported {age_s:.0f} s ago",
-                f"it hangs or is stopped; end process {report.pid}: the manager starts another"
-                if disk.is_locked(paths.manager_lock)
-                else f"it hangs or is stopped; end process {report.pid}, then {_UP}",
-            )
-        else:
-            yield from judge_links(pool, report.links)
-
-
-def judge_links(pool: str, reported: Sequence[LinkReport]) -> Iterator[Finding]:
-    """Judge the links that a client proxy reports."""
-    up = [link for link in reported if link.state is LinkState.UP]
-    for link in reported:
-        replica = f"pool `{pool}`: replica `{link.id.short}`"
-        by_hand = link.id.slot >= FIRST_BY_HAND
-        log = "the log on its machine" if by_hand else f"`fogft logs {link.id.slot}`"
-        if link.state is not LinkState.UP:
+def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
+    """Judge what the client proxy of a pool says of its links."""
+    status = seen.status
+    if not status.proxy_alive:
+        return
+    if not seen.links_known:
+        age_s, pid = seen.report_age_s, status.proxy_pid
+        said = "has not written a readable report" if pid is None else f"last did {age_s:.0f} s ago"
+        yield fail(
+            "links",
+            f"pool `{pool}`: its client proxy reports twice a second, and {said}",
+            f"it hangs or is stopped; end process {pid}: the manager, or {_UP}, starts another"
+            if pid
+            else f"see `{PoolPaths.of(pool).proxy_log}`",
+        )
+        return
+    reported = [one for one in (*status.replicas, *status.by_hand) if one.link]
+    up = [one for one in reported if one.link == LinkState.UP.value]
+    for one in reported:
+        replica = f"pool `{pool}`: replica `{one.slot}.{one.generation}`"
+        by_hand = one.slot >= FIRST_BY_HAND
+        log = "the log on its machine" if by_hand else f"`fogft logs {one.slot}`"
+        if one not in up:
             yield warn(
                 "links",
-                f"{replica} is {link.state.value}: {link.detail or 'it does not answer probes'}",
+                f"{replica} is {one.link}: {one.detail or 'it does not answer probes'}",
                 f"it was started by hand and is not replaced automatically; see {log}"
                 if by_hand
                 else f"it is replaced if it stays silent; see `fogft status` and {log}",
             )
-        elif link.detail:
+        elif one.detail:
             yield warn(
                 "replicas",
-                f"{replica} is not ready: {link.detail}",
+                f"{replica} is not ready: {one.detail}",
                 f"{log} shows what `run` says; compare each `name` and "
                 "`type` in the pool file with what the node offers",
             )
@@ -213,4 +198,4 @@ def judge_links(pool: str, reported: Sequence[LinkReport]) -> Iterator[Finding]:
         yield ok("links", f"pool `{pool}`: {len(up)} of {len(reported)} up")
 
 
-CHECKS: tuple[Check, ...] = (pool_file, certificates, processes, links)
+CHECKS: tuple[Check, ...] = (pool_file, certificates, processes)

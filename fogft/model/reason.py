@@ -111,7 +111,6 @@ class Cause(str, Enum):
     CLOCK_SET = "clock_set"
     CLOCK_DOUBTED = "clock_doubted"
     SLEPT = "slept"
-    NO_MANAGER = "no_manager"
     NO_PROXY_REPORT = "no_proxy_report"
     STALE_PROXY_REPORT = "stale_proxy_report"
     PROXY_KEEPS_ENDING = "proxy_keeps_ending"

@@ -21,7 +21,7 @@ from fogft.model.replica import LinkReport, LinkState, ReplicaId
 from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
-from fogft.pool.manager.status import TopicStatus
+from fogft.pool.manager.status import ReplicaStatus, TopicStatus
 from fogft.ros import environment
 from tests.cli.pools import FILE, STATUS, alive, lay_down, report
 from tests.needs import needs
@@ -36,6 +36,12 @@ def situation(home: Path, *names: str, now: float | None = None) -> Situation:
 def the_only(found) -> Finding:
     (only,) = found
     return only
+
+
+def of_check(name: str, home: Path) -> Finding:
+    """Return what a check says of the pool `planner`."""
+    found = pools.processes(situation(home, "planner"))
+    return the_only(one for one in found if one.check == name)
 
 
 @pytest.fixture
@@ -287,8 +293,8 @@ def test_missing_processes_are_found_and_living_ones_seen(tmp_path):
     assert proxy.advice.startswith("the manager restarts it")
     with alive(paths):
         found = list(pools.processes(situation(tmp_path, "planner")))
-    assert [f.verdict for f in found] == [Verdict.OK] * 3
-    assert found[-1].check == "answers"
+    judged = {f.check: f.verdict for f in found if f.check not in ("links", "replicas")}
+    assert judged == dict.fromkeys(("manager", "client proxy", "answers"), Verdict.OK)
 
 
 def test_a_doctor_says_of_answers_what_status_says(tmp_path):
@@ -296,29 +302,34 @@ def test_a_doctor_says_of_answers_what_status_says(tmp_path):
     gone = replace(STATUS, replicas=[replace(one, link="suspect") for one in STATUS.replicas])
     paths = lay_down(tmp_path, gone)
     with alive(paths):
-        *_, answers = pools.processes(situation(tmp_path, "planner"))
+        answers = of_check("answers", tmp_path)
         assert (answers.verdict, answers.text) == (
             Verdict.FAIL,
             "pool `planner`: no replica answers `/plan`",
         )
         report(paths, gone, age_s=30)
-        *_, answers = pools.processes(situation(tmp_path, "planner"))
-        assert answers.verdict is Verdict.WARN
+        assert of_check("answers", tmp_path).verdict is Verdict.WARN
+
+
+def judged_links(*links: LinkReport) -> list[Finding]:
+    rows = [ReplicaStatus(one.id.slot, one.id.generation, "ready") for one in links]
+    status = replace(STATUS, replicas=rows).joined(None, proxy_alive=True, links=links)
+    return list(pools.judge_links("p", Seen(status, 0.0, manager_alive=True)))
 
 
 def test_silent_links_are_found():
     silent = LinkReport(ReplicaId(UID, 1, 2), LinkState.SUSPECT)
     up = LinkReport(ReplicaId(UID, 0, 1), LinkState.UP)
-    assert [f.verdict for f in pools.judge_links("p", [up])] == [Verdict.OK]
-    found = list(pools.judge_links("p", [up, silent]))
+    assert [f.verdict for f in judged_links(up)] == [Verdict.OK]
+    found = judged_links(up, silent)
     assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
     assert "`1.2` is suspect: it does not answer probes" in found[0].text
-    assert [f.verdict for f in pools.judge_links("p", [silent])] == [Verdict.WARN, Verdict.FAIL]
+    assert [f.verdict for f in judged_links(silent)] == [Verdict.WARN, Verdict.FAIL]
 
 
 def test_a_replica_whose_program_ends_is_found():
     ends = LinkReport(ReplicaId(UID, 1, 2), LinkState.UP, detail="`run` exit status 3")
-    found = list(pools.judge_links("p", [ends]))
+    found = judged_links(ends)
     assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
     assert "`1.2` is not ready: `run` exit status 3" in found[0].text
     assert "`fogft logs 1`" in found[0].advice
@@ -339,8 +350,8 @@ def test_a_proxy_that_hangs_is_found(tmp_path):
     report = {"pid": 4711, "written_at": time.time() - 60, "links": []}
     paths.proxy_status.write_text(json.dumps(report))
     with disk.locked(paths.proxy_lock):
-        found = the_only(pools.links(situation(tmp_path, "planner")))
+        found = of_check("links", tmp_path)
         paths.proxy_status.write_text("{torn")
-        damaged = the_only(pools.links(situation(tmp_path, "planner")))
+        damaged = of_check("links", tmp_path)
     assert (found.verdict, damaged.verdict) == (Verdict.FAIL, Verdict.FAIL)
     assert "4711" in found.advice

@@ -14,7 +14,7 @@ from fogft.errors import FogftError, SpecError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.pool.commands import composition, init, preview, startup
-from fogft.pool.commands.status import Seen, refreshed
+from fogft.pool.commands.status import Seen, renewed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from fogft.reason_words import words
@@ -381,19 +381,19 @@ def test_logs_of_a_slot_that_never_was(home, capsys):
 # --- refresh
 
 
-def test_refresh_without_a_manager_asks_the_cloud_and_says_so(home, capsys):
+def test_refresh_without_a_manager_shows_what_was_seen_last_and_says_so(home, capsys):
     lay_down(home)
     assert main.run(["status", "--refresh"]) == 0
     said = capsys.readouterr()
-    assert "note: no manager is running: asked the cloud directly" in said.out
-    assert said.out.startswith("planner  not answering  ? of 3 ready  $0.000/h on local")
+    assert said.out.startswith("planner  not answering  ? of 3 ready  $0.063/h on local  seen ")
+    assert "no manager is running" in said.err
 
 
 def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
     paths = lay_down(home)
     with disk.locked(paths.manager_lock):
         with pytest.raises(FogftError, match="did not refresh"):
-            refreshed(composition.make_store("planner"), limit_s=0.2)
+            renewed(paths, limit_s=0.2)
 
 
 @pytest.mark.parametrize(

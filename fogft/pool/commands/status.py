@@ -4,8 +4,7 @@
     proxy-status.json (client proxy) ──► links, counters ────────┼──► Seen
     locks (processes) ──► who lives ─────────────────────────────┘
 
-What nobody has looked at lately is unknown, never as it was. With a dead manager, `ask` looks at
-the cloud itself, and changes nothing.
+What nobody has looked at lately is unknown, never as it was.
 
 Owns: reading and renewing a status.
 Not here: its schema (`fogft.pool.manager.status`), showing it (`fogft.cli`).
@@ -18,22 +17,16 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fogft import disk
-from fogft.errors import CloudError, PoolNotFound, StateError, told
-from fogft.model.reason import Cause, Reason
+from fogft.errors import PoolNotFound, StateError
 from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import proxy_report, status
 from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.pool.manager.status import PoolStatus
 
-if TYPE_CHECKING:
-    from fogft.cloud.port import Cloud
-    from fogft.pool.folder.store import PoolStore
-
-EVENTS_SHOWN = 20
 _LOOK_EVERY_S = 0.05
 STALE_AFTER_S = 15.0
 """A manager that has not looked for so long knows nothing of now."""
@@ -120,8 +113,8 @@ def _heard(link: LinkReport, written_at: float, since: float) -> LinkReport:
     return link
 
 
-def read(paths: PoolPaths, now: float) -> Seen:
-    """Return what is known of a pool now.
+def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> Seen:
+    """Return what is known of a pool now; `heard_since` is as of `current`.
 
     Raises:
         PoolNotFound: There is no such pool.
@@ -129,12 +122,6 @@ def read(paths: PoolPaths, now: float) -> Seen:
     """
     raw = disk.read_json(paths.status)
     seen = _unobserved(paths) if raw is None else status.from_json(raw, paths.status)
-    return _current(paths, seen, now)
-
-
-def _current(
-    paths: PoolPaths, seen: PoolStatus, now: float, *, heard_since: float | None = None
-) -> Seen:
     return current(
         seen,
         proxy_report.read(paths.proxy_status, seen.uid),
@@ -154,7 +141,7 @@ def checked(paths: PoolPaths, limit_s: float) -> Seen:
     asked_at, deadline = time.time(), time.monotonic() + limit_s
     while True:
         seen = read(paths, time.time())
-        asked = _current(paths, seen.status, time.time(), heard_since=asked_at)
+        asked = read(paths, time.time(), heard_since=asked_at)
         links = [(*one.status.replicas, *one.status.by_hand) for one in (seen, asked)]
         if not seen.status.proxy_alive or time.monotonic() >= deadline:
             return asked
@@ -174,21 +161,21 @@ def every(names: Iterable[str], now: float) -> Iterator[tuple[str, Seen | StateE
             yield name, error
 
 
-def renewed(paths: PoolPaths, limit_s: float) -> Seen:
-    """Have the living manager look again, and return what it saw.
+def renewed(paths: PoolPaths, limit_s: float = 15.0) -> Seen:
+    """Have the living manager look again, and return what it saw; without one what was seen last.
 
     Raises:
-        StateError: It did not within `limit_s`, or it died meanwhile.
+        StateError: It did not within `limit_s`.
     """
     asked_at = time.time()
     deadline = time.monotonic() + limit_s
     with contextlib.suppress(OSError):
-        os.utime(paths.intent)  # the manager watches it; without one, its next tick comes soon
+        os.utime(paths.intent)  # the manager watches it
     while True:
         seen = read(paths, time.time())
-        if seen.age_s is not None and seen.status.observed_at >= asked_at:
+        if not seen.manager_alive or seen.status.observed_at >= asked_at:
             return seen
-        if not seen.manager_alive or time.monotonic() >= deadline:
+        if time.monotonic() >= deadline:
             raise StateError(
                 f"the manager of `{seen.status.pool}` did not refresh within {limit_s:.0f} s",
                 "see `fogft logs`; `fogft status` shows what it saw last",
@@ -196,56 +183,9 @@ def renewed(paths: PoolPaths, limit_s: float) -> Seen:
         time.sleep(_LOOK_EVERY_S)
 
 
-def refreshed(store: PoolStore, limit_s: float = 15.0) -> Seen:
-    """Have the manager look again; without one, ask the cloud and the client proxy's report."""
-    from fogft.pool.commands.composition import cloud_of
-
-    if disk.is_locked(store.paths.manager_lock):
-        return renewed(store.paths, limit_s)
-    return ask(store, cloud_of(store.identity()), time.time())
-
-
 def slots(paths: PoolPaths) -> list[int]:
     """Return the slots that hold a replica, sorted."""
     return sorted({replica.slot for replica in read(paths, time.time()).status.replicas})
-
-
-def ask(store: PoolStore, cloud: Cloud, now: float) -> Seen:
-    """Look at the cloud and at the client proxy's report, without a manager."""
-    # Not above: `fogft status` needs none of these when a manager lives.
-    from fogft.model.replica import Observed
-    from fogft.planning.observed.health import judge
-    from fogft.planning.observed.history import History
-    from fogft.planning.planner import Plan
-    from fogft.planning.rollout import describe
-    from fogft.pool.manager.reconciler import Tick
-
-    paths = store.paths
-    identity, spec, intent = store.identity(), store.spec(), store.intent()
-    events = store.recent(1 << 30)
-    history = History(events)
-    report = proxy_report.read(paths.proxy_status, identity.uid)
-    trouble = [Reason(Cause.NO_MANAGER)]
-    try:
-        machines = tuple(cloud.machines(identity.uid))
-    except CloudError as error:
-        machines = None
-        trouble.append(Reason(Cause.NO_ANSWER, words=told(error)))
-    links = report.links if report is not None and report.fresh(now) else None
-    observed = Observed(now, machines, links)
-    health = None if machines is None else judge(identity.uid, spec, observed, history)
-    decided = Plan(wanted=intent.wanted(spec), health=health)
-    tick = Tick(identity, spec, intent, observed, decided, store.membership(), file=store.applied())
-    if health is not None:
-        update = describe(spec, store.good(), store.trial(), health, decided.wanted)
-        tick = tick._replace(update=update)
-    found = status.of_tick(
-        tick,
-        history=history,
-        recent=events[-EVENTS_SHOWN:],
-        notes=trouble,
-    )
-    return _current(paths, found, now)
 
 
 def _unobserved(paths: PoolPaths) -> PoolStatus:

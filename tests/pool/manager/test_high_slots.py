@@ -28,6 +28,7 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager import configuration, proxy_report, status
 from fogft.pool.manager.reconciler import Tick
+from fogft.pool.manager.status import ReplicaStatus
 from tests.planning.pool_worlds import NOW, SERVICE, UID, World, replica, spec
 
 HIGH = st.integers(100, LAST_BY_HAND)
@@ -157,8 +158,9 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
 
 
 def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> None:
-    [by_hand, _] = pools.judge_links("p", [LinkReport(id_of(2000, 2), LinkState.SUSPECT)])
-    [launched, _] = pools.judge_links("p", [LinkReport(id_of(105, 2), LinkState.SUSPECT)])
+    rows = [ReplicaStatus(slot, 2, "ready", link="suspect") for slot in (2000, 105)]
+    silent = replace(seen(), proxy_alive=True, replicas=rows[1:], by_hand=rows[:1])
+    [launched, by_hand, _] = pools.judge_links("p", Seen(silent, 0.0, manager_alive=True))
     assert "replica `2000.2` is suspect" in by_hand.text
     assert "replica `105.2` is suspect" in launched.text
     assert "is not replaced automatically" in by_hand.advice
