@@ -99,32 +99,36 @@ def include(
     pool: PoolOption = None,
 ) -> None:
     """Allow an excluded location again."""
-    from fogft.pool.commands import change
+    from fogft.model import intent
+    from fogft.pool.commands.change import change
 
     store = composition.store_of(pool)
-    change.include(store, location)
+    change(store, lambda before: intent.include(before, location))
     output.done(f"`{location}` is allowed for `{store.name}` again")
     _warn_without_manager(store)
 
 
 def retry(pool: PoolOption = None) -> None:
     """Launch replicas again after a pool file was given up."""
-    from fogft.pool.commands import change
+    from fogft.model import intent
+    from fogft.pool.commands.change import change
 
     store = composition.store_of(pool)
-    change.retry(store, time.time())
+    change(store, lambda before: intent.retry(before, time.time()))
     output.done(f"`{store.name}` launches replicas again")
     _warn_without_manager(store)
 
 
 def _scale(pool: str | None, by: int, *, wait: bool) -> None:
     from fogft.cli import progress
-    from fogft.pool.commands import change
+    from fogft.model import intent
+    from fogft.pool.commands.change import change
     from fogft.pool.commands.outcome import Settled
 
     store = composition.store_of(pool)
-    since = time.time()
-    before, after = change.scale(store, by)
+    since, spec = time.time(), store.spec()
+    wishes = change(store, lambda now: intent.scale(now, spec, by))
+    before, after = (one.wanted(spec) for one in wishes)
     if wait:
         progress.settle(store, Settled(since), f"does not have {after} replicas")
         output.done(f"`{store.name}` has {after} replicas (had {before})")

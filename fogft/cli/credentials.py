@@ -6,6 +6,7 @@ shown.
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from pathlib import Path
@@ -62,15 +63,19 @@ def issue(
     file.
     """
     from fogft.model.credentials import Role
-    from fogft.pool.commands.credentials import issue_credentials
+    from fogft.pool.commands import joining
     from fogft.pool.credentials.bundle import new_passphrase
 
     own = None if passphrase_file is None else _read_passphrase(passphrase_file)
     passphrase = own or new_passphrase()
     store = composition.store_of(pool)
-    holder, file = issue_credentials(
-        store, _role(role), name, out, passphrase, open_for_s=hours * 3600
+    file = out or Path(f"{name}.join")
+    if file.exists():
+        raise FogftError(f"`{file}` exists", "choose another name with `--out`")
+    holder, data = joining.issue(
+        store, _role(role), name, passphrase, time.time(), open_for_s=hours * 3600
     )
+    disk.write_whole(file, data)
     output.data(str(file))
     if own is None:
         output.say(f"passphrase: {passphrase}")
@@ -87,10 +92,10 @@ def list_(
 ) -> None:
     """List the certificates that the pool's CA has issued, without their keys."""
     from fogft.cli.table import table
-    from fogft.pool.commands.credentials import certificates
+    from fogft.pool.credentials.ledger import Ledger
 
     now = time.time()
-    entries = certificates(composition.store_of(pool))
+    entries = Ledger(composition.paths_of(pool).credentials).entries()
     if as_json:
         output.json_data([_as_data(entry, now) for entry in entries])
         return
@@ -187,13 +192,15 @@ def join(
     running proxy picks them up without losing a request.
     """
     from fogft.pool.commands import joining
-    from fogft.pool.commands.credentials import join_here
     from fogft.pool.credentials.bundle import read_label
+    from fogft.pool.folder.paths import home
 
     label = read_label(joining.read(bundle))
     whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"
     output.say(f"this bundle is for {whom}")
-    joined = join_here(bundle, _read_passphrase(passphrase_file))
+    disk.make_folder(home())
+    logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # an error says what matters
+    joined = joining.join(bundle, _read_passphrase(passphrase_file), home(), time.time())
     output.data(str(joined.config))
     output.done(f"this machine has joined as {whom}")
     if joined.alone:

@@ -25,7 +25,6 @@ from fogft.model.choices import (
     OnDemandSpec,
     PlacementSpec,
     ScheduleSpec,
-    Speaks,
     Spread,
     TrafficSpec,
 )

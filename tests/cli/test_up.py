@@ -13,7 +13,7 @@ from fogft.cli import main, progress
 from fogft.errors import FogftError, SpecError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
-from fogft.pool.commands import composition, init, preview, startup
+from fogft.pool.commands import init, preview, startup
 from fogft.pool.commands.status import Seen, renewed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus

@@ -22,17 +22,25 @@ from fogft.pool.folder.store import PoolStore
 from fogft.poolfile.tree import nearest
 
 
-def scale(store: PoolStore, by: int) -> tuple[int, int]:
-    """Want `by` more replicas (fewer when negative); return how many before and after."""
-    spec = store.spec()
-    before, after = _change(store, lambda now: intent.scale(now, spec, by))
-    return before.wanted(spec), after.wanted(spec)
+def change(store: PoolStore, step: Callable[[Intent], Intent]) -> tuple[Intent, Intent]:
+    """Change a pool's intent under its lock; return it before and after."""
+    with disk.locked(store.paths.intent_lock):
+        store.identity()  # it may have been ended while we waited
+        before = store.intent()
+        if before.stopping:
+            raise PoolBusy(
+                f"pool `{store.name}` is being ended",
+                "let `fogft down` finish, then start it again with `fogft up`",
+            )
+        after = step(before)
+        store.write_intent(after)
+    return before, after
 
 
 def drain(store: PoolStore, slot: int, now: float) -> int:
     """Have the replica in a slot replaced; return its generation."""
     generation = generation_in(store.paths, slot, now)
-    _change(store, lambda now: intent.drain(now, slot, generation))
+    change(store, lambda before: intent.drain(before, slot, generation))
     return generation
 
 
@@ -49,18 +57,8 @@ def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
             f"the cloud `{identity.cloud}` of pool `{identity.name}` has no location `{place}`",
             f"did you mean `{meant[0]}`?" if meant else nearest(place, known),
         )
-    before, after = _change(store, lambda now: intent.exclude(now, place))
+    before, after = change(store, lambda now: intent.exclude(now, place))
     return before != after
-
-
-def include(store: PoolStore, location: str) -> None:
-    """Allow a location again."""
-    _change(store, lambda now: intent.include(now, location))
-
-
-def retry(store: PoolStore, now: float) -> None:
-    """Launch again what was given up."""
-    _change(store, lambda before: intent.retry(before, now))
 
 
 def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
@@ -82,18 +80,3 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
             f"pool `{status.pool}` has no replica in slot {slot}", f"slots with a replica: {known}"
         )
     return max(found)
-
-
-def _change(store: PoolStore, step: Callable[[Intent], Intent]) -> tuple[Intent, Intent]:
-    """Change a pool's intent under its lock; return it before and after."""
-    with disk.locked(store.paths.intent_lock):
-        store.identity()  # it may have been ended while we waited
-        before = store.intent()
-        if before.stopping:
-            raise PoolBusy(
-                f"pool `{store.paths.folder.name}` is being ended",
-                "let `fogft down` finish, then start it again with `fogft up`",
-            )
-        after = step(before)
-        store.write_intent(after)
-    return before, after

@@ -1,54 +1,27 @@
-"""Who holds a certificate of a pool: issue, join with, revoke and rotate them.
+"""Take certificates of a pool back, and have others take their place.
 
-Owns: what `fogft credentials` and `fogft join` do, and waiting until it has taken effect.
+Owns: revoking and rotating, and waiting until it has taken effect.
 Not here: bundles (`joining`), the CA and its ledger (`fogft.pool.credentials`).
 """
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Sequence
-from pathlib import Path
+from functools import partial
 
 from fogft import disk
-from fogft.errors import FogftError
+from fogft.model import intent
 from fogft.model.credentials import Holder, Role
-from fogft.pool.commands import change, joining
-from fogft.pool.commands.joining import Joined
+from fogft.pool.commands import change
 from fogft.pool.commands.status import slots
-from fogft.pool.credentials.ledger import Entry, Ledger
-from fogft.pool.folder.paths import PoolPaths, home
+from fogft.pool.credentials.ledger import Ledger
+from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
 from fogft.pool.manager import configuration
 from fogft.pool.manager.process_control import wait_for
 
 PUBLISH_LIMIT_S = 10.0
-
-
-def certificates(store: PoolStore) -> Sequence[Entry]:
-    """Return the certificates that a pool's CA has issued, oldest first. Keys are not in it."""
-    store.identity()
-    return Ledger(store.paths.credentials).entries()
-
-
-def issue_credentials(
-    store: PoolStore, role: Role, name: str, out: Path | None, passphrase: str, *, open_for_s: float
-) -> tuple[Holder, Path]:
-    """Write a join bundle for the next generation of a holder; return both. See `joining.issue`."""
-    file = out or Path(f"{name}.join")
-    if file.exists():
-        raise FogftError(f"`{file}` exists", "choose another name with `--out`")
-    holder, data = joining.issue(store, role, name, passphrase, time.time(), open_for_s=open_for_s)
-    disk.write_whole(file, data)
-    return holder, file
-
-
-def join_here(file: Path, passphrase: str) -> Joined:
-    """Set this machine up from a join bundle, which is destroyed by it. See `joining.join`."""
-    logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # an error says what matters
-    disk.make_folder(home())
-    return joining.join(file, passphrase, home(), time.time())
 
 
 def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Holder], bool]:
@@ -65,17 +38,9 @@ def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Ho
     holders = ledger.named(role, name)
     ledger.revoke(holders)
     for holder in holders if role is Role.REPLICA else ():
-        now = time.time()
-        if holder.generation == _generation_in(store.paths, int(holder.name), now):
-            change.drain(store, int(holder.name), now)
+        drained = partial(intent.drain, slot=int(holder.name), generation=holder.generation)
+        change.change(store, drained)
     return holders, _published(store, holders)
-
-
-def _generation_in(paths: PoolPaths, slot: int, now: float) -> int | None:
-    try:
-        return change.generation_in(paths, slot, now)
-    except FogftError:
-        return None  # it is gone already, or was started by hand
 
 
 def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:

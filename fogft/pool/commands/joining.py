@@ -13,7 +13,6 @@ Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`
 from __future__ import annotations
 
 import contextlib
-import os
 import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -157,8 +156,7 @@ def join(
             no rendezvous tells whether it was used. Then it is as good as before.
         StateError: Something cannot be written; the bundle is still there.
     """
-    data = read(file)
-    label, content = bundle.open_sealed(data, passphrase, now)
+    label, content = bundle.open_sealed(read(file), passphrase, now)
     brought = read_content(content)
     files, endpoints = brought.files, list(brought.rendezvous)
     holder = label.holder
@@ -173,7 +171,7 @@ def join(
             place = folder / name
             disk.make_folder(place.parent)
             disk.write_whole(place, text)
-    destroy(file, len(data))
+    destroy(file)
     config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
     alone = not endpoints and holder.role is not Role.RENDEZVOUS
     return Joined(label.pool, holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
@@ -248,13 +246,8 @@ def read_content(content: dict[str, Any]) -> Content:
         raise CredentialError(f"the bundle holds what cannot be used: {error}") from error
 
 
-def destroy(file: Path, size: int) -> None:
-    """Overwrite and remove a file; a removed file's bytes may otherwise be read for long."""
-    with contextlib.suppress(OSError):
-        with file.open("r+b") as opened:
-            opened.write(secrets.token_bytes(size))
-            opened.flush()
-            os.fsync(opened.fileno())
+def destroy(file: Path) -> None:
+    """Remove a bundle that was used."""
     try:
         file.unlink()
     except OSError as error:

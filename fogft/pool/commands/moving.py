@@ -60,11 +60,7 @@ def export(
     service is stateful it ends, since only one robot may order its requests.
 
     Args:
-        store: The pool.
         root: The folder of all of fogft's state.
-        file: What to write; it must not exist.
-        passphrase: What to seal it with.
-        now: Seconds since the epoch.
         open_for_s: How long the file can be imported.
         told: Called with each process as it has been ended.
 
@@ -132,18 +128,14 @@ def import_(
     """Take a pool over from its file, and destroy the file; return the pool, without a manager yet.
 
     Args:
-        file: From `export`.
-        passphrase: What it was sealed with.
         root: The folder of all of fogft's state.
-        now: Seconds since the epoch.
         pool_file: The pool file on this machine: relative paths in it start at its folder.
 
     Raises:
         CredentialError: It is none, is too old, or was used here.
         FogftError: There is a pool of this name here, or its pool file is missing.
     """
-    data = joining.read(file)
-    label, content = bundle.open_sealed(data, passphrase, now)
+    label, content = bundle.open_sealed(joining.read(file), passphrase, now)
     if label.holder.role is not Role.MANAGER:
         raise FogftError(f"`{file}` lets a machine join a pool", "use it with `fogft join`")
     brought = stored(_Moved, content, "the file contains no pool")
@@ -179,5 +171,5 @@ def import_(
         here = replace(was, file=str(place), first_epoch=lease.next_term(before))
         write_identity(paths, here)
         paths.exported.unlink(missing_ok=True)
-    joining.destroy(file, len(data))
+    joining.destroy(file)
     return make_store(was.name)

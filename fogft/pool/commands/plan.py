@@ -13,8 +13,9 @@ from fogft.errors import CloudError, PoolNotFound, SpecError
 from fogft.model.choices import TrafficSpec
 from fogft.model.groups import groups_of, with_spot
 from fogft.model.intent import Intent
+from fogft.model.plain import from_plain
 from fogft.model.replica import Observed, Offer
-from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.model.spec import PoolSpec
 from fogft.planning.explain import Explanation, explain
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
@@ -22,7 +23,6 @@ from fogft.pool.folder.paths import latency_file
 from fogft.pool.manager import offers, proxy_report
 from fogft.pool.manager.distances import Distance, Latencies, regions_of
 from fogft.pool.manager.offers import Seller
-from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.poolfile import named_clouds
 from fogft.poolfile.file import parse, read_text
 
@@ -97,12 +97,13 @@ def plan_file(
         counted = measured(store.paths.proxy_status, store.identity().uid)
     except PoolNotFound:
         intent, history, counted, took_s = Intent(), History(), {}, []
-    counted = {
-        service.name: counted[service.name]
-        for service in spec.services
-        if service.name in counted and not is_stated(service)
-    }
-    spec = with_measured(spec, counted)
+    silent = {service.name for service in spec.services if service.traffic == TrafficSpec()}
+    counted = {name: one for name, one in counted.items() if name in silent}
+    services = (
+        replace(one, traffic=counted[one.name].traffic) if one.name in counted else one
+        for one in spec.services
+    )
+    spec = replace(spec, services=tuple(services))
     now = time.time()
     observed = Observed(now, (), None, sold, rtt_s={r: d.rtt_s for r, d in distances.items()})
     ready_p90_s = took_s[int(0.9 * len(took_s))] if len(took_s) >= LEAST_LAUNCHES else None
@@ -167,7 +168,6 @@ class Measured:
 
     traffic: TrafficSpec
     over_s: float
-    requests: int
 
 
 def measured(proxy_status: Path, pool_uid: str) -> dict[str, Measured]:
@@ -175,37 +175,14 @@ def measured(proxy_status: Path, pool_uid: str) -> dict[str, Measured]:
     report = proxy_report.read(proxy_status, pool_uid)
     if report is None or not report.uptime_s >= LEAST_S:
         return {}
-    counted = {name: _measured(report, name) for name in report.services}
-    return {name: one for name, one in counted.items() if one is not None}
-
-
-def _measured(report: ProxyReport, name: str) -> Measured | None:
-    count = report.services[name]
-    try:
-        requests, answers = int(count["received"]), int(count["answered"])
-        sizes = float(count["request_bytes"]), float(count["response_bytes"])
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return None
-    if requests <= 0 or answers < 0 or not all(0 <= size < float("inf") for size in sizes):
-        return None
-    traffic = TrafficSpec(
-        requests / report.uptime_s, sizes[0] / requests, sizes[1] / answers if answers else 0.0
-    )
-    return Measured(traffic, report.uptime_s, requests)
-
-
-def with_measured(spec: PoolSpec, found: dict[str, Measured]) -> PoolSpec:
-    """Return a pool file whose services carry what was measured where it states nothing."""
-
-    def carried(service: ServiceSpec) -> ServiceSpec:
-        known = found.get(service.name)
-        if known is None or is_stated(service):
-            return service
-        return replace(service, traffic=known.traffic)
-
-    return replace(spec, services=tuple(carried(service) for service in spec.services))
-
-
-def is_stated(service: ServiceSpec) -> bool:
-    """Whether the pool file says what is asked of a service."""
-    return service.traffic != TrafficSpec()
+    found = {}
+    for name, raw in report.services.items():
+        count = from_plain(proxy_report.Counted, raw)
+        if count.received:
+            traffic = TrafficSpec(
+                count.received / report.uptime_s,
+                count.request_bytes / count.received,
+                count.response_bytes / max(1, count.answered),
+            )
+            found[name] = Measured(traffic, report.uptime_s)
+    return found

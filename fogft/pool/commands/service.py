@@ -22,7 +22,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from fogft import disk
+from fogft import disk, template_files
 from fogft.errors import FogftError, StateError
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.manager import process_control
@@ -37,32 +37,6 @@ _TAKEN = re.compile(
     r"ROS_.*|RMW_IMPLEMENTATION|AMENT_.*|COLCON_.*|CYCLONEDDS_URI|FAST(DDS|RTPS)_.*|ZENOH_.*|"
     r"OTEL_.*|PATH|PYTHONPATH|LD_LIBRARY_PATH|VIRTUAL_ENV|LANG|FOGFT_HOME"
 )
-
-_UNIT = """\
-{mark}
-[Unit]
-Description=fogft {what}
-After=network-online.target
-Wants=network-online.target
-ConditionPathExists={needs}
-StartLimitIntervalSec=600
-StartLimitBurst=30
-
-[Service]
-Type=notify
-NotifyAccess=main
-ExecStart={command}
-EnvironmentFile={environment}
-{user}Restart=on-failure
-RestartSec=1
-TimeoutStartSec=300
-TimeoutStopSec=180
-WatchdogSec={watchdog_s}
-KillMode=process
-
-[Install]
-WantedBy={wanted_by}
-"""
 
 
 @dataclass(frozen=True)
@@ -133,7 +107,7 @@ def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
 def _unit(name: str, words: Sequence[str], needs: Path, environment: Path, *, system: bool) -> Unit:
     command = " ".join(_quoted(word) for word in (sys.executable, "-m", "fogft", *words))
     owner = pwd.getpwuid(needs.stat().st_uid).pw_name
-    text = _UNIT.format(
+    text = template_files.read_text("systemd.service").format(
         mark=MARK,
         what=name.removeprefix("fogft-").removesuffix(".service"),
         needs=str(needs).replace("%", "%%"),

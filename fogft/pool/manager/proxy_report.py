@@ -49,6 +49,8 @@ class Counted:
     turned_away: Count = 0
     poison: Count = 0
     late: Count = 0
+    request_bytes: Count = 0
+    response_bytes: Count = 0
     pending: Count = 0
     needed_replicas: Count = 0
     poisoned_at: Moment | None = None
