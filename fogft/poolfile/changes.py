@@ -14,10 +14,10 @@ from fogft.model.spec import PoolSpec
 def changes(before: PoolSpec, after: PoolSpec) -> list[str]:
     """Return one sentence for each difference; empty when there is none."""
     old, new = _ours(before), _ours(after)
-    services = [{one["name"]: one for one in ours.pop("services")} for ours in (old, new)]
+    was, is_ = ({one["name"]: one for one in ours.pop("services")} for ours in (old, new))
     return [
         *_differences(before.task, after.task),
-        *_differences(*services, "service ", inside=True),
+        *_differences(was, is_, "service ", inside=True),
         *_differences(old, new, inside=True),
     ]
 
