@@ -18,7 +18,7 @@ from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Placement
 from tests.sky.scene import Scene
-from tests.sky.scripted_sky import EAST, WEST, replica
+from tests.sky.scripted_sky import EAST, WEST, ScriptedProvider, ScriptedSky, replica
 
 ID = replica()
 NAME = naming.cluster_name(ID)
@@ -304,6 +304,27 @@ def test_a_machine_that_the_provider_still_lists_is_left_alone(scene: Scene, age
     scene.cloud.refresh(ID)
     assert scene.machine().phase is MachinePhase.RUNNING
     assert not scene.sky.asked("refresh")
+
+
+@pytest.mark.parametrize("ended_by_us", [False, True])
+def test_a_provider_of_another_account_is_not_believed(tmp_path: Path, ended_by_us: bool):
+    """An API server elsewhere has credentials of its own; those here may be of another account."""
+    scene = Scene(tmp_path)
+    scene.sky = ScriptedSky(ScriptedProvider())
+    scene.cloud = scene.another_process()
+    scene.launched()
+    scene.pass_s(120)
+    scene.cloud.refresh(ID)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.RUNNING
+    if ended_by_us:
+        scene.sky.down_lies = True
+        with pytest.raises(CloudUnreachable):
+            scene.cloud.terminate(ID)
+    else:
+        scene.sky.preempt(NAME)
+        scene.cloud.refresh(ID)
+        assert not scene.machines()
 
 
 def test_a_machine_that_the_provider_does_not_list_yet_is_asked_about_at_skypilot(scene: Scene):

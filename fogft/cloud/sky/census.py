@@ -1,5 +1,8 @@
 """Ask the providers which machines exist: SkyPilot may have forgotten some.
 
+A machine's absence counts only where the provider has listed it before. The credentials here may be
+of another account than those that SkyPilot, or its API server elsewhere, launches with.
+
 Not here: the providers' interfaces (`provider`, `aws`).
 """
 
@@ -34,6 +37,7 @@ class Census:
         self._found: dict[str, Sequence[Instance]] = {}
         self._begun_at: dict[str, float] = {}
         self._refused: dict[str, str] = {}
+        self._seen: set[ReplicaId] = set()
 
     def of(self, id: ReplicaId, entry: Entry | None) -> list[Instance] | None:
         """Return a replica's instances, asked now; None where SkyPilot's word has to do.
@@ -49,7 +53,8 @@ class Census:
         if provider is None:
             return None
         mine = self._ask(provider, [entry.placement.region], id.pool_uid)
-        return [i for i in mine if i.id == id] if self.vouches(provider.cloud) else None
+        vouched = id in self._seen and self.vouches(provider.cloud)
+        return [i for i in mine if i.id == id] if vouched else None
 
     def terminate(self, instance: Instance) -> None:
         """Ask for the end of an instance. Raises CloudUnreachable: it may run on."""
@@ -128,4 +133,5 @@ class Census:
             self._refused[provider.cloud] = f"this account may not list machines: {error}"
             return []
         self._refused.pop(provider.cloud, None)
+        self._seen.update(instance.id for instance in found)
         return found

@@ -99,6 +99,7 @@ class Following:
             else:
                 self._move(entry, stage=Stage.SETTING_UP, job=job, running_at=self.clock())
                 self._find_endpoint(entry)
+                self.ending.census.of(entry.id, entry)  # seen once, its absence counts
 
     def _find_endpoint(self, entry: Entry) -> None:
         """Ask where a machine is reached whose cloud maps its port, until that is known."""
