@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -304,6 +305,18 @@ def test_a_machine_that_the_provider_still_lists_is_left_alone(scene: Scene, age
     scene.cloud.refresh(ID)
     assert scene.machine().phase is MachinePhase.RUNNING
     assert not scene.sky.asked("refresh")
+
+
+def test_a_machine_that_the_provider_lists_as_stopped_is_asked_about_at_skypilot(scene: Scene):
+    """So GCP lists what it has preempted."""
+    scene.launched()
+    scene.pass_s(120)
+    for key, one in scene.provider.found.items():
+        scene.provider.found[key] = replace(one, running=False)
+    scene.sky.records[NAME] = replace(scene.sky.records[NAME], state=ClusterState.STOPPED)
+    scene.cloud.refresh(ID)
+    assert scene.sky.asked("refresh") == [NAME]
+    assert scene.machine().phase is MachinePhase.FAILED
 
 
 @pytest.mark.parametrize("ended_by_us", [False, True])

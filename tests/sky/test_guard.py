@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from fogft import template_files
-from fogft.cloud.sky import guard
+from fogft.cloud.sky import settings
 from fogft.cloud.sky.following import LAUNCH_LIMIT_S
 from fogft.model.names import SETUP_LIMIT_S
 
@@ -77,7 +77,7 @@ def test_a_machine_whose_replica_runs_stays_and_its_time_begins_anew(tmp_path: P
 
 def test_its_command_returns_at_once_and_is_plain_text_for_every_reader(tmp_path: Path):
     """It goes through a command line, YAML twice and a shell before it is run."""
-    command = guard.command()
+    command = settings.guard()
     assert "\n" not in command
     assert not set(command) & set("'\"#:{}[]%@`!?,")
     here = command.replace("/run/fogft-guard", str(tmp_path / "guard"))
@@ -86,9 +86,9 @@ def test_its_command_returns_at_once_and_is_plain_text_for_every_reader(tmp_path
     assert done.returncode == 0
     until_minutes(tmp_path, 2)  # it runs on, though its shell is gone
     text = (tmp_path / "guard").read_text()
-    assert f'"$alone" -lt {guard.ALONE_MINUTES} ' in text
+    assert f'"$alone" -lt {settings.ALONE_MINUTES} ' in text
     (tmp_path / "sleep").write_text("#!/bin/sh\nkill $PPID\n")  # its end
 
 
 def test_its_limit_is_longer_than_a_launch_and_a_set_up_may_take():
-    assert LAUNCH_LIMIT_S + SETUP_LIMIT_S <= guard.ALONE_MINUTES * 60
+    assert LAUNCH_LIMIT_S + SETUP_LIMIT_S <= settings.ALONE_MINUTES * 60

@@ -20,7 +20,7 @@ from unittest import mock
 
 import pytest
 
-from fogft.cloud.sky import answers, guard, settings, task
+from fogft.cloud.sky import answers, settings, task
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, Sale
@@ -181,7 +181,7 @@ def test_every_launch_asks_for_the_guard_once_after_the_users_own_commands(
     for _ in range(2):
         installed.launch({"run": "serve"}, "c")
         asked = carried()["aws"]["post_provision_runcmd"]
-        assert asked == ["echo mine", guard.command()]
+        assert asked == ["echo mine", settings.guard()]
         assert carried()["gcp"]["remote_identity"] == "NO_UPLOAD"
     assert carried()["allowed_clouds"] == ["aws"], "all else is as it was"
 
@@ -294,8 +294,8 @@ def test_the_guard_is_what_cloud_init_reads(home: Path):
     text = (Path(sky.__file__).parent / "templates" / "aws-ray.yml.j2").read_text()
     start = text.index("{%- if runcmd %}")
     part = text[start : text.index("TagSpecifications", start)]
-    written = jinja2.Template(part).render(runcmd=["echo mine", guard.command()])
-    assert yaml.safe_load(written) == {"runcmd": ["echo mine", guard.command()]}
+    written = jinja2.Template(part).render(runcmd=["echo mine", settings.guard()])
+    assert yaml.safe_load(written) == {"runcmd": ["echo mine", settings.guard()]}
 
 
 @needs("skypilot")

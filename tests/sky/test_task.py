@@ -199,7 +199,7 @@ def shell(home: Path, script: str, **environ: str) -> subprocess.CompletedProces
         env={"HOME": str(home), "PATH": "/usr/local/bin:/usr/bin:/bin", **environ},
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
         start_new_session=True,  # as SkyPilot does
     )
@@ -260,6 +260,41 @@ def test_what_setup_installs_with_pip_is_there_for_run_and_for_the_server_proxy(
     seen = "python3 -c 'import rclpy, userlib; print(\"run finds\", userlib.version)'\nexec ~/"
     done = on_skypilot(new_vm, run.replace("exec ~/", seen))
     assert done.stdout.splitlines() == ["run finds 1.0", "the proxy finds 1.0"], done.stderr
+
+
+@pytest.fixture
+def conda(new_vm: Path) -> Path:
+    """What SkyPilot's images with conda have: a Python of its own, active in every shell.
+
+    Stands in for Miniforge: this test's Python, copied, with one package that conda has brought.
+    """
+    root, base = new_vm / "miniconda3", Path(sys.base_prefix)
+    library = root / "lib" / f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    (root / "bin").mkdir(parents=True)
+    shutil.copy(Path(sys.executable).resolve(), root / "bin/python3")
+    library.mkdir(parents=True)
+    for entry in (base / "lib" / library.name).iterdir():
+        if entry.name not in ("site-packages", "dist-packages"):
+            (library / entry.name).symlink_to(entry)
+    for name in ("site-packages", "dist-packages"):  # Debian's Python looks into the other one
+        (library / name).mkdir()
+        (library / name / "condalib.py").write_text("version = '3.0'\n")
+    return root
+
+
+def test_on_an_image_with_conda_run_has_what_conda_and_pip_brought(new_vm: Path, conda: Path):
+    """SkyPilot leaves its own environment aside where conda's is active."""
+    wheel_of(new_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1", extra="rclpy")
+    active = f"export CONDA_PREFIX={conda} PATH={conda}/bin:/usr/bin:/bin\n"
+    asked = {"setup": "set -e\npython3 -c 'import condalib'\npip install -q userlib==1.0"}
+    index = {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(new_vm / "index")}
+    setup = with_ros_at(new_vm / "no-ros", built(asked)["setup"])
+    done = shell(new_vm, active + setup, **index)
+    assert done.returncode == 0, done.stdout + done.stderr
+    seen = "python3 -c 'import condalib, rclpy, userlib; print(userlib.version)'\nexec ~/"
+    run = with_ros_at(new_vm / "no-ros", built(asked)["run"]).replace("exec ~/", seen)
+    done = shell(new_vm, active + run)
+    assert done.stdout.splitlines() == ["1.0", "the proxy finds 1.0"], done.stderr
 
 
 def lock(home: Path, **versions: str) -> None:

@@ -27,6 +27,7 @@ from fogft.cloud.sky.presence import Presence
 from fogft.cloud.sky.prices import Prices
 from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError
+from fogft.cloud.sky.settings import GROUP
 from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
 from fogft.disk import write_whole
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
@@ -224,7 +225,7 @@ class SkyCloud:
                 f"SkyPilot gives every VM these files of yours, and its own ssh key: {listed}. It "
                 "has no setting against that: move them away where a replica must not have them"
             )
-        held = self._providers.keys() if allow_from else ()
+        held = GROUP[:1] if allow_from else ()
         world = ", ".join(f"`{one}`" for one in clouds if one not in held)
         if world and (open_port or allow_from):
             port = f"port {open_port} of every VM (mutual TLS) and " if open_port else ""

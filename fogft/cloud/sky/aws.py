@@ -316,4 +316,5 @@ def _instance(region: str, raw: Mapping[str, Any]) -> Instance | None:
         labels=labels,
         public_ip=raw.get("PublicIpAddress", ""),
         launched_at=launched.timestamp() if launched else 0.0,
+        running=raw.get("State", {}).get("Name") in ("pending", "running"),
     )

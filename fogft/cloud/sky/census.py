@@ -115,7 +115,8 @@ class Census:
         found: list[Instance] = []
         for cloud, provider in self.providers.items():
             try:
-                found += self._ask(provider, (regions or {}).get(cloud), pool_uid)
+                where = regions.get(cloud, ()) if regions else None
+                found += self._ask(provider, where, pool_uid)
             except CloudUnreachable as error:
                 log.warning("census_failed cloud=%s reason=%r", cloud, error.message)
                 return

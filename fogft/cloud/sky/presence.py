@@ -78,7 +78,7 @@ class Presence:
             if not alive and gone_for_sure and entry.stage in ON_THE_MACHINE:
                 self._is_gone(entry)
                 self.submit(lambda: self._drop_record(id))
-            if alive or gone_for_sure:
+            if all(one.running for one in alive) and (alive or gone_for_sure):
                 return
         self.sky.clusters(cluster_name(id), refresh=True)
         self.forget()

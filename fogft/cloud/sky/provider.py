@@ -24,6 +24,7 @@ class Instance:
     labels: Mapping[str, str]
     public_ip: str = ""
     launched_at: float = 0.0  # seconds since the epoch
+    running: bool = True  # or about to; a stopped one's disk still costs
 
 
 class NotAllowedError(Exception):
@@ -32,6 +33,8 @@ class NotAllowedError(Exception):
 
 class Provider(Protocol):
     """One cloud, by its own interface. Calls come from any thread and have limits.
+
+    What an implementation leaves out is not known there.
 
     All raise `CloudUnreachable` when the cloud cannot tell, or it is not known whether it heard,
     and `NotAllowedError` where the account may not.
@@ -53,17 +56,23 @@ class Provider(Protocol):
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
         """See to what lets only some networks reach some ports; return its name for SkyPilot.
 
-        Repeatable. Raises `CloudError` where something else goes by that name.
+        Repeatable. Raises `CloudError` where something else goes by that name. Empty where
+        SkyPilot cannot hold it.
         """
+        return ""
 
     def warning(self) -> str:
         """Return what a VM there may do that it need not; empty where nothing is known."""
+        return ""
 
     def credentials_end_at(self) -> float | None:
         """Return when the credentials here end, in seconds since the epoch; None for unknown."""
+        return None
 
     def quota(self, region: str, code: str) -> float | None:
         """Return how many vCPUs an account may run there at once; None where that is unknown."""
+        return None
 
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         """Return live spot prices: (zone, instance type) -> US dollars per hour."""
+        return {}

@@ -1,7 +1,12 @@
 """What fogft has SkyPilot do at a launch, where the user's own settings do not say otherwise.
 
-A VM gets the guard (`guard`), and no credentials: by SkyPilot's default it would get the files of
-every cloud that they exist for, and with any of them SkyPilot's own ssh key. Usage reports are off.
+A VM gets no credentials: by SkyPilot's default it would get the files of every cloud that they
+exist for, and with any of them SkyPilot's own ssh key. Usage reports are off.
+
+It gets a guard that ends it where no replica ever runs on it. SkyPilot sets `autostop` when a
+machine is wholly set up; before that one whose launcher dies, SkyPilot's API server with it, would
+run until somebody looks. On AWS only: SkyPilot has no such setting for others.
+
 A request carries these settings to the API server. To one elsewhere it carries the guard only:
 which of its own credentials that server gives away its administrator has decided.
 
@@ -12,6 +17,7 @@ Not here: which roles, ports and security groups a VM has (`aws`, `task`).
 
 from __future__ import annotations
 
+import base64
 import importlib
 import json
 import os
@@ -19,19 +25,32 @@ import threading
 from collections.abc import Iterable
 from typing import Any
 
-from fogft.cloud.sky import guard, naming
+from fogft import template_files
+from fogft.cloud.sky import naming
+from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.replica import ReplicaId
 
 NO_UPLOAD, UPLOAD = "NO_UPLOAD", "LOCAL_CREDENTIALS"
 ENDED_BY_FILES = frozenset({"nebius", "oci", "vast"})
 """Clouds whose VMs have no identity of their own: to end itself one needs its cloud's files."""
 GROUP = ("aws", "security_group_name")  # by patterns of clusters' names
+GUARD = ("aws", "post_provision_runcmd")  # handed to the machine with the order itself
+ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60
+"""A launch takes 15 minutes at most (`following.LAUNCH_LIMIT_S`), a set-up its own limit."""
 NO_REPORTS = "SKYPILOT_DISABLE_USAGE_COLLECTION"
 
 
 def report_nothing() -> None:
     """Turn SkyPilot's usage reports off, unless the user chose. Before it is imported."""
     os.environ.setdefault(NO_REPORTS, "1")
+
+
+def guard() -> str:
+    """Return the guard's command: one line, for a shell, which returns at once."""
+    text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(ALONE_MINUTES))
+    packed = base64.b64encode(text.encode()).decode()
+    path = "/run/fogft-guard"
+    return f"echo {packed} | base64 -d > {path} && setsid sh {path} > /dev/null 2>&1 &"
 
 
 class Settings:
@@ -56,10 +75,10 @@ class Settings:
             changes: list[str] = []
             if id is not None:
                 changes += _with_group(config, naming.clusters_of(id.pool_uid), group)
-            given = list(config.get_nested(guard.SETTING, []) or [])
-            if guard.command() not in given:
-                value = json.dumps([*given, guard.command()])
-                changes.append(f"{'.'.join(guard.SETTING)}={value}")
+            given = list(config.get_nested(GUARD, []) or [])
+            if guard() not in given:
+                value = json.dumps([*given, guard()])
+                changes.append(f"{'.'.join(GUARD)}={value}")
             for cloud in () if _is_elsewhere() else _with_identity():
                 wanted = UPLOAD if cloud in self._launched else NO_UPLOAD
                 found = _identity(config, cloud)
