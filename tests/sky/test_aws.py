@@ -221,6 +221,28 @@ def test_not_allowed_is_not_the_same_as_cannot_tell(code: str, expected: type, h
         assert not aws.clients, "renewed credentials are read from the disk again"
 
 
+def test_a_role_that_may_not_be_read_is_told_in_a_few_words():
+    """What AWS says of a refusal ends in some thousand characters that only AWS can read."""
+    error = client_error("AccessDenied")
+    error.args = (
+        "User: lab is not authorized to perform: iam:ListAttachedRolePolicies. Encoded "
+        "authorization failure message: " + "Zm9nZnQ" * 120,
+    )
+    aws = Aws()
+
+    class Iam:
+        def list_attached_role_policies(self, RoleName: str) -> Any:  # noqa: N803
+            raise error
+
+        class exceptions:  # noqa: N801
+            NoSuchEntityException = KeyError
+
+    aws.clients["iam", "us-east-1"] = Iam()
+    told = aws.warning()
+    assert told.startswith("what AWS's role `skypilot-v1`")
+    assert told.endswith("not authorized to perform: iam:ListAttachedRolePolicies.")
+
+
 @needs("moto")
 def test_a_region_that_may_not_be_asked_hides_no_other(account: None):
     """An organisation keeps its accounts out of most regions."""

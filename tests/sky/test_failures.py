@@ -53,6 +53,20 @@ def test_words_are_one_short_line_without_colours():
     assert "QuotaExceeded" in failure.words
 
 
+def test_a_permission_that_is_missing_is_named_however_long_the_caller_is_called():
+    who = "arn:aws:sts::123456789012:assumed-role/AWSReservedSSO_" + "x" * 200
+    text = (
+        "(UnauthorizedOperation) when calling the RunInstances operation: You may not "
+        f"perform this operation. User: {who} is not authorized to perform: iam:PassRole on "
+        "resource: arn:aws:iam::123456789012:role/skypilot-v1 because no identity-based policy "
+        "allows it. Encoded authorization failure message: " + "Zm9nZnQ" * 120
+    )
+    failure = classify(UNAVAILABLE, [text])
+    assert failure.cause is Cause.CREDENTIALS
+    assert "iam:PassRole on resource: arn:aws:iam::123456789012:role/skypilot-v1" in failure.words
+    assert len(failure.words) < 330
+
+
 def test_the_tail_of_a_log_is_its_last_lines_that_say_something():
     log = "\n".join(f"\x1b[36mline {n}\x1b[0m\n" for n in range(50))
     assert tail(log, lines=3) == "line 47\nline 48\nline 49"

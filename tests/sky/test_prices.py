@@ -179,3 +179,13 @@ def test_what_the_accounts_quota_forbids_is_not_offered_and_the_quota_is_named(m
     market.sky.sold = [Offer(gpu, 0.2, "catalogue")]
     with pytest.raises(SpecError, match="L-3819A6DF"):
         market.prices.offers({"infra": "aws", "accelerators": "T4"})
+
+
+def test_quotas_that_may_not_be_read_are_told_and_forbid_nothing(market: Market):
+    market.sky.sold = [Offer(EAST, 0.02, "catalogue")]
+    market.sky.quotas = {("m6i.large", EAST.spot): "L-34B43A08"}
+    market.sky.vcpus = {"m6i.large": 2.0}
+    market.provider.allowed = False
+    assert len(market.prices.offers({"infra": "aws"})) == 1
+    (said,) = market.prices.left_out()
+    assert said.endswith("since they cannot be read: UnauthorizedOperation")

@@ -182,7 +182,9 @@ class Aws:
 
         try:
             names = self._ask(_HOME, policies, "iam")
-        except (NotAllowedError, CloudUnreachable):
+        except NotAllowedError as error:
+            return f"what AWS's role `{ROLE}`, which every VM has, may do cannot be read: {error}"
+        except CloudUnreachable:
             return ""
         if names is None:
             return (
@@ -220,7 +222,8 @@ class Aws:
             told = getattr(error, "response", None) or {}
             code = str(told.get("Error", {}).get("Code", "")) or type(error).__name__
             if code in _FORBIDDEN or code == "NoCredentialsError":
-                raise NotAllowedError(f"{code}: {error}") from error
+                words = str(error).partition(" Encoded authorization failure message:")[0]
+                raise NotAllowedError(f"{code}: {words}") from error
             hint = ""
             if classify(code, [str(error)]).cause is Cause.CREDENTIALS:
                 with self._lock:  # renewed ones are read by a new session only

@@ -65,6 +65,7 @@ def told_last(log: str) -> Reason | None:
     return next((failure for failure in found if failure.cause is not Cause.ERROR), None)
 
 
+_NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # who asked may have a long name
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")
 _DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # what SkyPilot says of its own doing
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
@@ -83,7 +84,7 @@ def tail(log: str, lines: int = 20, width: int = 200) -> str:
 
 
 def _short(text: str, pattern: str, room: int = 300) -> str:
-    """Return the part of a text around what matched."""
-    found = re.search(pattern, text) if pattern else None
+    """Return the part of a text around what matched, and of a refusal what was not allowed."""
+    found = _NOT_ALLOWED.search(text) or re.search(pattern, text) if pattern else None
     start = max(0, found.start() - 80) if found and len(text) > room else 0
     return ("... " if start else "") + text[start : start + room]

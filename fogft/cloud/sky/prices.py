@@ -51,6 +51,7 @@ class Prices:
         self._instead: dict[Placement, Sequence[Offer]] = {}
         self._left_out: dict[str, dict[str, None]] = {}  # by what was asked: sentences
         self._quotas: dict[tuple[str, str], tuple[float, float | None]] = {}
+        self._unread: dict[str, str] = {}  # cloud -> why its quotas cannot be read
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """See `fogft.cloud.port.Cloud.offers`. The first call takes seconds, later ones none.
@@ -144,6 +145,7 @@ class Prices:
         if not wanted:
             return sale.offers
         limits = _side_by_side(wanted, self._quota)
+        left_out |= dict.fromkeys(self._unread.values())
         kept = []
         for offer in sale.offers:
             limit, place = limits.get(asked(offer)), offer.placement
@@ -163,7 +165,15 @@ class Prices:
         key = f"{cloud}/{region}", code
         at, value = self._quotas.get(key, (-math.inf, None))
         if self.clock() - at > USABLE_S:
-            value = _told(lambda: self.providers[cloud].quota(region, code), "quota", key[0])
+            self._unread.pop(cloud, None)
+            try:
+                value = self.providers[cloud].quota(region, code)
+            except CloudUnreachable as error:
+                log.info("quota_unknown region=%s reason=%r", key[0], str(error))
+                value = None
+            except NotAllowedError as error:
+                said = f"what `{cloud}`'s quotas forbid is not left out, since they cannot be read"
+                self._unread[cloud], value = f"{said}: {error}", None
             self._quotas[key] = self.clock(), value
         return value
 
@@ -179,8 +189,11 @@ class Prices:
         def live(where: tuple[str, str]) -> Mapping[tuple[str, str], float]:
             cloud, region = where
             provider, kinds = self.providers[cloud], wanted[where]
-            prices = _told(lambda: provider.spot_prices(region, kinds), "prices", "/".join(where))
-            return prices or {}
+            try:
+                return provider.spot_prices(region, kinds)
+            except (NotAllowedError, CloudUnreachable) as error:
+                log.info("prices_unknown region=%s reason=%r", "/".join(where), str(error))
+                return {}
 
         answers = _side_by_side(wanted, live)
         now = self.clock()
@@ -204,15 +217,6 @@ class Prices:
 def _side_by_side(wanted: Collection[K], ask: Callable[[K], V]) -> dict[K, V]:
     with ThreadPoolExecutor(min(8, len(wanted)), "prices") as pool:
         return dict(zip(wanted, pool.map(ask, wanted), strict=True))
-
-
-def _told(ask: Callable[[], V], what: str, region: str) -> V | None:
-    """Return what a provider says; None where it does not."""
-    try:
-        return ask()
-    except (NotAllowedError, CloudUnreachable) as error:
-        log.info("not_told what=%s region=%s reason=%r", what, region, str(error))
-        return None
 
 
 def _with_extras(offer: Offer, resources: Mapping[str, Any]) -> Offer:

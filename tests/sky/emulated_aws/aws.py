@@ -221,6 +221,11 @@ def patch_moto() -> None:
         setattr(instances.Instance, name, killing(getattr(instances.Instance, name)))
 
 
+# As somebody is called who has logged in by SSO.
+LOGIN = (
+    "arn:aws:sts::123456789012:assumed-role/AWSReservedSSO_RoboticsLabPowerUsers_0123456789abcdef/"
+    "firstname.lastname@robotics.example.com"
+)
 LAUNCHER, VM = Policy(statements(PAGE.read_text())), Policy(OF_VMS)
 
 
@@ -243,10 +248,15 @@ def enforce() -> None:
             tagged = self._get_param("TagSpecifications", None)
             tagged = tagged or self._get_param("TagSpecification", None) or []
             kinds = {str(one["ResourceType"]) for one in tagged}
-            if all(policy.allows("ec2:CreateTags", tags, kind) for kind in kinds):
+            if not all(policy.allows("ec2:CreateTags", tags, kind) for kind in kinds):
+                action = "ec2:CreateTags"
+            elif self._get_param("IamInstanceProfile", None) and not policy.allows(
+                "iam:PassRole", tags
+            ):
+                action = "iam:PassRole"
+            else:
                 return call(self)
-            action = "ec2:CreateTags"
-        who = "arn:aws:iam::123456789012:" + ("user/lab" if mine else "role/skypilot-v1")
+        who = LOGIN if mine else "arn:aws:iam::123456789012:role/skypilot-v1"
         WORLD.say("denied", action=action, by=who)
         code, does = "AccessDenied", ""
         if self.service_name == "ec2":
@@ -254,12 +264,18 @@ def enforce() -> None:
                 "UnauthorizedOperation",
                 "You are not authorized to perform this operation. ",
             )
+        subject = "arn:aws:iam::123456789012:role/skypilot-v1"
+        if not action.startswith("iam:"):
+            subject = f"arn:aws:ec2:{self.region}:123456789012:instance/*"
         words = (
-            f"{does}User: {who} is not authorized to perform: {action} because no identity-based "
+            f"{does}User: {who} is not authorized to perform: {action} on resource: {subject} "
+            f"because no identity-based policy allows the {action} action."
         )
+        if self.service_name == "ec2":
+            words += f" Encoded authorization failure message: {'Zm9nZnQ' * 120}"
         # moto tells by an exception's module in which service's words it is.
         denied = type("Denied", (ServiceException,), {"__module__": type(self).__module__})
-        error = denied(f"{words}policy allows the {action} action")
+        error = denied(words)
         error.code = code
         return self.serialized(ActionResult(error))
 

@@ -23,9 +23,9 @@ from tests.sky.emulated_aws.prove_adapter import FILES, TASK, UID
 from tests.sky.emulated_aws.under_contract import RESOURCES, adapter, stub_server
 
 step = Steps()
-# What fogft can do without, as the page says; and what is no call of its own.
-NOT_NEEDED = {"servicequotas:GetServiceQuota", "iam:ListAttachedRolePolicies", "iam:PassRole"}
+# What a launch can do without: each has a step of its own.
 OTHERWISE = {
+    *("servicequotas:GetServiceQuota", "iam:ListAttachedRolePolicies"),
     *("ec2:Describe*", "ec2:TerminateInstances", "ec2:DeleteSecurityGroup"),
     "ec2:ModifyInstanceAttribute",
 }
@@ -54,8 +54,18 @@ def main() -> int:
     control("/deny?action=ec2:Describe*")
     with step("without ec2:Describe* `up` says that it cannot tell, and names what it asked for"):
         assert "not authorized to perform: ec2:Describe" in cloud.unverified("aws")
+    control("/deny?action=servicequotas:GetServiceQuota")
+    with step("without servicequotas:GetServiceQuota `plan` says that quotas cannot be read"):
+        cloud.offers(RESOURCES)
+        (told,) = cloud.left_out()
+        print(f"        {told}", flush=True)
+        assert "not authorized to perform: servicequotas:GetServiceQuota" in told
+    control("/deny?action=iam:ListAttachedRolePolicies")
+    with step("without iam:ListAttachedRolePolicies `up` says that the role cannot be read"):
+        told = " ".join(cloud.exposures(["aws"], open_port=None))
+        assert "not authorized to perform: iam:ListAttachedRolePolicies" in told, told
     control("/deny")
-    tried = [one for one in listed if one not in NOT_NEEDED | OTHERWISE]
+    tried = [one for one in listed if one not in OTHERWISE]
     for slot, action in enumerate(tried):
         control(f"/deny?action={action}")
         with step(f"a launch without {action} fails and names it"):
@@ -83,6 +93,20 @@ def main() -> int:
     with step("... and with it it ends, though SkyPilot may not do what it does before"):
         cloud.terminate(machine.id)
         assert running() == []
+    control("/deny")
+    machine = outcome(cloud, 51)
+    assert machine is not None
+    assert machine.phase is MachinePhase.RUNNING, machine.failure
+    control("/deny?action=ec2:DeleteSecurityGroup")
+    with step("without ec2:DeleteSecurityGroup the machine ends, and what may be left is told"):
+        with pytest.raises(CloudError, match="DeleteSecurityGroup") as refused:
+            cloud.terminate(machine.id)
+        print(f"        {refused.value.message}", flush=True)
+        assert running() == []
+    control("/deny")
+    with step("... and with it nothing is left to end"):
+        cloud.terminate(machine.id)
+        assert not cloud.machines(UID)
     denied = {one["action"] for one in control("/log", post=False) if one["event"] == "denied"}
     print(f"        asked for in vain: {', '.join(sorted(denied))}", flush=True)
     return 0
