@@ -4,6 +4,7 @@ for ros in /opt/ros/*/setup.bash; do [ ! -f "$ros" ] || . "$ros"; done
 if [ -f install/setup.sh ] && ! grep -qF "$PWD/install" install/setup.sh; then
   rm -rf build install  # it came along from the machine that built it
 fi
+[ ! -f build/COLCON_IGNORE ] || grep -qsF "=$PWD/" build/*/CMakeCache.txt || rm -rf build
 if [ -f install/setup.sh ] && [ -z "$(find src -newer install/setup.sh -print -quit)" ]; then
   exit 0
 fi

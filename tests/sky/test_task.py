@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from fogft import template_files
 from fogft.cloud.local import processes
 from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming, task
@@ -22,6 +23,7 @@ from fogft.errors import SpecError
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.replica import Placement
 from tests.cloud.waiting import wait_for
+from tests.needs import needs
 from tests.sky.scripted_sky import EAST, WEST, replica
 
 
@@ -360,6 +362,42 @@ def test_a_machine_without_a_python_of_today_is_told(new_vm: Path):
     done = shell(new_vm, script, PATH=f"{old.parent}:/usr/bin:/bin")
     assert done.returncode != 0
     assert "there is no Python 3.10 to 3.13" in done.stdout
+
+
+WORKSPACE = template_files.read_text("workspace.sh")
+PACKAGE = """\
+<package format="3"><name>greet</name><version>0.0.1</version><description>none</description>
+<maintainer email="a@b.c">a</maintainer><license>MIT</license>
+<export><build_type>cmake</build_type></export></package>
+"""
+
+
+@needs("colcon")
+@pytest.mark.parametrize("setup", ["colcon build --base-paths src", WORKSPACE])
+def test_a_workspace_that_was_built_elsewhere_is_built_anew(vm: Path, setup: str):
+    """CMake refuses a cache of another folder; what was built here before stays."""
+    lab = vm / "lab/src/greet"
+    lab.mkdir(parents=True)
+    (lab / "package.xml").write_text(PACKAGE)
+    (lab / "CMakeLists.txt").write_text(
+        "cmake_minimum_required(VERSION 3.16)\nproject(greet NONE)\n"
+        "install(FILES package.xml DESTINATION share/greet)\n"
+    )
+    path = f"{Path(sys.executable).parent}:/usr/local/bin:/usr/bin:/bin"
+    done = shell(vm, "cd lab && colcon build --base-paths src", PATH=path)
+    assert done.returncode == 0, done.stderr
+    shutil.copytree(vm / "lab", vm / "sky_workdir")
+    for folder in ("install", "log"):
+        shutil.rmtree(vm / "sky_workdir" / folder)
+    script = f"cd ~/sky_workdir\n{built({'setup': setup})['setup']}"
+    for setting_up in ("on a new machine", "again"):
+        (vm / "sky_workdir/build" / setting_up).touch()
+        done = shell(vm, script, PATH=path)
+        assert done.returncode == 0, done.stderr
+        assert "different" not in done.stderr + done.stdout
+        cache = (vm / "sky_workdir/build/greet/CMakeCache.txt").read_text()
+        assert f"CMAKE_HOME_DIRECTORY:INTERNAL={vm}/sky_workdir/src/greet" in cache
+        assert (vm / "sky_workdir/build" / setting_up).exists() == (setting_up == "again")
 
 
 def test_a_failing_setup_of_the_pool_file_fails_the_whole(vm: Path):
