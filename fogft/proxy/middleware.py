@@ -72,13 +72,14 @@ def join_early(speaks: Speaks, name: str, domain_id: int | None) -> EarlyJoin | 
 
 def load_types(type_names: Sequence[str]) -> None:
     """Load what of these service types can be had here; what is wrong, their user tells."""
-    from fogft.ros import messages, transfer, types
+    from fogft.ros import messages, types
+    from fogft.ros.serialised import self_test
 
     for name in type_names:
         with contextlib.suppress(ImportError, RosError):
             types.definition(name)
             messages.default_response(name)
-            transfer.choose(types.load_service_type(name), name)
+            self_test()
 
 
 def declare_gone(participant: str, domain_id: int | None) -> None:

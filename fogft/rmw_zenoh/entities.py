@@ -25,7 +25,7 @@ from fogft.link.zenoh import threads
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.log_limits import worth_logging
 from fogft.rmw_zenoh import naming
-from fogft.ros.pacing.client_probes import ServiceProbes
+from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.pacing.pacer import Pacer
 
 log = logging.getLogger(__name__)
@@ -55,9 +55,8 @@ class Server:
     def __init__(
         self, session: Any, token: Callable[[str], naming.Token], hash: str,
         on_request: Callable[[bytes, Any], None], fault: Callable[[bytes], str],
-        *, probes: ServiceProbes | None = None,
+        *, probes: NodeProbes,
     ) -> None:  # fmt: skip
-        self._pacer = Pacer(self._reply, probes, client_of=lambda handle: handle.client)
         self._answered_ns = OrderedDict[bytes, int]()  # client -> when it got its last answer
         self._session = session
         self._fault = fault
@@ -66,6 +65,7 @@ class Server:
         self.is_open = True  # whether it is offered
         self._faces: dict[str, tuple[Any, Any]] = {}
         self.name, self.type = token("").service, token("").type
+        self._pacer = Pacer(self._reply, probes, self.name, client_of=lambda h: h.client)
         self._worker = _worker(self.name)
         self._declare(hash)
 

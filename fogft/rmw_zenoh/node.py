@@ -27,7 +27,7 @@ from fogft.model.type_definition import REQUEST, RESPONSE
 from fogft.rmw_zenoh import naming, session
 from fogft.rmw_zenoh.entities import Client, Server
 from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
-from fogft.ros.pacing.client_probes import NodeProbes, ServiceProbes
+from fogft.ros.pacing.client_probes import NodeProbes
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +135,7 @@ class RmwZenohNode:
             lambda: Server(
                 *(self._session, self._tokens(SERVER, name, type_name), known, on_request),
                 self._fault_of(type_name, RESPONSE),
-                probes=ServiceProbes(name, self._probes),
+                probes=self._probes,
             )
         )
         for hash in self.graph.hashes(CLIENT, name, type_name):

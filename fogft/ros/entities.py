@@ -5,7 +5,7 @@ entity has one lock: over *send and insert*, so that a response never comes befo
 request is known, and over the C message that sending uses.
 
 Owns: pending requests, the order of sending and closing.
-Not here: the loop (`node`), bytes (`transfer`).
+Not here: the loop (`node`), bytes (`serialised`).
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any
 
 from fogft.errors import RosError
 from fogft.log_limits import worth_logging
-from fogft.ros.pacing.client_probes import ServiceProbes
+from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import OnBurst
 
 if TYPE_CHECKING:
-    from fogft.ros.transfer import ClientEnd, ServiceEnd
+    from fogft.ros.serialised import ClientEnd, ServiceEnd
 
 log = logging.getLogger(__name__)
 
@@ -53,7 +53,7 @@ class Server:
         withdraw: Callable[[Server], None],
         *,
         on_burst: OnBurst | None = None,
-        probes: ServiceProbes | None = None,
+        probes: NodeProbes,
         mismatch: Callable[[], str] = str,
     ) -> None:
         self.handle = service.handle
@@ -67,7 +67,7 @@ class Server:
         self.mismatch = mismatch
         self._in_bursts = False  # several came together the last time
         self._lock = threading.Lock()
-        self._pacer = Pacer(self._send, probes)
+        self._pacer = Pacer(self._send, probes, service.service_name)
 
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send the serialised response; in a burst, when the client can bear it."""

@@ -6,7 +6,7 @@ Two rules:
 2. Callbacks run on the take loop. They must not block; what they raise is logged.
 
 Owns: the context, the node, the thread, quality of service.
-Not here: pending requests (`entities`), bytes (`transfer`).
+Not here: pending requests (`entities`), bytes (`serialised`).
 """
 
 from __future__ import annotations
@@ -21,14 +21,15 @@ from typing import Any, TypeVar
 from fogft.errors import RosError
 from fogft.model import ros_names
 from fogft.model.topic import Quality
-from fogft.ros import topic_ends, transfer, vendors
+from fogft.ros import topic_ends, vendors
 from fogft.ros.entities import Client, Server
-from fogft.ros.pacing.client_probes import NodeProbes, ServiceProbes
+from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.participant import farewell
 from fogft.ros.participant.joining import EarlyJoin, bare_node, new_context
 from fogft.ros.port import ClientNode, OnBurst
-from fogft.ros.topic_ends import Publisher, Reader, Subscription
-from fogft.ros.types import load_message_type, load_service_type
+from fogft.ros.serialised import ClientEnd, ServiceEnd, self_test
+from fogft.ros.topic_ends import Publisher, Subscription
+from fogft.ros.types import load_message_type, load_service_type, shape
 from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
@@ -59,7 +60,6 @@ class SerialisedNode:
         self._entities: tuple[Entity, ...] = ()
         self._changes: list[tuple[Entity, bool, threading.Event]] = []
         self._create_lock = threading.Lock()  # rcl wants one creation at a time
-        self._chosen: dict[str, transfer.Ends] = {}
         self._stopping = False
         self._ended = threading.Event()
         self._visible: VisibleNode | None = None
@@ -82,6 +82,7 @@ class SerialisedNode:
         from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
         from rclpy.utilities import get_rmw_implementation_identifier
 
+        self_test()
         self._middleware: str = get_rmw_implementation_identifier()
         self._new_wait_set: Any = rclpy_implementation.WaitSet
         self._quality = QoSProfile(
@@ -112,25 +113,18 @@ class SerialisedNode:
         on_burst: OnBurst | None = None,
     ) -> Server:
         """Offer a service. A first request may come before this returns."""
-
-        service_type, ends = self._ends(type_name)
+        service_type = load_service_type(type_name)
 
         def create() -> Server:
             service: Any = self._node.create_service(
                 service_type, name, lambda _, response: response, qos_profile=self._quality
             )
-            try:
-                end = ends.service(service, service_type)
-                full = service.service_name
-                return Server(
-                    *(service, end, on_request, self._withdraw),
-                    on_burst=on_burst,
-                    probes=ServiceProbes(full, self._probes),
-                    mismatch=partial(self._clients_mismatch, full),
-                )
-            except BaseException:
-                self._node.destroy_service(service)
-                raise
+            return Server(
+                *(service, ServiceEnd(service, service_type), on_request, self._withdraw),
+                on_burst=on_burst,
+                probes=self._probes,
+                mismatch=partial(self._clients_mismatch, service.service_name),
+            )
 
         return self._add(name, create)
 
@@ -138,17 +132,12 @@ class SerialisedNode:
         """Make a client of a service."""
         # ROS 2 Humble cannot count: there, whether one is available must do.
         count: Any = getattr(self._node, "count_services", lambda _: 0)
-
-        service_type, ends = self._ends(type_name)
+        service_type = load_service_type(type_name)
 
         def create() -> Client:
             client: Any = self._node.create_client(service_type, name, qos_profile=self._quality)
-            try:
-                end, mismatch = ends.client(client, service_type), self._servers_mismatch
-                return Client(client, end, self._withdraw, count, partial(mismatch, name))
-            except BaseException:
-                self._node.destroy_client(client)
-                raise
+            end, mismatch = ClientEnd(client, service_type), self._servers_mismatch
+            return Client(client, end, self._withdraw, count, partial(mismatch, name))
 
         return self._add(name, create)
 
@@ -158,11 +147,7 @@ class SerialisedNode:
 
         def create() -> Publisher:
             made: Any = self._node.create_publisher(message_type, name, topic_ends.profile(quality))
-            try:
-                return Publisher(made, Reader(message_type), self._withdraw)
-            except BaseException:
-                self._node.destroy_publisher(made)
-                raise
+            return Publisher(made, shape(message_type), self._withdraw)
 
         return self._add(name, create)
 
@@ -223,11 +208,7 @@ class SerialisedNode:
             service: Its absolute name.
             client: The first 16 bytes of a request's handle: the reader of its responses.
         """
-        find: Any = self._node.get_subscriptions_info_by_topic
-        try:
-            readers = find(f"rr{service}Reply", no_mangle=True)
-        except Exception:  # rclpy's InvalidHandle: closed meanwhile
-            return None
+        readers = self._endpoints(self._node.get_subscriptions_info_by_topic, f"rr{service}Reply")
         nodes = {bytes(r.endpoint_gid)[:16]: (r.node_name, r.node_namespace) for r in readers}
         if client not in nodes:
             return None
@@ -238,11 +219,10 @@ class SerialisedNode:
 
     def participant(self, service: str) -> bytes:
         """Return the first bytes of our participant's id; empty before it offers `service`."""
-        find: Any = self._node.get_subscriptions_info_by_topic
-        with contextlib.suppress(Exception):  # rclpy's InvalidHandle: closed meanwhile
-            for reader in find(f"rq{service}Request", no_mangle=True):
-                if reader.node_name == self._node.get_name():
-                    return bytes(reader.endpoint_gid)[: farewell.PREFIX_BYTES]
+        requests, own = f"rq{service}Request", self._node.get_name()
+        for reader in self._endpoints(self._node.get_subscriptions_info_by_topic, requests):
+            if reader.node_name == own:
+                return bytes(reader.endpoint_gid)[: farewell.PREFIX_BYTES]
         return b""
 
     def callers(self, service: str) -> int:
@@ -262,8 +242,13 @@ class SerialisedNode:
 
     def _identifiers(self, find: Any, service: str) -> list[bytes]:
         """Return the identifiers of those who write, or read, the requests to a service."""
-        with contextlib.suppress(Exception):  # rclpy's InvalidHandle: closed meanwhile
-            return [bytes(one.endpoint_gid) for one in find(f"rq{service}Request", no_mangle=True)]
+        return [bytes(one.endpoint_gid) for one in self._endpoints(find, f"rq{service}Request")]
+
+    @staticmethod
+    def _endpoints(find: Any, topic: str) -> list[Any]:
+        """Return what discovery tells of a topic's writers, or readers; nothing once closed."""
+        with contextlib.suppress(Exception):  # rclpy's InvalidHandle
+            return list(find(topic, no_mangle=True))
         return []
 
     def services_of(self, name: str, namespace: str) -> list[str]:
@@ -275,14 +260,6 @@ class SerialisedNode:
             return self._node.get_service_names_and_types_by_node(name, namespace)
         except Exception:  # the node has gone since
             return []
-
-    def _ends(self, type_name: str) -> tuple[Any, transfer.Ends]:
-        """Return a service type, and how its bytes travel, which is found out once."""
-        service_type = load_service_type(type_name)
-        with self._create_lock:
-            if type_name not in self._chosen:
-                self._chosen[type_name] = transfer.choose(service_type, type_name)
-            return service_type, self._chosen[type_name]
 
     def _add(self, name: str, create: Callable[[], E]) -> E:
         """Create an entity, and have the take loop attend to it."""

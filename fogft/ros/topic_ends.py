@@ -1,17 +1,17 @@
 """A node's publishers and subscriptions: serialised messages of any type, never a Python one.
 
-Owns: quality of service of topics; that bytes are read once before they are published.
+Owns: quality of service of topics; that bytes are checked before they are published.
 Not here: the loop (`node`), which messages pass (`fogft.proxy`).
 """
 
 from __future__ import annotations
 
 import logging
-import threading
 from collections.abc import Callable
 from typing import Any
 
-from fogft.errors import RosError
+from fogft.errors import RosError, Unreadable
+from fogft.model.cdr import Shape
 from fogft.model.topic import Quality
 from fogft.ros.entities import BURST
 
@@ -31,35 +31,12 @@ def profile(quality: Quality) -> Any:
     )
 
 
-class Reader:
-    """Reads bytes as a message of a type, so that nothing else is published."""
-
-    def __init__(self, message_type: Any) -> None:
-        from fogft.ros.serialised import CMessage
-
-        self._lock = threading.Lock()
-        self._message = CMessage(message_type)
-
-    def check(self, payload: bytes) -> None:
-        """Raise `Unreadable` for bytes that are no such message."""
-        with self._lock:
-            if self._message.address:
-                self._message.read(payload)
-
-    def close(self) -> None:
-        """Free the message."""
-        with self._lock:
-            self._message.close()
-
-
 class Publisher:
     """A publisher of a node. Any thread."""
 
-    def __init__(
-        self, publisher: Any, reader: Reader, withdraw: Callable[[Publisher], None]
-    ) -> None:
+    def __init__(self, publisher: Any, shape: Shape, withdraw: Callable[[Publisher], None]) -> None:
         self._publisher = publisher
-        self._reader = reader
+        self._shape = shape
         self._withdraw = withdraw
         self._open = True
 
@@ -70,7 +47,9 @@ class Publisher:
             Unreadable: The bytes are no message of this type.
             RosError: ROS refused it.
         """
-        self._reader.check(payload)
+        fault = self._shape.fault(payload)
+        if fault:
+            raise Unreadable(f"{len(payload)} bytes are no message of its type: {fault}")
         try:
             if self._open:
                 self._publisher.publish(payload)
@@ -93,7 +72,6 @@ class Publisher:
     def destroy(self, node: Any) -> None:
         """Free everything. Take loop only, once."""
         self._open = False
-        self._reader.close()
         node.destroy_publisher(self._publisher)
 
 

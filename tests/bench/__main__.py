@@ -29,6 +29,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
         first,
         graph,
         hostile,
+        images,
         load,
         ordering,
         planning,
@@ -58,6 +59,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["simulation"] = simulation.simulation
     found["ordering"] = ordering.ordering
     found["graph"] = graph.graph
+    found["images"] = images.images
     found["bursts"] = graph.bursts
     found["first"] = first.first
     found["uplink"] = uplink.uplink

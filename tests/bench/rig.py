@@ -27,6 +27,7 @@ from fogft.model import membership as memberships
 from fogft.model.plain import to_plain
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
+from fogft.model.topic import TopicSpec
 from fogft.pool.credentials import authority
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
@@ -106,6 +107,7 @@ class Rig:
         rmw: How proxies, services and callers speak ROS.
         environ: More of the environment for every process.
         graph: Whether topics and an action pass as well.
+        topics: Other topics that pass.
         hostile: Slots of replicas that lie, as their file says (`tests.hostile.serve`).
         bare: Whether the same services are also to be had the barest way, in `bare_domain`.
     """
@@ -125,6 +127,7 @@ class Rig:
         rmw: str = "rclpy",
         environ: Mapping[str, str] = MappingProxyType({}),
         graph: bool = False,
+        topics: Sequence[TopicSpec] = (),
         hostile: Mapping[int, Path] = MappingProxyType({}),
         bare: bool = False,
     ) -> None:
@@ -139,7 +142,8 @@ class Rig:
         self._rmw = rmw
         self._environ = environ
         self._action = ACTION_SERVICES if graph else ()
-        self._topics = [to_plain(topic) for topic in TOPICS] if graph else []
+        self._graph = graph
+        self._topics = [to_plain(topic) for topic in (*(TOPICS if graph else ()), *topics)]
         self._stateful = stateful
         self._policy: dict[str, Any] = policy or {}
         self.robot_domain, self.bare_domain, *domains = free_domains(2 + 2 * replicas)
@@ -230,7 +234,7 @@ class Rig:
             "envs": {
                 SPEAKS: self._rmw,
                 **({STATEFUL: "1"} if self._stateful else {}),
-                **({GRAPH: "1"} if self._topics else {}),
+                **({GRAPH: "1"} if self._graph else {}),
             },
             "rmw": self._rmw,
             "topics": self._topics,

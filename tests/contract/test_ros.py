@@ -1,4 +1,4 @@
-"""One suite for every `RosNode`: in memory, over rcl, over rclpy's own messages, over Zenoh."""
+"""One suite for every `RosNode`: in memory, over rcl, over Zenoh."""
 
 from __future__ import annotations
 
@@ -87,30 +87,18 @@ def _zenoh(router: Router) -> World:
         "memory",
         "zenoh",
         pytest.param("rcl", marks=pytest.mark.ros),
-        pytest.param("converted", marks=pytest.mark.ros),
     ]
 )
-def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+def world(request: pytest.FixtureRequest) -> Iterator[World]:
     if request.param == "memory":
         made = _memory()
     elif request.param == "zenoh":
         made = _zenoh(request.getfixturevalue("rmw_router"))
     else:
-        if request.param == "converted":
-            _break_fast_path(monkeypatch)
         made = _rclpy(request.getfixturevalue("ros_domain"))
     yield made
     for node in made.nodes:
         node.close()
-
-
-def _break_fast_path(monkeypatch: pytest.MonkeyPatch) -> None:
-    from fogft.ros import serialised
-
-    def fail(_: Any) -> None:
-        raise RosError("broken for the test")
-
-    monkeypatch.setattr(serialised, "self_test", fail)
 
 
 def _response(number: int) -> bytes:

@@ -34,7 +34,12 @@ class End:
 
 class Service:
     handle = None
-    srv_name = "/s"
+    srv_name = service_name = "/s"
+
+
+class NoNodes:
+    def answers(self, service: str, client: bytes) -> bool:
+        return False
 
 
 def serving(waiting: list[Any], heard: list[Any], fails: bool = False) -> Server:
@@ -43,7 +48,8 @@ def serving(waiting: list[Any], heard: list[Any], fails: bool = False) -> Server
         if fails:
             raise ValueError("of the application")
 
-    return Server(Service(), End(waiting), on_request, lambda server: None, on_burst=heard.append)
+    ends = Service(), End(waiting), on_request, lambda server: None
+    return Server(*ends, on_burst=heard.append, probes=NoNodes())
 
 
 def numbered(count: int) -> list[tuple[bytes, bytes]]:

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fogft.errors import RosError
-from fogft.ros.pacing.client_probes import KEPT, NodeProbes, ServiceProbes
+from fogft.ros.pacing.client_probes import KEPT, NodeProbes
 from fogft.ros.port import ClientNode
 
 CLIENT = b"c" * 16
@@ -56,8 +56,8 @@ class Graph:
 
 def test_a_node_with_parameters_answers_probes():
     graph = Graph()
-    probes = ServiceProbes("/detect", NodeProbes(graph))
-    assert probes.answers(CLIENT) is True
+    probes = NodeProbes(graph)
+    assert probes.answers("/detect", CLIENT) is True
     answers = []
     for _ in range(3):
         probes.send(CLIENT, lambda: answers.append(1))
@@ -65,18 +65,18 @@ def test_a_node_with_parameters_answers_probes():
     for on_response in end.asked:
         on_response(b"")
     assert len(answers) == 3
-    assert probes.unique(CLIENT)
+    assert probes.unique("/detect", CLIENT)
     graph.nodes[CLIENT] = graph.nodes[CLIENT]._replace(unique=False)
-    assert not probes.unique(CLIENT)
-    assert not probes.unique(b"?" * 16)
+    assert not probes.unique("/detect", CLIENT)
+    assert not probes.unique("/detect", b"?" * 16)
 
 
 def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
     graph = Graph()
-    probes = ServiceProbes("/detect", NodeProbes(graph))
-    assert probes.answers(b"?" * 16) is None
+    probes = NodeProbes(graph)
+    assert probes.answers("/detect", b"?" * 16) is None
     graph.client = lambda name, type_name: _missing()
-    assert probes.answers(CLIENT) is None
+    assert probes.answers("/detect", CLIENT) is None
 
 
 def _missing() -> End:
@@ -88,16 +88,16 @@ def _missing() -> End:
 def test_a_node_without_parameters_answers_none():
     graph = Graph()
     graph.services = ["/left/arm/move"]
-    assert ServiceProbes("/detect", NodeProbes(graph)).answers(CLIENT) is False
+    assert NodeProbes(graph).answers("/detect", CLIENT) is False
     assert not graph.ends
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_probe_that_cannot_be_sent_is_not_answered(known: bool):
     graph = Graph()
-    probes = ServiceProbes("/detect", NodeProbes(graph))
+    probes = NodeProbes(graph)
     if known:
-        assert probes.answers(CLIENT)
+        assert probes.answers("/detect", CLIENT)
         graph.ends["/left/arm/get_parameter_types"].closed = True
     answered = threading.Event()
     probes.send(CLIENT, answered.set)
@@ -106,11 +106,10 @@ def test_a_probe_that_cannot_be_sent_is_not_answered(known: bool):
 
 def test_of_many_nodes_the_first_are_let_go():
     graph = Graph()
-    nodes = NodeProbes(graph)
-    probes = ServiceProbes("/detect", nodes)
+    probes = NodeProbes(graph)
     for n in range(KEPT + 10):
         client = n.to_bytes(16, "big")
         graph.nodes[client] = ClientNode(f"n{n}", "/", unique=True)
         graph.services = [f"/n{n}/get_parameter_types"]
-        assert probes.answers(client)
+        assert probes.answers("/detect", client)
     assert sum(end.closed for end in graph.ends.values()) == 10

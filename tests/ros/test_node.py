@@ -162,27 +162,6 @@ def test_services_come_and_go_under_traffic(
     assert errors == []
 
 
-def test_a_fallback_is_announced_and_still_works(
-    make_node: Callable[[int], Any],
-    ros_domain: int,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    """Where the C library cannot be used, rclpy's messages do the work, with a warning."""
-    from fogft.ros import rcl
-
-    def missing() -> None:
-        raise RosError("the C library of ROS 2 cannot be used: gone")
-
-    monkeypatch.setattr(rcl, "load", missing)
-    _, client = echo_pair(make_node, ros_domain)
-    answers: list[bytes] = []
-    client.call(TRUE, answers.append)
-    wait_for(lambda: answers, "the response")
-    assert answers[0][4] == 1
-    assert "large messages will be slow" in caplog.text
-
-
 CHILD = """
 import os, signal, sys, threading
 from fogft.ros.node import SerialisedNode

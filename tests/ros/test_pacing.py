@@ -29,6 +29,16 @@ from fogft.ros.port import NotFoundYet
 from tests.nightly import by_day
 
 
+class _NoNodes:
+    """Nodes that answer no probes."""
+
+    def answers(self, service, client):
+        return False
+
+
+UNKNOWN = _NoNodes()
+
+
 class Probed:
     """An ordinary client whose node answers probes: a turn takes one response, answers one probe.
 
@@ -259,7 +269,7 @@ def handle(client: int, number: int) -> bytes:
 def test_every_response_is_sent_once_and_in_order():
     sent = Sent()
     sent.expected = 99
-    pacer = Pacer(sent)
+    pacer = Pacer(sent, UNKNOWN, "/s")
     for n in range(100):
         pacer.requested(handle(1, n))
     for n in range(100):
@@ -273,7 +283,7 @@ def test_every_response_is_sent_once_and_in_order():
 def test_what_waits_for_one_client_is_bounded(size, most):
     """Beyond that it is sent at once: nothing is kept without end, and nothing is dropped."""
     sent = []
-    pacer = Pacer(lambda handle, payload: sent.append(handle), clock=lambda: 0.0)
+    pacer = Pacer(lambda handle, payload: sent.append(handle), UNKNOWN, "/s", clock=lambda: 0.0)
     payload = bytes(size)
     asked = [handle(0, number) for number in range(WINDOW + most + 100)]
     for one in asked:
@@ -287,7 +297,7 @@ def test_what_waits_for_one_client_is_bounded(size, most):
 
 def test_one_clients_burst_does_not_hold_up_another():
     sent = Sent()
-    pacer = Pacer(sent, clock=lambda: 0.0)
+    pacer = Pacer(sent, UNKNOWN, "/s", clock=lambda: 0.0)
     for n in range(100):
         pacer.requested(handle(1, n))
         pacer.respond(handle(1, n), b"")
@@ -303,18 +313,18 @@ def test_a_node_that_was_started_again_releases_nothing_of_its_predecessor(uniqu
     now, sent, asked = [0.0], [], threading.Event()
 
     class Node:
-        def answers(self, client):
+        def answers(self, service, client):
             return True
 
         def send(self, client, on_answer):
             self.answered = on_answer
             asked.set()
 
-        def unique(self, client):
+        def unique(self, service, client):
             return unique
 
     node = Node()
-    pacer = Pacer(lambda handle, payload: sent.append(handle), node, clock=lambda: now[0])
+    pacer = Pacer(lambda handle, payload: sent.append(handle), node, "/s", clock=lambda: now[0])
     for number in range(30):
         pacer.requested(handle(1, number), together=True)
     for number in range(30):
@@ -355,7 +365,7 @@ def test_a_response_to_a_client_that_is_not_found_yet_is_sent_again():
         if payload == b"early":
             found.set()
 
-    pacer = Pacer(send)
+    pacer = Pacer(send, UNKNOWN, "/s")
     pacer.respond(bytes(24), b"early")
     pacer.respond(bytes(range(24)), b"other")
     assert found.wait(30)
@@ -374,7 +384,7 @@ def test_a_client_that_is_never_found_is_given_up(caplog):
             refused.set()
         raise NotFoundYet("client will not receive response")
 
-    pacer = Pacer(send, clock=lambda: now + time.monotonic())
+    pacer = Pacer(send, UNKNOWN, "/s", clock=lambda: now + time.monotonic())
     pacer.respond(bytes(24), b"1")
     pacer.respond(bytes(24), b"2")
     assert refused.wait(30)
@@ -396,7 +406,7 @@ def test_what_waits_for_a_client_to_be_found_does_not_come_all_at_once():
         if len(sent) == 64:
             all_sent.set()
 
-    pacer = Pacer(send)
+    pacer = Pacer(send, UNKNOWN, "/s")
     for n in range(64):
         pacer.requested(handle(1, n))
     for n in range(64):

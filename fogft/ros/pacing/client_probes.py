@@ -9,9 +9,10 @@ Owns: whose node a client is, and the probes on the way. Not here: what they sho
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Protocol
 
 from fogft.errors import RosError
 from fogft.ros.port import ClientNode, RosClient
@@ -35,64 +36,49 @@ class Graph(Protocol):
 
 
 class NodeProbes:
-    """Probes of the nodes in one ROS domain, for all services. Any thread."""
+    """Probes of the nodes in one ROS domain, for the clients of all services. Any thread."""
 
     def __init__(self, graph: Graph) -> None:
-        self.graph = graph
-        self._ends: dict[str, RosClient] = {}
+        self._graph = graph
+        self._by_name: dict[str, RosClient] = {}
+        self._by_client: dict[bytes, RosClient] = {}
         self._lock = threading.Lock()
 
-    def end(self, service: str, client: bytes) -> RosClient | bool | None:
-        """Return the way to a client's node; False for none, None while it is not known."""
-        found = self.graph.node_of(service, client)
+    def answers(self, service: str, client: bytes) -> bool | None:
+        """Whether the node of a service's client answers; None while discovery does not tell."""
+        found = self._graph.node_of(service, client)
         if found is None:
             return None
         name, namespace, _ = found
         asked = f"{namespace.rstrip('/')}/{name}/{_SERVICE}"
-        if asked not in self.graph.services_of(name, namespace):
+        if asked not in self._graph.services_of(name, namespace):
             return False
         with self._lock:
-            end = self._ends.get(asked)
+            end = self._by_name.get(asked)
             if end is None:
-                if len(self._ends) >= KEPT:
-                    self._ends.pop(next(iter(self._ends))).close()
-                end = self._ends[asked] = self.graph.client(asked, _TYPE)
-        return end if end.available() else None
-
-
-class ServiceProbes:
-    """Probes of one service's clients: how it learns that an executor has had a turn."""
-
-    def __init__(self, service: str, nodes: NodeProbes) -> None:
-        self._service = service
-        self._nodes = nodes
-        self._ends: dict[bytes, Any] = {}
-
-    def answers(self, client: bytes) -> bool | None:
-        """Whether the client's node answers probes; None while discovery does not tell."""
-        try:
-            end = self._nodes.end(self._service, client)
-        except RosError:
-            return False
-        if isinstance(end, bool) or end is None:
-            return end
-        if len(self._ends) >= 4 * KEPT:  # long gone: a service remembers fewer clients
-            self._ends.pop(next(iter(self._ends)))
-        self._ends[client] = end
+                if len(self._by_name) >= KEPT:
+                    self._by_name.pop(next(iter(self._by_name))).close()
+                try:
+                    end = self._by_name[asked] = self._graph.client(asked, _TYPE)
+                except RosError:
+                    return False
+            if not end.available():
+                return None
+            if len(self._by_client) >= 4 * KEPT:  # long gone
+                self._by_client.pop(next(iter(self._by_client)))
+            self._by_client[client] = end
         return True
 
-    def unique(self, client: bytes) -> bool:
+    def unique(self, service: str, client: bytes) -> bool:
         """Whether only the client's own node can have answered.
 
         A node that was killed and started again answers what its predecessor was asked, which
         discovery lists until its lease ends.
         """
-        found = self._nodes.graph.node_of(self._service, client)
+        found = self._graph.node_of(service, client)
         return found is not None and found.unique
 
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
         """Send a probe; `on_answer` comes from the take loop, or never. It may not be sent."""
-        try:
-            self._ends[client].call(_OF_NO_PARAMETER, lambda _: on_answer())
-        except (KeyError, RosError):
-            return
+        with contextlib.suppress(KeyError, RosError):
+            self._by_client[client].call(_OF_NO_PARAMETER, lambda _: on_answer())

@@ -21,7 +21,7 @@ from functools import partial
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.ros.pacing.client_probes import ServiceProbes
+from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.pacing.pace import EVERY_S, ClientPace, Pace, Probing
 from fogft.ros.port import NotFoundYet
 
@@ -33,8 +33,8 @@ _GUID_BYTES = 16
 
 
 def _client(handle: Any) -> bytes:
-    """Return who asked. rclpy's own handles do not tell: those clients share a pace."""
-    return handle[:_GUID_BYTES] if isinstance(handle, bytes) else b""
+    """Return who asked, of the header of a request in DDS."""
+    return bytes(handle[:_GUID_BYTES])
 
 
 class Pacer:
@@ -42,22 +42,24 @@ class Pacer:
 
     Args:
         send: Sends a response; may raise RosError.
-        probes: Asks the clients' nodes; None where none answers.
+        probes: Asks the clients' nodes.
+        service: Its name, for them.
         client_of: Returns who asked, of a request's handle.
     """
 
     def __init__(
         self,
         send: Callable[[Any, bytes], None],
-        probes: ServiceProbes | None = None,
+        probes: NodeProbes,
+        service: str,
+        *,
         clock: Callable[[], float] = time.monotonic,
         client_of: Callable[[Any], bytes] = _client,
     ) -> None:
         self._client_of = client_of
         self._send = send
-        self._probe_answers = probes.answers if probes is not None else lambda client: False
-        self._send_probe = probes.send if probes is not None else lambda client, answered: None
-        self._answered_itself = probes.unique if probes is not None else lambda client: True
+        self._probes = probes
+        self._service = service
         self._clock = clock
         self._pace = Pace()
         self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
@@ -135,7 +137,7 @@ class Pacer:
                     log.warning("response_refused reason=%r", error.message)
             for id, count in probed:
                 for _ in range(count):
-                    self._send_probe(id, partial(self._answered, id))
+                    self._probes.send(id, partial(self._answered, id))
             for id in asked:
                 self._ask(id)
 
@@ -171,7 +173,7 @@ class Pacer:
 
     def _ask(self, id: bytes) -> None:
         """Find out whether a client's node answers probes."""
-        answers = self._probe_answers(id)
+        answers = self._probes.answers(self._service, id)
         now = self._clock()
         with self._wake:
             until = self._asked.get(id, now)
@@ -184,7 +186,7 @@ class Pacer:
         now = self._clock()
         with self._wake:
             silent = self._pace.client(id, now).silent(now)
-        if silent and not self._answered_itself(id):
+        if silent and not self._probes.unique(self._service, id):
             return  # or all that its killed predecessor left open would push out its responses
         with self._wake:
             self._pace.client(id, now).answered_probe(now)
