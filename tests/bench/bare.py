@@ -3,27 +3,30 @@
     python -m tests.bench.bare replica FOLDER DOMAIN PORT
     python -m tests.bench.bare robot FOLDER DOMAIN PORT...
 
-Serialised services at both ends, a Zenoh session and a sender thread a replica, a query for each
-request, over mutual TLS; the first reply is the response. No ids, deadlines, probes, windows,
-membership or counts: a robot that freezes, or a replica that never answers, breaks it. It has
-services like those of the proxies that it is compared with, on the same machine and in the same
-run, so that the comparison holds on any machine.
+Serialised services at both ends and a Zenoh session a replica, over mutual TLS. A request is one
+published message, sent by the thread that took it; its answer is a reply to one query that stays
+open; the first is the response. Zenoh's threads are few and keep their Python thread states, as
+the proxies' do. No deadlines, probes, windows, membership or counts: a robot that freezes, or a
+replica that never answers, breaks it. It has services like those of the proxies that it is
+compared with, on the same machine and in the same run, so that the comparison holds on any machine.
 """
 
 from __future__ import annotations
 
 import ctypes
+import itertools
 import signal
 import sys
 import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import zenoh
 from zenoh import handlers
 
+from fogft.link.zenoh import runtime, threads
 from fogft.model.choices import Speaks
 from fogft.proxy import middleware
 from fogft.ros import memory_tuning
@@ -31,70 +34,82 @@ from tests.bench.floor import configuration
 from tests.bench.service import FLAG, MAP
 
 KEYS = {FLAG: "bare/flag", MAP: "bare/map"}
-_LIMIT_S = 10.0
+_ANSWERS = "bare/answers"
+_LIMIT_S = 1e6
+_BLOCK = zenoh.CongestionControl.BLOCK
 
 
 def serve(folder: Path, domain: int, port: int) -> None:
-    """Hand each query to the local service, and its response back."""
+    """Hand each message to the local service, and its response back."""
     node = middleware.join(Speaks.RCLPY, "bench_bare_replica", domain).node
     clients = {key: node.client(*service) for service, key in KEYS.items()}
     session = zenoh.open(configuration(folder, "replica", listen=[f"tls/127.0.0.1:{port}"]))
-    kept = []
+    queries: list[Any] = []
+    kept: list[Any] = [session.declare_queryable(_ANSWERS, _on_zenoh(queries.append))]
     for key, client in clients.items():
 
-        def pass_on(query: Any, client: Any = client) -> None:
+        def pass_on(sample: Any, client: Any = client) -> None:
+            number, query = sample.attachment, queries[0]
+
             def answer(payload: bytes) -> None:
-                query.reply(query.key_expr, payload)
-                query.drop()
+                query.reply(_ANSWERS, payload, attachment=number)
 
-            client.call(query.payload.to_bytes(), answer)
+            client.call(sample.payload.to_bytes(), answer)
 
-        kept.append(session.declare_queryable(key, handlers.Callback(pass_on, indirect=False)))
+        kept.append(session.declare_subscriber(key, _on_zenoh(pass_on)))
     _stay()
-
-
-class Link:
-    """One replica: a session, and the thread that asks on it."""
-
-    def __init__(self, folder: Path, port: int) -> None:
-        self._session = zenoh.open(
-            configuration(folder, "robot", connect=[f"tls/127.0.0.1:{port}"])
-        )
-        self.asked: SimpleQueue[tuple[str, bytes, Any]] = SimpleQueue()
-        threading.Thread(target=self._run, daemon=True).start()
-
-    def _run(self) -> None:
-        while True:
-            key, payload, answered = self.asked.get()
-            self._session.get(
-                key,
-                handlers.Callback(answered, None, indirect=False),
-                payload=payload,
-                timeout=_LIMIT_S,
-                target=zenoh.QueryTarget.ALL,
-                consolidation=zenoh.ConsolidationMode.NONE,
-            )
 
 
 def ask(folder: Path, domain: int, ports: Sequence[int]) -> None:
     """Offer the services; ask every replica, and respond what comes first."""
     node = middleware.join(Speaks.RCLPY, "bench_bare_robot", domain).node
-    links = [Link(folder, port) for port in ports]
+    waiting: dict[bytes, tuple[Any, Any]] = {}
+    numbers = itertools.count()
+
+    def answered(reply: Any) -> None:
+        end, handle = waiting.pop(reply.ok.attachment.to_bytes(), (None, None))
+        if end is not None:
+            end.respond(handle, reply.ok.payload.to_bytes())
+
+    sessions = [
+        zenoh.open(configuration(folder, "robot", connect=[f"tls/127.0.0.1:{port}"]))
+        for port in ports
+    ]
+    publishers = {
+        key: [one.declare_publisher(key, congestion_control=_BLOCK) for one in sessions]
+        for key in KEYS.values()
+    }
+    while not all(one.matching_status.matching for many in publishers.values() for one in many):
+        time.sleep(0.01)
+    for session in sessions:
+        session.get(
+            _ANSWERS,
+            _on_zenoh(answered),
+            timeout=_LIMIT_S,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
     for (name, type_name), key in KEYS.items():
         ends: list[Any] = []
 
         def request(payload: bytes, handle: Any, ends: list[Any] = ends, key: str = key) -> None:
-            first = threading.Lock()
-
-            def answered(reply: Any) -> None:
-                if reply.ok is not None and first.acquire(blocking=False):
-                    ends[0].respond(handle, reply.ok.payload.to_bytes())
-
-            for link in links:
-                link.asked.put((key, payload, answered))
+            number = next(numbers).to_bytes(8, "big")
+            waiting[number] = ends[0], handle
+            for publisher in publishers[key]:
+                publisher.put(payload, attachment=number)
 
         ends.append(node.serve(name, type_name, request))
     _stay()
+
+
+def _on_zenoh(call: Any) -> Any:
+    """Return what Zenoh's own thread calls."""
+
+    def called(one: Any) -> None:
+        threads.note()
+        call(one)
+
+    return handlers.Callback(called, indirect=False)
 
 
 def _stay() -> None:
@@ -106,6 +121,7 @@ def main() -> None:
     """Be one end, until the bench ends."""
     ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)
     middleware.prepare(Speaks.RCLPY)
+    runtime.prepare()
     memory_tuning.tune()
     side, folder, domain, *ports = sys.argv[1:]
     if side == "replica":

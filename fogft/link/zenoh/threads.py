@@ -1,7 +1,8 @@
 """Zenoh's own threads, and ours that are inside Zenoh when the process ends.
 
 Zenoh's threads, which call our callbacks, must not send what might wait for room: only they can
-make room. They are few, and live as long as the process.
+make room. They are few, and live as long as the process. So each keeps its Python thread state:
+else every callback makes one, and destroys it.
 
 A daemon thread that returns from Zenoh while the interpreter shuts down aborts the process
 (SIGABRT: the interpreter ends the thread by unwinding it, which Rust does not allow). So what
@@ -12,6 +13,7 @@ seconds.
 from __future__ import annotations
 
 import atexit
+import ctypes
 import logging
 import threading
 import time
@@ -26,8 +28,11 @@ _idents: set[int] = set()
 
 
 def note() -> None:
-    """Note that this thread is Zenoh's. Called by every callback that may lead to a reply."""
-    _idents.add(threading.get_ident())
+    """Note that this thread is Zenoh's. Called by each callback of requests and answers."""
+    ident = threading.get_ident()
+    if ident not in _idents:
+        _idents.add(ident)
+        ctypes.pythonapi.PyGILState_Ensure()  # never released
 
 
 def is_this() -> bool:
