@@ -53,29 +53,9 @@ class Verb:
         return main.run([type(self).__name__.lower(), *args.words])
 
 
-class Up(Verb):
-    """Start a pool, or apply a changed pool file to a running pool."""
+def __getattr__(name: str) -> type[Verb]:
+    """Make the verb that an entry point names; ``Up`` is ``fogft up``, with its help."""
+    from fogft.cli.commands import Commands
 
-
-class Down(Verb):
-    """End a pool and everything it started."""
-
-
-class Status(Verb):
-    """Show a pool's replicas and services."""
-
-
-class Scale(Verb):
-    """Ask for more or fewer replicas."""
-
-
-class Plan(Verb):
-    """Explain where replicas would go, and at what price."""
-
-
-class Logs(Verb):
-    """Show the logs of the manager, the client proxy and the replicas."""
-
-
-class Doctor(Verb):
-    """Check this machine, ROS 2 and the pools here."""
+    described = Commands().commands[name.lower()].help
+    return type(name, (Verb,), {"__doc__": described})

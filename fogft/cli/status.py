@@ -7,6 +7,7 @@ import os
 import re
 import sys
 import time
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -20,8 +21,6 @@ from fogft.cli.status_text import age
 from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from fogft.pool.commands.status import Seen
     from fogft.pool.folder.paths import PoolPaths
 
@@ -143,7 +142,6 @@ def logs(
 
     Each line starts with the name of its log: `manager`, `proxy` or `slot.generation`.
     """
-    from fogft.cli.status import Tail, in_order
     from fogft.pool.commands.logs import find
 
     slot = int(of) if of is not None and of.isdecimal() else None
@@ -187,14 +185,17 @@ class Tail:
 
     def __init__(self, path: Path, last: int | None) -> None:
         self._path = path
+        self._last = last
         self._rest = b""
         self._inode = -1
         self._position = 0
-        if last is not None:
-            self._position, self._inode = _start_of_last(path, last)
 
-    def new_lines(self) -> Iterator[str]:
-        """Yield the whole lines that were added since the last call."""
+    def new_lines(self) -> Iterable[str]:
+        """Return the whole lines that were added since the last call."""
+        last, self._last = self._last, None  # a log that appears later is shown whole
+        return self._added() if last is None else deque(self._added(), maxlen=last)
+
+    def _added(self) -> Iterator[str]:
         try:
             file = open(self._path, "rb")  # noqa: SIM115 - closed below, in every case
         except OSError:
@@ -209,21 +210,3 @@ class Tail:
                 *whole, self._rest = (self._rest + chunk).split(b"\n")
                 for line in whole:
                     yield line.decode(errors="replace").rstrip("\r")
-
-
-def _start_of_last(path: Path, count: int) -> tuple[int, int]:
-    try:
-        with open(path, "rb") as file:
-            stat = os.fstat(file.fileno())
-            position, newlines = stat.st_size, 0
-            while position > 0 and newlines <= count:
-                step = min(_CHUNK_BYTES, position)
-                position -= step
-                file.seek(position)
-                newlines += file.read(step).count(b"\n")
-            file.seek(position)
-            for _ in range(newlines - count):
-                file.readline()
-            return file.tell(), stat.st_ino
-    except OSError:
-        return 0, -1

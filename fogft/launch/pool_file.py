@@ -1,4 +1,4 @@
-"""Turn a launch file's nodes and pool into a pool file. Pure.
+"""Turn a launch file's nodes and pool into a pool file.
 
 Owns: the `run` command of a replica, and how a base file and a launch file merge.
 Not here: substitutions and conditions (`actions`), what a pool file may say (`fogft.poolfile`).
@@ -11,37 +11,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from fogft import template_files
 from fogft.errors import FogftError
 
 FILE_LIMIT_BYTES = 256 << 10
 _END = "END_OF_PARAMETERS"
-
-_FIND = """\
-find_executable() {  # prints the path of an executable of a ROS package
-  local prefix
-  IFS=: read -ra prefixes <<<"${AMENT_PREFIX_PATH:-}"
-  for prefix in "${prefixes[@]}"; do
-    if [ -x "$prefix/lib/$1/$2" ]; then echo "$prefix/lib/$1/$2"; return; fi
-  done
-  echo "error: package \\`$1\\` has no executable \\`$2\\` here (AMENT_PREFIX_PATH is \\
-${AMENT_PREFIX_PATH:-empty}); build or install it in \\`setup\\`" >&2
-  return 127
-}
-"""
-
-# Not `wait -n`: bash forgets a child that ended before it was called.
-_WATCH = """\
-while :; do
-  for node in "${nodes[@]}"; do
-    if ! kill -0 "$node" 2>/dev/null; then
-      wait "$node"; status=$?
-      kill "${nodes[@]}" 2>/dev/null
-      wait
-      exit $status
-    fi
-  done
-  sleep 0.5
-done"""
 
 
 @dataclass(frozen=True)
@@ -75,7 +49,7 @@ def run_text(nodes: Sequence[NodeCommand]) -> str:
         raise FogftError("a fog pool contains no cloud node", "move a node into it as a cloud node")
     lines: list[str] = []
     if any(node.package for node in nodes):
-        lines.append(_FIND)
+        lines.append(template_files.read_text("find_executable.sh"))
     names: dict[str, str] = {}
     for node in nodes:
         for path, content in node.files.items():
@@ -91,8 +65,7 @@ def run_text(nodes: Sequence[NodeCommand]) -> str:
     if len(commands) == 1:
         return "\n".join([*lines, f"exec {commands[0]}"]) + "\n"
     lines += [f"{command} & nodes[{index}]=$!" for index, command in enumerate(commands)]
-    lines.append(_WATCH)
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, template_files.read_text("watch_nodes.sh")])
 
 
 def _command(node: NodeCommand, index: int, names: Mapping[str, str]) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
+from graphlib import CycleError, TopologicalSorter
 
 from fogft.model.credentials import NAME_PATTERN, Holder, Role
 from fogft.model.keys import Listed, Maps, Text, key, only
@@ -139,21 +140,8 @@ def trouble(topology: Topology) -> str:
 
 def find_loop(through: Mapping[str, Iterable[str]]) -> list[str]:
     """Return the names along a loop, the first one again at the end; none where there is none."""
-    done: set[str] = set()
-    for start in through:
-        path: list[str] = []
-        stack = [(start, iter(through[start]))]
-        while stack:
-            name, rest = stack[-1]
-            if len(path) < len(stack):
-                path.append(name)
-            following = next((n for n in rest if n not in done), None)
-            if following is None:
-                done.add(name)
-                stack.pop()
-                path.pop()
-            elif following in path:
-                return [*path[path.index(following) :], following]
-            else:
-                stack.append((following, iter(through.get(following, ()))))
+    try:
+        TopologicalSorter(through).prepare()
+    except CycleError as error:
+        return list(reversed(error.args[1]))
     return []
