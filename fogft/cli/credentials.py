@@ -64,10 +64,8 @@ def issue(
     """
     from fogft.model.credentials import Role
     from fogft.pool.commands import joining
-    from fogft.pool.credentials.bundle import new_passphrase
 
-    own = None if passphrase_file is None else _read_passphrase(passphrase_file)
-    passphrase = own or new_passphrase()
+    passphrase, is_new = _chosen_passphrase(passphrase_file)
     store = composition.store_of(pool)
     file = out or Path(f"{name}.join")
     if file.exists():
@@ -77,7 +75,7 @@ def issue(
     )
     disk.write_whole(file, data)
     output.data(str(file))
-    if own is None:
+    if is_new:
         output.say(f"passphrase: {passphrase}")
     output.done(f"{holder.role.value} `{holder.short}` may join for {hours:g} hours")
     if not store.spec().rendezvous and holder.role is not Role.RENDEZVOUS:
@@ -225,11 +223,9 @@ def export(
     machine's client proxy continue to answer.
     """
     from fogft.pool.commands import moving
-    from fogft.pool.credentials.bundle import new_passphrase
     from fogft.pool.folder.paths import home
 
-    own = None if passphrase_file is None else _read_passphrase(passphrase_file)
-    passphrase = own or new_passphrase()
+    passphrase, is_new = _chosen_passphrase(passphrase_file)
     store = composition.store_of(pool)
     identity = moving.export(
         *(store, home(), file, passphrase, time.time()),
@@ -237,7 +233,7 @@ def export(
         told=lambda what: output.say(f"ended {what}"),
     )
     output.data(str(file))
-    if own is None:
+    if is_new:
         output.say(f"passphrase: {passphrase}")
     output.done(f"`{pool}` is exported; this machine no longer manages it")
     if identity.cloud != composition.LOCAL:
@@ -292,6 +288,13 @@ def _role(text: str) -> Role:
     raise CredentialError(
         f"there is no role `{text}`", "roles: " + ", ".join(f"`{role.value}`" for role in allowed)
     )
+
+
+def _chosen_passphrase(file: Path | None) -> tuple[str, bool]:
+    """Return the passphrase in a file, else a new one; and whether it is new."""
+    from fogft.pool.credentials.bundle import new_passphrase
+
+    return (new_passphrase(), True) if file is None else (_read_passphrase(file), False)
 
 
 def _read_passphrase(file: Path | None) -> str:

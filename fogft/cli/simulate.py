@@ -11,6 +11,7 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import AsJson, Cloud, Plot
+from fogft.cli.status_text import age
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -124,7 +125,7 @@ def _cells(row: Row) -> list[str | Text]:
         f"{cost.mean * 730:.0f}",
         f"{row.estimate('launches_per_day').mean:.1f}",
         f"{row.estimate('preemptions_per_day').mean:.1f}",
-        duration(row.longest_outage_s),
+        age(row.longest_outage_s) if row.longest_outage_s else "none",
     ]
 
 
@@ -135,13 +136,3 @@ def percent(share: float) -> str:
         if share >= 1 or float(shown) < 100:
             return f"{shown} %"
     return "99.99999 %"
-
-
-def duration(seconds: float) -> str:
-    """Return a duration in its largest fitting unit."""
-    if seconds == 0:
-        return "none"
-    for unit, size in (("d", 86_400), ("h", 3600), ("min", 60)):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}"
-    return f"{seconds:.0f} s"

@@ -65,8 +65,7 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
     """Want `change` more replicas (fewer when negative).
 
     Raises:
-        FogftError: Fewer than one, or more than 16, would be wanted, or fewer than a quorum,
-            or the number follows from an availability target.
+        FogftError: So many cannot be had, or the number follows from an availability target.
     """
     if spec.availability is not None:
         raise FogftError(
@@ -74,22 +73,15 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
             "change `fogft.availability` or `fogft.replicas` in the pool file and run `fogft up`",
         )
     wanted = intent.wanted(spec) + change
-    if wanted < 1:
+    least = max((1, *(service.quorum for service in spec.services)))
+    if not least <= wanted <= MAX_REPLICAS:
+        limit = f"minimum is {least}" if wanted < least else f"maximum is {MAX_REPLICAS}"
         raise FogftError(
-            f"cannot scale `{spec.name}` to {wanted} replicas: the minimum is 1",
-            "`fogft down` ends a pool",
+            f"cannot scale `{spec.name}` to {wanted} replicas: the {limit}",
+            "`fogft down` ends a pool"
+            if least == 1
+            else "a service has that `quorum`: change it in the pool file and run `fogft up`",
         )
-    if wanted > MAX_REPLICAS:
-        raise FogftError(
-            f"cannot scale `{spec.name}` to {wanted} replicas: the maximum is {MAX_REPLICAS}"
-        )
-    for service in spec.services:
-        if service.quorum > wanted:
-            raise FogftError(
-                f"cannot scale `{spec.name}` to {wanted} replicas: `{service.name}` has a quorum "
-                f"of {service.quorum}, and no answer could win",
-                "change `quorum` in the pool file and run `fogft up`",
-            )
     if wanted == spec.replicas:
         return replace(intent, target=None, scaled_from=None)
     return replace(intent, target=wanted, scaled_from=spec.replicas)

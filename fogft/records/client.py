@@ -202,10 +202,7 @@ class RendezvousClient:
 
     def _say(self, kind: RecordKind, subject: str, own: _Own) -> None:
         self._own[kind, subject] = own
-        try:
-            self._assert_own(kind, subject, own)
-        except (ValueError, StateError) as error:
-            log.error("record_not_published kind=%s reason=%r", kind.value, str(error))
+        self._look_after_own()
 
     def _assert_own(self, kind: RecordKind, subject: str, own: _Own) -> None:
         """See that what stands for us is what we say now, signed by our present certificate."""
@@ -248,7 +245,7 @@ class RendezvousClient:
         for (kind, subject), own in list(self._own.items()):
             try:
                 self._assert_own(kind, subject, own)
-            except ValueError as error:
+            except (ValueError, StateError) as error:
                 log.error("record_not_published kind=%s reason=%r", kind.value, str(error))
 
     # -- what changed --------------------------------------------------------------------------

@@ -77,20 +77,16 @@ class RendezvousServer:
         host, _, port = self._listen.rpartition(":")
         try:
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            bound = socket.socket(family, socket.SOCK_STREAM)
-            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            bound.bind((host.strip("[]"), int(port)))
-            bound.listen(128)
-            bound.setblocking(False)
+            address = host.strip("[]"), int(port)
+            self._socket = socket.create_server(address, family=family, backlog=128)
+            self._socket.setblocking(False)
         except (OSError, ValueError, OverflowError) as error:
             words = getattr(error, "strerror", None) or str(error)
             raise WireError(
                 f"cannot listen at `{self._listen}`: {words}",
                 "give `host:port` with a free port, for instance `0.0.0.0:7450`",
             ) from error
-        self._socket = bound
-        bound_port = bound.getsockname()[1]
-        self._endpoint = f"{host}:{bound_port}"
+        self._endpoint = f"{host}:{self._socket.getsockname()[1]}"
 
     async def serve(self) -> None:
         """Accept callers until cancelled."""

@@ -91,7 +91,7 @@ def test_a_check_that_breaks_does_not_hide_the_others(tmp_path):
     def breaks(_: Situation):
         raise RuntimeError("oh")
 
-    found = list(finding.run([breaks, machine.python], situation(tmp_path)))
+    found = list(finding.run([breaks, machine.clock], situation(tmp_path)))
     assert [f.verdict for f in found] == [Verdict.FAIL, Verdict.OK]
     assert "RuntimeError: oh" in found[0].text
 

@@ -7,7 +7,7 @@ import json
 import pytest
 
 from fogft.cli import main
-from fogft.cli.simulate import duration, percent
+from fogft.cli.simulate import percent
 from tests.needs import needs
 
 POOL = """\
@@ -131,11 +131,3 @@ def test_a_trace_of_another_region_is_told(file, traces, capsys):
 )
 def test_a_share_is_never_rounded_up_to_all(share, text):
     assert percent(share) == text
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0, "none"), (59, "59 s"), (150, "2.5 min"), (9000, "2.5 h"), (200_000, "2.3 d")],
-)
-def test_a_duration_stands_in_its_largest_fitting_unit(seconds, text):
-    assert duration(seconds) == text
