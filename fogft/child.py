@@ -31,11 +31,7 @@ def detached(
     folder: Path | None = None,
     environ: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes]:
-    """Start a process in a session of its own, its output appended to a log (0600).
-
-    Raises:
-        OSError: It cannot be started, or the log not be written.
-    """
+    """Start a process in a session of its own, its output appended to a log (0600)."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
     try:
         return subprocess.Popen(

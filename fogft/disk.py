@@ -68,11 +68,7 @@ def to_json(value: Any) -> str:
 
 
 def read_json(path: Path) -> Any:
-    """Return what a JSON file holds, or None where there is no file.
-
-    Raises:
-        StateError: It cannot be read or is not JSON.
-    """
+    """Return what a JSON file holds, or None where there is no file."""
     try:
         text = path.read_text()
     except FileNotFoundError:

@@ -28,7 +28,6 @@ class SpecError(FogftError):
 
     Attributes:
         key: The key that it is about, such as ``fogft.replicas``; empty where it is about none.
-        what: What is wrong with it.
         line: Where, from 1; 0 where it is about no line.
     """
 

@@ -8,11 +8,7 @@ from fogft.errors import FogftError
 
 
 def folder() -> Path:
-    """Return the folder of templates: inside the installed package, or of this checkout.
-
-    Raises:
-        FogftError: It is nowhere.
-    """
+    """Return the folder of templates: inside the installed package, or of this checkout."""
     package = Path(__file__).resolve().parent
     for candidate in (package / "templates", package.parent / "templates"):
         if (candidate / "echo" / "pool.yaml").is_file():
@@ -24,11 +20,7 @@ def folder() -> Path:
 
 
 def read_text(name: str) -> str:
-    """Return a template of the templates' folder as it stands there.
-
-    Raises:
-        FogftError: There is no such template, or it cannot be read.
-    """
+    """Return a template of the templates' folder as it stands there."""
     path = folder() / name
     try:
         return path.read_text(encoding="utf-8")

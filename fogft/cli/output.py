@@ -94,11 +94,7 @@ def error(message: str, hint_text: str = "") -> None:
 
 
 def confirm(question: str) -> bool:
-    """Ask a yes-or-no question on the terminal; anything but yes is no.
-
-    Raises:
-        FogftError: There is nobody to ask.
-    """
+    """Ask a yes-or-no question on the terminal; anything but yes is no."""
     if not is_terminal(sys.stdin):
         raise FogftError(
             "cannot ask for confirmation: there is no terminal",

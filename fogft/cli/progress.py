@@ -103,11 +103,7 @@ def _show_launches(preview: Preview) -> None:
 
 
 def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tuple[Seen, Outcome]:
-    """Show a pool's progress until an `up` has an outcome; return the last status and the outcome.
-
-    Raises:
-        FogftError: The pool has no manager any more.
-    """
+    """Show a pool's progress until an `up` has an outcome; return it after the last status."""
     from fogft.pool.commands import status
     from fogft.pool.commands.outcome import Outcome
 
@@ -131,11 +127,7 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
 
 
 def settle(store: PoolStore, settled: Settled, what: str) -> None:
-    """Show a pool's progress until a change of it is done.
-
-    Raises:
-        FogftError: It is not within the time that an `up` waits, or there is no manager.
-    """
+    """Show a pool's progress until a change of it is done."""
     from fogft.pool.commands.outcome import Outcome
 
     is_local = store.identity().cloud == composition.LOCAL

@@ -64,10 +64,8 @@ def table(
     """Return a table without lines, or several below each other that begin with one column.
 
     Args:
-        right: Columns that are aligned to the right.
         folds: Columns whose cells may be folded.
         optional: Columns that a terminal is spared where they are empty, or 0 everywhere.
-        titled: Whether the header is shown.
     """
     cells = [[cell(one) if isinstance(one, str) else one for one in row] for row in rows]
     columns = [

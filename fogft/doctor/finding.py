@@ -20,11 +20,7 @@ class Verdict(str, Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
-
-    Attributes:
-        advice: What to do; empty when there is nothing to do.
-    """
+    """One thing that was looked at."""
 
     check: str
     verdict: Verdict
@@ -34,11 +30,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Situation:
-    """What the checks may look at.
-
-    Attributes:
-        spec: The pool file asked about, if any.
-    """
+    """What the checks may look at."""
 
     home: Path
     pools: tuple[str, ...] = ()

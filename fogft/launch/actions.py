@@ -54,9 +54,6 @@ class CloudNode(Node):  # type: ignore[misc]
     Takes what `launch_ros.actions.Node` takes. Name, namespace, parameters, remappings,
     environment and arguments are kept; `output` and `respawn` have no effect: replicas'
     logs are always shown, and their nodes always restarted.
-
-    Raises:
-        FogftError: An argument cannot be carried to another machine.
     """
 
     def __init__(self, **arguments: Any) -> None:
@@ -111,10 +108,7 @@ class FogPool(Action):  # type: ignore[misc]
 
     Args:
         actions: Cloud nodes, and whatever starts here once their services answer.
-        name: The pool's name.
         file: A pool file without `run` that supplies the rest.
-        replicas: How many.
-        resources: SkyPilot's `resources`.
         services: As in a pool file; without them, those that the nodes offer.
         setup: Shell text that prepares a replica.
         workdir: A folder that is copied to the replicas.

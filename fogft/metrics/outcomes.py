@@ -46,7 +46,6 @@ class Outcomes:
             the fallback that came to nothing; ``rejected`` responses that were not ok;
             ``undelivered`` those that ROS did not take. ``request_bytes`` are those of all
             received requests together, ``response_bytes`` those of the first answers of replicas.
-        refused: Refusals by reason.
         poisoned_at: When services last died over a request that was then given up; wall clock.
         trace: How each request ended, until somebody takes it; None where it is not wanted.
     """

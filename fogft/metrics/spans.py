@@ -37,7 +37,6 @@ class Spans:
 
     Args:
         process: Its kind, as the ``service.name`` of its spans.
-        pool: Whose it is.
     """
 
     def __init__(self, process: str, pool: str) -> None:
@@ -158,11 +157,7 @@ class _Span:
 
 
 def wanted(process: str, pool: str) -> Spans | None:
-    """Return an exporter where the environment names an endpoint, else None.
-
-    Args:
-        process, pool: As for `Spans`.
-    """
+    """Return an exporter where the environment names an endpoint, else None."""
     if not any(map(os.environ.get, _WANTED_BY)):
         return None
     try:

@@ -83,7 +83,6 @@ class _Kind:
     """How to step over a value of one type.
 
     Attributes:
-        walk: From an offset to the one behind the value.
         align: Of its widest number; where it starts only matters modulo this.
         has_fixed_size: Whether its size follows from where it starts.
     """

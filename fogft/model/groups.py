@@ -28,11 +28,7 @@ LAST_BY_HAND = 999_999
 
 @dataclass(frozen=True)
 class Group(GroupSpec):
-    """One kind of replicas, whose name is empty where the pool file names no groups.
-
-    Attributes:
-        block: Which slots are its own.
-    """
+    """One kind of replicas, whose name is empty where the pool file names no groups."""
 
     block: int = 0
 

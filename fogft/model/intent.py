@@ -62,11 +62,7 @@ class Intent:
 
 
 def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
-    """Want `change` more replicas (fewer when negative).
-
-    Raises:
-        FogftError: So many cannot be had, or the number follows from an availability target.
-    """
+    """Want `change` more replicas (fewer when negative)."""
     if spec.availability is not None:
         raise FogftError(
             f"`{spec.name}` cannot be scaled: `availability` sets its number of replicas",
@@ -100,11 +96,7 @@ def exclude(intent: Intent, location: str) -> Intent:
 
 
 def include(intent: Intent, location: str) -> Intent:
-    """Allow a location again. Repeatable.
-
-    Raises:
-        FogftError: It is not excluded (the message says what is).
-    """
+    """Allow a location again. Repeatable."""
     place = checked_location(location)
     if place not in intent.excluded:
         listed = ", ".join(f"`{p}`" for p in sorted(intent.excluded)) or "nothing"

@@ -138,7 +138,6 @@ class Machine:
         failure: Why the phase is FAILED, with the cloud's words (a log's last lines after a
             line break); None otherwise.
         progress: What the cloud says is being done there until it serves, for people.
-        setting_up: The task's `setup` is under way.
         running_at: When it was seen to run, in seconds since the epoch; 0 where it is not known.
         set_up_at: When that was done, in seconds since the epoch; 0 where it is not known.
         pool: The name of its pool, as far as the cloud knows it.
@@ -190,14 +189,11 @@ class LinkReport:
 
     Attributes:
         ready: Names of the services that this replica says it can answer now.
-        draining: The replica asked to be left alone (a preemption notice, a drain).
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
         disagrees: Its answers have differed from those of a quorum, repeatedly, or have been
             `misread` (they were no responses), or it `ignores` requests that others answer.
         heard_age_s: Since the server proxy last answered a probe; None if never.
         silent_for_s: How long probes have gone unanswered; 0 while they are answered.
-        rtt_s: Round trip of the last probe.
-        restarts: How often the server proxy restarted the user's `run` command.
         strangers: Connections at its port that nobody with a certificate had opened.
         version: Of fogft on the replica; empty where it is not known.
         lease_age_s: Since the replica last heard of the manager; None if it never did.
@@ -206,7 +202,6 @@ class LinkReport:
         failed: How many came to a crash, a refusal or a response that was not ok.
         detail: Last error in words (connection refused, wrong certificate, ...).
         differs: A service's type is not the same there as on the robot, or cannot be loaded.
-        differing: The services of such types.
         offered: Name and type of each service that `run` offers, where that is found out.
     """
 
@@ -253,7 +248,6 @@ class Observed:
     Attributes:
         machines: The cloud's own list; None when the cloud could not tell.
         links: What the client proxy reports; None when there is no fresh report.
-        offers: What can be bought now, in any order.
         ending: Machines that were already asked to end, and may still be listed.
         rtt_s: ``cloud/region`` -> round trip from the robot in seconds, where it is known.
         doubt_s: By so much the clock was set just now: the time of day goes without it.
@@ -301,7 +295,6 @@ class Membership:
         epoch: The writing manager's lease; then `version` counts its writes. A lower
             (epoch, version) never replaces a higher one.
         revoked: Common names of certificates that are no good any more. Only ever grows.
-        topology: Who talks through whom.
     """
 
     pool: str

@@ -90,11 +90,7 @@ class Part(str, Enum):
 
 @dataclass(frozen=True)
 class ServiceSpec:
-    """One proxied service.
-
-    Attributes:
-        part: Which part of an action it is.
-    """
+    """One proxied service."""
 
     name: str = key(
         service_name("write a name such as `/detect`"),

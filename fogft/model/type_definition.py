@@ -31,7 +31,6 @@ class Definition:
             has none.
         fields: `REQUEST`, `RESPONSE` and each nested ``package/Message`` -> its fields, each a
             name and a type as the generated Python code tells them, in order.
-        trouble: Why the type cannot be loaded there; empty when it can.
         service_hash: Of the whole service, its event message included, as `rmw_zenoh` writes
             it into names; empty where it is not known.
     """

@@ -27,11 +27,7 @@ def document(config: Any, heading: str) -> str:
 
 
 def read(cls: type[T], path: Path, override: Mapping[str, Any] | None = None) -> T:
-    """Return a configuration of a class, its paths absolute; `override` replaces keys of the file.
-
-    Raises:
-        StateError: It cannot be read, or a key is missing or of the wrong type.
-    """
+    """Return a configuration, its paths absolute; `override` replaces keys of the file."""
     try:
         root = yaml_tree.tree(path.read_text(), str(path))
         raw = plain(root)

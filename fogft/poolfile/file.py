@@ -40,9 +40,6 @@ def parse(
     Args:
         file: Its name, for messages; its stem names the pool where the text does not.
         folder: Where `workdir` is looked for; None to leave it unjudged.
-
-    Raises:
-        SpecError: The first mistake: ``file:line: key: what``.
     """
     if len(source) > MAX_BYTES:
         raise _too_large(file)
@@ -52,11 +49,7 @@ def parse(
 
 
 def read_text(path: Path | str) -> str:
-    """Return a pool file's text, as it stands on disk but for a byte order mark.
-
-    Raises:
-        SpecError: It cannot be read, is too large or is not UTF-8.
-    """
+    """Return a pool file's text, as it stands on disk but for a byte order mark."""
     try:
         with open(path, "rb") as file:
             raw = file.read(MAX_BYTES + 1)

@@ -28,9 +28,6 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
     Args:
         spec: The pool file, which is read from `source`, the text of `file`.
         names: Each name that it may use -> the adapter that it stands for.
-
-    Raises:
-        SpecError: They name a cloud that there is not, or clouds of two adapters.
     """
     named = dict(_named_in(spec))
     for cloud, key in named.items():

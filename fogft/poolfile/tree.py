@@ -84,11 +84,7 @@ def nearest(word: str, known: Iterable[str]) -> str:
 
 
 class Section:
-    """A map in a pool file, read key by key.
-
-    Raises:
-        SpecError: It is not a map.
-    """
+    """A map in a pool file, read key by key."""
 
     def __init__(self, file: str, path: str, node: Node, hint: str = "") -> None:
         if not isinstance(node.value, Mapping):
@@ -128,7 +124,6 @@ class Section:
 
         Args:
             hints: Keys that are no longer or not yet there: what is to be said, and what to do.
-            elsewhere: Keys that have their place in another section, with that place.
         """
         allowed = set(known)
         for key in [key for key in self.children if key not in allowed]:

@@ -31,11 +31,7 @@ class _RefusedError(Exception):
 
 
 def tree(text: str, file: str) -> Node:
-    """Return a document's tree.
-
-    Raises:
-        SpecError: It is empty, is not YAML, or goes beyond the limits.
-    """
+    """Return a document's tree."""
     loader: _Loader | None = None
     try:
         loader = _Loader(text)

@@ -42,11 +42,7 @@ def write(path: Path, records: Sequence[SignedRecord], *, durable: bool = True) 
 
 
 def read(path: Path) -> list[SignedRecord]:
-    """Return the records of the file, none where there is no file.
-
-    Raises:
-        StateError: It is damaged, or of another version.
-    """
+    """Return the records of the file, none where there is no file."""
     raw = disk.read_json(path)
     if raw is None:
         return []

@@ -61,10 +61,6 @@ class RendezvousClient:
     Args:
         cache: File that the records are kept in; None for nowhere.
         changed: Called on the client's thread after anything changed; must not block.
-
-    Raises:
-        CredentialError: The credentials cannot be used.
-        WireError: An endpoint is none.
     """
 
     def __init__(

@@ -118,7 +118,6 @@ class Writer:
     """Who signed something, by a certificate that was found to be good.
 
     Attributes:
-        common_name: From `model.names`.
         serial: The certificate's serial number, lower-case hexadecimal.
     """
 

@@ -67,12 +67,7 @@ class RendezvousServer:
         return self._endpoint
 
     def bind(self) -> None:
-        """Take the port.
-
-        Raises:
-            WireError: It cannot be had.
-            CredentialError: The certificate or its key cannot be used.
-        """
+        """Take the port."""
         self._renew_context()
         host, _, port = self._listen.rpartition(":")
         try:

@@ -27,11 +27,7 @@ _KNOWN_LIMIT = 4096
 
 
 class Signer:
-    """Signs with a key on disk; reads it again when its certificate was replaced.
-
-    Raises:
-        CredentialError: They cannot be used, or do not belong together.
-    """
+    """Signs with a key on disk; reads it again when its certificate was replaced."""
 
     def __init__(self, certificate: Path, key: Path) -> None:
         self._certificate_path = certificate
@@ -97,9 +93,6 @@ class Verifier:
 
     Args:
         any_time: Accept certificates out of their time: for what was verified before.
-
-    Raises:
-        CredentialError: The CA cannot be used.
     """
 
     def __init__(

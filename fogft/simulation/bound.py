@@ -45,7 +45,6 @@ def least_usd_per_hour(
         spot: Location -> US dollars per hour of a spot machine there.
         on_demand: Of an on-demand machine, which can always be had; None for none.
         boot_s: From the order until a machine serves. Machines of the beginning are paid for it.
-        length_s: How long they serve.
     """
     stays = [
         stay

@@ -38,10 +38,6 @@ def generate(
     The market is stationary: it has run for a while before it is looked at.
 
     Args:
-        model: What zones have in common.
-        locations: The zones.
-        length_s: For so long.
-        chance: All randomness.
         zones: Location -> its own MTTF and MTTR, where they are not the model's.
     """
     own = {

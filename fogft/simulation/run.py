@@ -38,13 +38,8 @@ def simulate(
     """Run a pool file and fixed baselines side by side. Launches nothing.
 
     Args:
-        file: The pool file.
-        traces: A folder of recorded traces; None to make markets up.
         prices: A folder of spot prices, laid out like the traces, in US dollars per hour.
-        fit: Make markets up that are like the traces.
         model: ``KEY=VALUE,...``, see `fogft.simulation.model`.
-        days: Measured by each seed.
-        seeds: One run of each policy a seed.
         cloud: Whose prices; None for the one that the pool file names, else `local`.
         told: Called with how many runs are done, and of how many.
     """

@@ -41,7 +41,6 @@ def read(folder: Path, per_unit: int = 1) -> list[Trace]:
     """Read every ``.json`` file in and below a folder; one that is no trace is an error.
 
     Args:
-        folder: Where they are.
         per_unit: What one of what was sampled counts: 1 for machines, `PER_USD` for prices.
     """
     if not folder.is_dir():

@@ -62,11 +62,7 @@ def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
 
 
 def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
-    """Return the highest generation of the replicas last seen in a slot.
-
-    Raises:
-        FogftError: There is none (the hint lists those there are).
-    """
+    """Return the highest generation of the replicas last seen in a slot."""
     status = read(paths, now).status
     found = [replica.generation for replica in status.replicas if replica.slot == slot]
     if not found and any(replica.slot == slot for replica in status.by_hand):

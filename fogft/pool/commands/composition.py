@@ -38,11 +38,7 @@ def is_exported(name: str) -> bool:
 
 
 def paths_of(name: str | None = None) -> PoolPaths:
-    """Return where the pool that is named is kept, else the only one there is.
-
-    Raises:
-        PoolNotFound: There is no such pool, none, or more than one to choose from.
-    """
+    """Return where the pool that is named is kept, else the only one there is."""
     known = pools()
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
@@ -91,11 +87,7 @@ def cloud_of(identity: Identity) -> Cloud:
 
 
 def cloud_named_by(spec: PoolSpec, source: str, file: Path) -> str:
-    """Return the one of `CLOUDS` that a pool file's resources name, else `local`.
-
-    Raises:
-        SpecError: They name a cloud that does not exist, or real clouds and the local one.
-    """
+    """Return the one of `CLOUDS` that a pool file's resources name, else `local`."""
     from fogft.model.names import NO_VM_CLOUDS, VM_CLOUDS
     from fogft.poolfile import named_clouds
 

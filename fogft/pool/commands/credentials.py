@@ -28,10 +28,6 @@ def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Ho
     """Revoke certificates; return their holders, and whether the pool has been told.
 
     A replica that is revoked is replaced, too.
-
-    Raises:
-        CredentialError: There is none of that name.
-        FogftError: There is no such pool.
     """
     store.identity()
     ledger = Ledger(store.paths.credentials)

@@ -32,10 +32,6 @@ def examples() -> dict[str, str]:
 def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Path]:
     """Copy an example's files into a folder, which is made if need be; return them, the pool file
     first. With `force` files of the same names are overwritten; others in the folder stay.
-
-    Raises:
-        FogftError: There is no such example, a file is in the way, or the folder cannot be
-            written.
     """
     known = examples()
     if name not in known:

@@ -62,13 +62,7 @@ class Joined:
 def issue(
     store: PoolStore, role: Role, name: str, passphrase: str, now: float, *, open_for_s: float
 ) -> tuple[Holder, bytes]:
-    """Certify the next generation of a holder; return it, and its sealed bundle.
-
-    Raises:
-        CredentialError: The name or the passphrase will not do, the CA cannot be used, or
-            whoever joined would find nobody.
-        FogftError: There is no such pool.
-    """
+    """Certify the next generation of a holder; return it, and its sealed bundle."""
     identity, spec = store.identity(), store.spec()
     if role is Role.REPLICA and not _is_by_hand(name):
         raise CredentialError(
@@ -179,12 +173,7 @@ def join(
 
 @contextlib.contextmanager
 def used_once(root: Path, label: Label) -> Iterator[None]:
-    """Remember a bundle as used on this machine, if what is done meanwhile succeeds.
-
-    Raises:
-        CredentialError: It was used before.
-        StateError: It cannot be remembered.
-    """
+    """Remember a bundle as used on this machine, if what is done meanwhile succeeds."""
     used = root / "joined" / "used.json"
     disk.make_folder(used.parent)
     with disk.locked(used.with_suffix(".lock")):

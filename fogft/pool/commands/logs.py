@@ -22,9 +22,6 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
     """Return logs with their names: ``manager``, ``proxy``, then ``slot.generation``.
 
     Of one slot where it is given: then only those of its replicas.
-
-    Raises:
-        FogftError: There is no log of that slot (the hint lists those there are).
     """
     uid = store.identity().uid
     launched = {(e.slot, e.generation) for e in store.recent(EVENTS) if e.kind not in MOVING}

@@ -62,10 +62,8 @@ def export(
     Args:
         root: The folder of all of fogft's state.
         open_for_s: How long the file can be imported.
-        told: Called with each process as it has been ended.
 
     Raises:
-        CredentialError: The passphrase is too short.
         FogftError: The file exists or cannot be written: the pool is managed here as before.
     """
     bundle.check_passphrase(passphrase)
@@ -130,10 +128,6 @@ def import_(
     Args:
         root: The folder of all of fogft's state.
         pool_file: The pool file on this machine: relative paths in it start at its folder.
-
-    Raises:
-        CredentialError: It is none, is too old, or was used here.
-        FogftError: There is a pool of this name here, or its pool file is missing.
     """
     label, content = bundle.open_sealed(joining.read(file), passphrase, now)
     if label.holder.role is not Role.MANAGER:

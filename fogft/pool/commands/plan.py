@@ -63,10 +63,6 @@ def plan_file(
 
     Prices are of the cloud that its resources name, else `local`, unless told; `prices` is a table
     in place of a cloud. Offline no distance is measured; `told` hears of what takes long.
-
-    Raises:
-        SpecError: The first mistake in the file or in the table.
-        CloudError: Prices cannot be had.
     """
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.parent)
@@ -160,11 +156,7 @@ LEAST_S = 60.0
 
 @dataclass(frozen=True)
 class Measured:
-    """What was counted of one service.
-
-    Attributes:
-        over_s: For how long, in seconds.
-    """
+    """What was counted of one service."""
 
     traffic: TrafficSpec
     over_s: float

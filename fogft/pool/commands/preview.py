@@ -41,7 +41,6 @@ class Preview:
 
     Attributes:
         launches: Of a new pool; by slot. Of one that exists: what it would get if it were new.
-        observed_at: When the launches' prices were asked for, in seconds since the epoch.
         costs_money: Its machines are paid for: nothing is ordered unasked.
         accounts: Of each cloud whose credentials were tested: empty, or what is wrong.
         changes: Of a pool that exists: what the file now says otherwise, in words.
@@ -83,10 +82,6 @@ def order(
 
     It runs on the cloud that its resources name, else `local`, unless told; `told` hears of what
     takes long.
-
-    Raises:
-        SpecError: The first mistake in the file, or the cloud can never meet its resources.
-        CloudError: There is no such cloud, or a new pool cannot use any that it names.
     """
     source = read_text(file)
     spec = parse(source, str(file), checks_here(), file.parent)

@@ -34,11 +34,7 @@ MANAGER_LIMIT_S = 20.0
 
 
 def start(order: Preview) -> bool:
-    """Create the pool or apply the changed file; return whether a manager had to be started.
-
-    Raises:
-        FogftError: The pool is another one's, is being ended, or its manager did not start.
-    """
+    """Create the pool or apply the changed file; return whether a manager had to be started."""
     disk.make_folder(home())
     store, cloud = make_store(order.spec.name), order.cloud
     write(store, order.spec, source=order.source, file=order.file.resolve(), cloud=cloud)
@@ -115,11 +111,7 @@ def manager_version(paths: PoolPaths) -> str:
 
 
 def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None = None) -> bool:
-    """See to it that the pool has a manager of this version; return whether one was started.
-
-    Raises:
-        FogftError: It ended at once (the message has the end of its log).
-    """
+    """See to it that the pool has a manager of this version; return whether one was started."""
     paths = store.paths
     if disk.is_locked(paths.manager_lock):
         if manager_version(paths) in ("", __version__):

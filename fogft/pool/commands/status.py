@@ -114,12 +114,7 @@ def _heard(link: LinkReport, written_at: float, since: float) -> LinkReport:
 
 
 def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> Seen:
-    """Return what is known of a pool now; `heard_since` is as of `current`.
-
-    Raises:
-        PoolNotFound: There is no such pool.
-        StateError: The status is damaged, or another version's.
-    """
+    """Return what is known of a pool now; `heard_since` is as of `current`."""
     raw = disk.read_json(paths.status)
     seen = _unobserved(paths) if raw is None else status.from_json(raw, paths.status)
     return current(
@@ -162,11 +157,7 @@ def every(names: Iterable[str], now: float) -> Iterator[tuple[str, Seen | StateE
 
 
 def renewed(paths: PoolPaths, limit_s: float = 15.0) -> Seen:
-    """Have the living manager look again, and return what it saw; without one what was seen last.
-
-    Raises:
-        StateError: It did not within `limit_s`.
-    """
+    """Have the manager look again, and return what it saw; without one what was seen last."""
     asked_at = time.time()
     deadline = time.monotonic() + limit_s
     with contextlib.suppress(OSError):

@@ -27,11 +27,7 @@ _NAMED = 5  # in a sentence
 
 @dataclass(frozen=True)
 class Unowned:
-    """A machine that nobody looks after.
-
-    Attributes:
-        known: Its pool's folder is here.
-    """
+    """A machine that nobody looks after."""
 
     machine: Machine
     why: str
@@ -44,7 +40,6 @@ class Swept:
 
     Attributes:
         cloud: Its name, one of `composition.CLOUDS`.
-        asked: Clouds whose own list was read.
     """
 
     cloud: str
@@ -58,13 +53,7 @@ def clouds_used() -> list[str]:
 
 
 def sweep_cloud(name: str) -> Swept:
-    """Return the machines of this user's pools in a cloud that no manager owns.
-
-    Raises:
-        CloudUnreachable: It cannot tell what exists.
-        CloudError: There is no such cloud, or it is not usable here.
-        StateError: A pool's identity cannot be read, so that its machines are not known.
-    """
+    """Return the machines of this user's pools in a cloud that no manager owns."""
     return swept(name, make_cloud(name, Path.cwd()))
 
 

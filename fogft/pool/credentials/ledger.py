@@ -32,11 +32,7 @@ _WAY_OUT = "without it nobody knows what was revoked; `fogft down` and `up` begi
 
 @dataclass(frozen=True)
 class Entry:
-    """One certificate. Times in seconds since the epoch.
-
-    Attributes:
-        revoked_at: When it was taken back; None if it was not.
-    """
+    """One certificate. Times in seconds since the epoch."""
 
     common_name: Annotated[str, holder_of]
     serial: Line
@@ -145,11 +141,7 @@ class Ledger:
             )
 
     def named(self, role: Role, name: str) -> list[Holder]:
-        """Return the holders that a role and ``name`` or ``name.generation`` mean.
-
-        Raises:
-            CredentialError: There is none (the hint lists those there are).
-        """
+        """Return the holders that a role and ``name`` or ``name.generation`` mean."""
         holders = list(dict.fromkeys(e.holder for e in self.entries() if e.revoked_at is None))
         found = [h for h in holders if h.role is role and name in (h.name, h.short)]
         if not found:

@@ -32,7 +32,6 @@ class Identity:
     """What a pool is, for good.
 
     Attributes:
-        file: Absolute path of the pool file.
         first_epoch: Managers on this machine take epochs above it; see `lease`.
     """
 
@@ -112,22 +111,13 @@ class PoolStore:
         return self.paths.folder.name
 
     def identity(self) -> Identity:
-        """Return what the pool is.
-
-        Raises:
-            PoolNotFound: There is none.
-            StateError: Its file is damaged.
-        """
+        """Return what the pool is."""
         return read_identity(self.paths)
 
     def spec(self) -> PoolSpec:
         """Return the pool file in force: as applied last, or the good one after a rollback.
 
         Where it lists no services, what was discovered is with it.
-
-        Raises:
-            PoolNotFound: There is none.
-            SpecError: It is wrong (`up` never stores such a file).
         """
         raw = self._applied()
         trial = self.trial()
@@ -218,11 +208,7 @@ class PoolStore:
         return self._events.history()
 
     def append(self, event: Event) -> None:
-        """Remember an event, on disk before this returns.
-
-        Raises:
-            StateError: It cannot be written. The event did not happen.
-        """
+        """Remember an event, on disk before this returns."""
         self._events.append(event)
         self.heard(event)
 

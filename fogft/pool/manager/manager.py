@@ -73,10 +73,6 @@ class Manager:
         proxy_command: What to start as client proxy, in place of our own.
         metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
         keeps_proxy: Whether it starts client proxies; else somebody else does.
-
-    Raises:
-        PoolBusy: The pool has a manager.
-        PoolNotFound: There is no such pool.
     """
 
     def __init__(

@@ -71,7 +71,6 @@ class Tick(NamedTuple):
     Attributes:
         over: Its hours are used up: the pool ends by itself.
         update: The update under way, or the one that was given up; None where there is none.
-        file: Digest of the pool file that was applied last.
     """
 
     identity: Identity
@@ -106,7 +105,6 @@ class Reconciler:
     Args:
         reading: Tells in place of `clock` what it is, and whether it was set; see
             `planning.observed.clock_jumps`.
-        epoch: Of the lease; goes into every membership.
         by_hand: Replicas that people start themselves, and that are still let in.
         gateways: Name -> generations of its certificates that are good.
         distances: Says how far regions are from the robot, of what is sold and what runs.

@@ -89,21 +89,13 @@ def end(
 def without_manager(
     paths: PoolPaths, done: Callable[[str], None]
 ) -> contextlib.AbstractContextManager[None]:
-    """End a pool's manager; none can start while this is open.
-
-    Raises:
-        FogftError: It does not end.
-    """
+    """End a pool's manager; none can start while this is open."""
     return _taken(done, "manager", paths.manager_lock)
 
 
 @contextlib.contextmanager
 def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Iterator[None]:
-    """End a pool's client proxy and its standby; none can start while this is open.
-
-    Raises:
-        FogftError: It does not end.
-    """
+    """End a pool's client proxy and its standby; none can start while this is open."""
     # Its place in line stays free until the proxy has gone: it would wait for us to take over.
     process_control.end_holder(paths.standby_lock)
     with (

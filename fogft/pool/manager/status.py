@@ -52,7 +52,6 @@ class ReplicaStatus:
     """One replica, with what `LinkReport` says of it. Ages and durations in seconds; None: unknown.
 
     Attributes:
-        link: ``connecting``, ``up`` or ``suspect``; empty when there is no link.
         verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
             ``at risk``.
         age_s: Since its launch; None where that was somebody else's.
@@ -62,7 +61,6 @@ class ReplicaStatus:
             service, or cannot be reached.
         provisioning_s: From its order until the machine ran; then `setup_s` until `setup` was done
             and `starting_s` until it was ready. None where it is not known, or not over.
-        ready_after_s: From its order until it was ready for the first time.
     """
 
     slot: int
@@ -152,10 +150,8 @@ class TopicStatus:
     """One topic, of an action or by itself.
 
     Attributes:
-        origin: Who publishes, ``robot`` or ``replicas``.
         heard_by: The replicas, as ``slot.generation``, that pass it on now: of a topic of the
             robot's those where a node subscribes.
-        counters: What the client proxy counted.
     """
 
     name: str
@@ -170,7 +166,6 @@ class UpdateStatus:
     """An update under way, or the last one where it was given up.
 
     Attributes:
-        state: ``in progress``, ``stopped`` or ``rolled back``.
         done: Replicas of the version that is wanted now which serve.
         fault: Why it was given up, in words; empty while it was not.
     """
@@ -246,13 +241,11 @@ class PoolStatus:
         credentials_end_at: When the cloud's credentials end, in seconds since the epoch; None where
             no end is known.
         usd_to_date: What the pool has cost since its first `up`, as the manager saw it.
-        ended: Why the manager has ended the pool by itself; empty while it runs.
         notes: Why the pool is not yet as wanted, in sentences.
         reasons: The same, one for each note, as ``{cause, ...}``.
         version: Of this schema; see `fogft.pool.commands.status_schema`.
         topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
             how this machine's robot finds its gateways; empty where there are none.
-        applied: Digest of the pool file that was applied last.
         manager_version: Of fogft, by which the manager runs; empty before 0.2.0.
     """
 
@@ -351,11 +344,7 @@ class PoolStatus:
 
 
 def from_json(raw: Any, path: Path) -> PoolStatus:
-    """Read back the status in a file.
-
-    Raises:
-        StateError: It is none, or of another version of fogft.
-    """
+    """Read back the status in a file."""
     hint = "remove it: a manager of this version writes it anew"
     return stored(PoolStatus, raw, f"`{path}` is not a status", hint)
 
