@@ -41,12 +41,7 @@ def is_batch(header: bytes) -> bool:
 def encode_requests(
     requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
 ) -> tuple[bytes, bytes]:
-    """Return header and payload for requests: id, remaining seconds, handling and payload.
-
-    Args:
-        requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
-        seen: The stamp of the last answer that the connection has seen.
-    """
+    """Return header and payload for requests: id, remaining seconds, handling and payload."""
     parts = []
     for id, remaining_s, handling, payload in requests:
         parts.append(_REQUEST.pack(id, remaining_s, handling, len(payload)))

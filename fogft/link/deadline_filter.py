@@ -26,11 +26,9 @@ class DeadlineFilter:
     """Judges the requests of one connection. Any thread.
 
     Args:
-        timed: Services whose requests are of no use after their time.
         carries: Returns what the link carries, by the clock, in bytes a second; None where that is
             not known.
         left: Returns how many bytes sent before have not arrived, by the clock and that rate.
-        packs: Returns a service's compression; None where its payloads leave as they are.
     """
 
     def __init__(

@@ -52,13 +52,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
     """The header of a request.
 
     Attributes:
-        request_id: 16 bytes, made by the client proxy.
-        remaining_s: Time left when it was sent, in seconds.
-        token: Names the robot's connection, so that replies queue apart.
-        seen: The stamp of the last answer that its connection has seen.
-        may_pack: The answer may be.
         reads_packed: It may be where the replica itself finds the link to be thin.
-        handling: What the replica is asked to do with it.
     """
 
     request_id: bytes
@@ -74,13 +68,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
 
 @dataclass(frozen=True)
 class Greeting:
-    """Sent with a probe to authenticate the connection.
-
-    Attributes:
-        token: Names the robot's connection; requests under it are the greeter's.
-        certificate: The robot's (DER), with the first probe; empty once it was answered.
-        signature: Over `greeted_bytes`, with that certificate's key (DER).
-    """
+    """Sent with a probe to authenticate the connection."""
 
     token: bytes
     certificate: bytes = b""

@@ -19,11 +19,7 @@ PATIENCE_S = 0.005
 
 
 class LargeSendGate:
-    """Lets one large message of a robot go at a time, whichever its link.
-
-    Args:
-        patience_s: How long to wait for another's turn to end.
-    """
+    """Lets one large message of a robot go at a time, whichever its link."""
 
     def __init__(self, patience_s: float = PATIENCE_S) -> None:
         self._patience_s = patience_s

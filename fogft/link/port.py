@@ -31,8 +31,6 @@ class SendOptions:
     """Which services want the newest first, no compression, or a deadline on the way.
 
     Attributes:
-        latest: Those of which the newest request goes first.
-        plain: Those whose payloads are never compressed.
         timed: Those whose requests nobody wants after their time. Of others, such as topics and the
             orders of a stateful service, it only says when they are sent again.
     """
@@ -77,7 +75,6 @@ class ReplicaWord:
         ready: Names of the services that it can answer now.
         draining: It asks to be left alone: its machine will be taken.
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
-        restarts: How often it restarted the user's `run` command.
         detail: Why it is not ready, in words; empty when it is.
         version: Of fogft on the replica; empty before 0.2.0.
         lease_age_s: Since it last heard of the pool's manager; None for never.
@@ -125,7 +122,6 @@ class ProbeAnswer(ReplicaWord):
     Attributes:
         incarnation: Random text made when the server proxy started. A new one at the
             same id means that it forgot every request.
-        work: What became of requests since its start, by name (`Responder.report`).
         offered: Service name -> type of what `run` offers, where it is to be found out.
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
@@ -149,8 +145,6 @@ class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thri
     """The end of one attempt: `payload` if the service answered, else a `refusal`.
 
     Attributes:
-        service: The name given to `Link.offer`.
-        detail: What belongs to a refusal of its kind.
         load: What the replica has to do, if it says so.
     """
 
@@ -201,7 +195,6 @@ class LinkStatus:
     """A snapshot of a link. Durations in seconds.
 
     Attributes:
-        uplinks: How each uplink does, where there are several, for people.
         ignores: It takes requests and never ends them, though others answer them.
     """
 
@@ -254,7 +247,6 @@ class Link(Protocol):
 
         Args:
             more: Others follow at once, then `send`: it may wait for them, to leave in one message.
-            handling: What the replica is asked to do with it.
         """
 
     def send(self) -> None:
@@ -308,10 +300,7 @@ class Incoming(Protocol):
     """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing.
 
     Attributes:
-        request_id: 16 bytes, made by the client proxy.
         robot: Who asks; replies to one robot never wait for another.
-        remaining_s: Time that was left when the robot sent it.
-        handling: What this replica is asked to do with it.
     """
 
     service: str
@@ -322,12 +311,7 @@ class Incoming(Protocol):
     payload: bytes
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
-        """Send the serialised response. Never blocks.
-
-        Args:
-            load: What the replica has to do for this service.
-            more: Others will soon follow, to leave in one message with it.
-        """
+        """Send the serialised response. Never blocks."""
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal. Never blocks."""

@@ -84,8 +84,6 @@ class Flow:
     """What the kernel says of one connection.
 
     Attributes:
-        acknowledged: Bytes that the peer's kernel has acknowledged so far.
-        received: Bytes that came from the peer so far.
         outstanding: Bytes handed to the kernel that are not acknowledged.
         round_trip_s: The smoothed time to an acknowledgement, with four times its variation.
         unsent: Bytes among the outstanding ones that have not left: the path takes no more now.
@@ -99,11 +97,7 @@ class Flow:
 
 
 class SocketProgress:
-    """The progress of one connection. Times are monotonic seconds.
-
-    Attributes:
-        throughput: What it was seen to carry over some time.
-    """
+    """The progress of one connection. Times are monotonic seconds."""
 
     def __init__(self) -> None:
         self.throughput = Throughput()
@@ -118,9 +112,6 @@ class SocketProgress:
         """Take a new count; return for how many of the seconds since the last one bulk moved.
 
         These are not to be held against the peer: whatever it says queues behind that.
-
-        Args:
-            sending_for_s: For how long something large has been on its way into the kernel.
         """
         last, since_s = self._last, now - self._last_at
         if last is not None and since_s < _SHORTEST_LOOK_S:
@@ -161,12 +152,7 @@ class SocketProgress:
         return 0.0 if self._progress_at is None else max(0.0, now - self._progress_at)
 
     def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
-        """Whether a queue has stood still for longer than this path's own pauses explain.
-
-        Args:
-            shortest_s: However quick the path: its peer's processor may be busy.
-            longest_s: However slow the path, no longer than that.
-        """
+        """Whether a queue has stood still for longer than this path's own pauses explain."""
         last = self._last
         if last is None or last.outstanding < BULK_BYTES:
             return False

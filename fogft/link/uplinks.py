@@ -244,12 +244,7 @@ class UplinksLink:
 
 
 class UplinkDialer:
-    """Makes links that use several uplinks; see `port.Dialer`.
-
-    Attributes:
-        interfaces: Names of network interfaces, the preferred one first; none for whatever the
-            routes say.
-    """
+    """Makes links that use several uplinks; see `port.Dialer`."""
 
     def __init__(self, inner: Dialer) -> None:
         self.inner = inner

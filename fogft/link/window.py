@@ -46,11 +46,7 @@ class OpenAttempt:
 
 
 class LinkWindow:
-    """The attempts open on one connection.
-
-    Args:
-        limit_bytes: The most bytes at once; a larger single attempt still gets in alone.
-    """
+    """The attempts open on one connection."""
 
     def __init__(self, limit: int = ATTEMPTS_LIMIT, limit_bytes: int = BYTES_LIMIT) -> None:
         self._limit = limit

@@ -19,12 +19,7 @@ class Checkpoint:
 
 
 class OrderedLog:
-    """Requests by number, consecutive, bounded by count and bytes.
-
-    Args:
-        start: The number after which it begins: all before is part of a state.
-        bytes_limit: Their bytes together; a larger single entry still gets in alone.
-    """
+    """Requests by number, consecutive, bounded by count and bytes."""
 
     def __init__(
         self, start: int, *, entries_limit: int = 8192, bytes_limit: int = 64 << 20
@@ -58,11 +53,7 @@ class OrderedLog:
         return within and len(self._entries) < self._entries_limit
 
     def append(self, payload: bytes) -> int:
-        """Number a request; ask `has_room` before.
-
-        Raises:
-            ValueError: There is no room.
-        """
+        """Number a request; ask `has_room` before."""
         if not self.has_room(len(payload)):
             raise ValueError("the log is full")
         self._entries.append(payload)
@@ -70,11 +61,7 @@ class OrderedLog:
         return self.last
 
     def get(self, index: int) -> bytes:
-        """Return a request.
-
-        Raises:
-            IndexError: It is not in the log.
-        """
+        """Return a request."""
         if not self.start < index <= self.last:
             raise IndexError(f"the log has no number {index}")
         return self._entries[index - self.start - 1]

@@ -72,12 +72,7 @@ class _Queued(Generic[T]):
 
 
 class OrderedReplica(Generic[T]):
-    """One stateful service on one replica.
-
-    Args:
-        queue_limit, queue_bytes: Requests that wait for their turn; more are refused.
-        kept, kept_bytes: Answers kept for copies; the oldest go first.
-    """
+    """One stateful service on one replica."""
 
     def __init__(
         self,

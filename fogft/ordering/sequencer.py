@@ -33,7 +33,6 @@ class Handover:
     """From what a term begins in which another version becomes active.
 
     Attributes:
-        version: The one that becomes active.
         at: The state that it takes over: every number given before has been applied there.
     """
 
@@ -47,7 +46,6 @@ class Sequencer:
 
     Args:
         epoch: This term, above every earlier one.
-        mark: The position of the last answer that was returned, in whatever term.
         holder: The version that returned it; None where nobody knows.
         begin: What the term begins from, where a version takes over from another.
 

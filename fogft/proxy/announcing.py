@@ -68,9 +68,6 @@ class Announcer:
 class Presence:
     """A replica at the rendezvous and at the doors of those it has to dial.
 
-    Args:
-        listening: ``host:port`` of its own listener.
-
     Raises:
         CredentialError: The credentials cannot be used.
     """

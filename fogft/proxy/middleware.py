@@ -103,10 +103,8 @@ def join(
     """Make a node.
 
     Args:
-        domain_id: The ROS domain; None for what the environment says.
         told: Returns the definitions of types as replicas tell them.
         noticed: Called, from any thread, when a type may be known that was not.
-        environ: Where the variables of ROS and Zenoh are, for Zenoh.
 
     Raises:
         RosError: ROS, or Zenoh, is not usable here.

@@ -47,10 +47,6 @@ class TokenBucket:
     asked a thousand times a second both send the same share of extra copies.
 
     Law: after n requests at most ``capacity + share * n`` copies were taken.
-
-    Args:
-        share: Tokens that each request brings, above 0 and at most 1.
-        capacity: The most that are kept, and how many there are at first.
     """
 
     def __init__(self, share: float, capacity: float) -> None:
@@ -71,11 +67,7 @@ class TokenBucket:
 
 
 class Spares:
-    """Which requests get spare copies: all, unless these cost more waiting than they save.
-
-    Attributes:
-        share: Of requests that get them.
-    """
+    """Which requests get spare copies: all, unless these cost more waiting than they save."""
 
     def __init__(self) -> None:
         self.share = 1.0

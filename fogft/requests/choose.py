@@ -24,7 +24,6 @@ class Choose:
     What a policy does not say here it does not care for.
 
     Attributes:
-        moves_on: Whether another replica is asked at once when nobody works on a request.
         look_at: When `more` wants to be asked next, though nothing else has happened.
         news: What it has learned concerns requests that it did not want to be asked about yet.
     """

@@ -27,10 +27,6 @@ _WEIGHT = 0.1  # of a sample in the mean
 class ConcurrencyLimit:
     """The limit of one service.
 
-    Args:
-        most: The highest limit that may be learned; what the service's own queue holds.
-        given: The limit, where it is not to be learned.
-
     Attributes:
         service_s: What a request took lately, divided by how many were at work, seconds; 0
             before the first.

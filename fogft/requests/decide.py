@@ -41,7 +41,6 @@ class Send(NamedTuple):
     """Something to be sent to a replica.
 
     Attributes:
-        timeout_s: How long it is good for.
         is_copy: It is a copy of a caller's request, and counted as one.
     """
 

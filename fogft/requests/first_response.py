@@ -46,12 +46,8 @@ class Pending(Generic[T]):
     """A request that awaits its answer.
 
     Attributes:
-        item: What the caller keeps with it (payload, handle).
-        open: Replicas that work on it now, each with the moment when it was asked.
-        barred: Replicas that must not be asked again.
         failures: How often an attempt at each replica has failed, those that count.
         waits: Until when a replica that failed it is left alone, and that wait, in seconds.
-        rejection: The last response that was real but not ok.
         deaths: How often a service died while it worked on this: those that died together over
             copies of it, and of other requests, count as one.
         alone_at: The replica that works on it with nothing beside it, since a service has died.
@@ -72,12 +68,8 @@ class Pending(Generic[T]):
 class FirstResponse(Generic[T]):
     """The requests of one service that await an answer, oldest first.
 
-    Args:
-        attempts: How often one replica may fail one request before it is barred from it.
-
     Attributes:
         soonest_deadline: Of the requests, or sooner.
-        has_rejected: Whether any request so far got a rejection.
     """
 
     def __init__(self, *, attempts: int = 3) -> None:

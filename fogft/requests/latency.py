@@ -21,11 +21,7 @@ _RESCALE_AT = 1e100
 
 
 class Latencies:
-    """Recent latencies of one replica's answers to one service.
-
-    Args:
-        half_life_s: After so much time one weighs half, in seconds.
-    """
+    """Recent latencies of one replica's answers to one service."""
 
     def __init__(self, half_life: float = 200.0, half_life_s: float = 60.0) -> None:
         self._per_sample = 2.0 ** (1.0 / half_life)

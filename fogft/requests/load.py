@@ -49,8 +49,6 @@ class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice
     """What a replica says of one service with each answer and refusal.
 
     Attributes:
-        waiting: Requests that wait for their turn.
-        running: Requests that the service has now.
         slots: How many it works on at once; 0 where that is not known yet.
         service_s: What it lately took for a request, divided by how many it had at once.
         spent_s: How long the request of this answer was at the replica.
@@ -87,7 +85,6 @@ class ReplicaLoad:
     """What one robot knows of how busy a replica is. Not thread-safe: its owner holds a lock.
 
     Attributes:
-        latencies: Of its answers, as the robot saw them.
         doubted: An attempt is overdue, and it has ended none since that one began.
         ended_at: When it last ended an attempt, with an answer or too late for one.
     """

@@ -73,11 +73,7 @@ class PendingRequests(Generic[T]):
     def begin(
         self, request: bytes, item: T, able: Sequence[int], *, deadline: float, now: float
     ) -> Sequence[int]:
-        """Enter a request; return which replicas it goes to at once.
-
-        Raises:
-            ValueError: The id is under way already.
-        """
+        """Enter a request; return which replicas it goes to at once."""
         chosen = self.choose.first(request, able, now)
         if len(chosen) == len(able) > 1 and now < self._cautious_until:
             *chosen, spared = chosen
@@ -178,10 +174,6 @@ class PendingRequests(Generic[T]):
         now: float,
     ) -> Judged[T]:
         """Take an answer.
-
-        Args:
-            request: What it is about; None for no request.
-            load: What the replica has to do, if it says so.
 
         Returns:
             What it means; the request that it answers, None where it comes too late or is no

@@ -44,10 +44,6 @@ class Quorum(Decide):
 
     Replicas go on working on a request that has its answer: what they would have said is what
     tells a wrong one.
-
-    Args:
-        newly_flagged: Called with a replica that has disagreed once too often, and how often.
-        kept: Final answers kept to judge late ballots by.
     """
 
     def __init__(

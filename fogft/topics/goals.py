@@ -72,12 +72,7 @@ class Had(Enum):
 
 @dataclass(frozen=True)
 class Took:
-    """That a replica took a goal.
-
-    Attributes:
-        goal: Which; None where it did not, had it before, or that is not known any more.
-        in_vain: The goal is over, or cancelled.
-    """
+    """That a replica took a goal."""
 
     goal: bytes | None
     in_vain: bool

@@ -16,12 +16,7 @@ Numbered = tuple[int, bytes]
 
 
 class Ring:
-    """The last messages that a replica's nodes published.
-
-    Args:
-        latched: Whether a robot that has none yet gets what is kept.
-        kept_bytes: Their bytes together, at most; the newest is kept in any case.
-    """
+    """The last messages that a replica's nodes published."""
 
     def __init__(self, depth: int, *, latched: bool, kept_bytes: int = 64 << 20) -> None:
         self._depth = depth
@@ -62,12 +57,7 @@ class Ring:
 
 
 class Outbox:
-    """What one replica is to get of a topic of the robot's, in order.
-
-    Args:
-        depth: Messages that wait at most; the oldest go first.
-        kept_bytes: Bytes of those that wait, at most; the newest is kept in any case.
-    """
+    """What one replica is to get of a topic of the robot's, in order."""
 
     def __init__(self, depth: int, *, window: int = 16, kept_bytes: int = 64 << 20) -> None:
         self._limit = kept_bytes
@@ -119,11 +109,7 @@ class Outbox:
 
 
 class Seen:
-    """Drops at a replica what came before, or came after a later one. By robot and its start.
-
-    Args:
-        robots: How many are remembered; the one that is longest silent is forgotten.
-    """
+    """Drops at a replica what came before, or came after a later one. By robot and its start."""
 
     def __init__(self, robots: int = 256) -> None:
         self._robots = robots

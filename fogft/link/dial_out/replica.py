@@ -32,11 +32,7 @@ _GREETING_TIMEOUT_S = 5.0
 
 
 class DialOut:
-    """Keeps connections open to the dial-in ports of robots, for them to use.
-
-    Args:
-        local: ``host:port`` of this replica's own listener.
-    """
+    """Keeps connections open to the dial-in ports of robots, for them to use."""
 
     def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:
         host, port = host_and_port(local)
@@ -111,12 +107,7 @@ class DialOut:
         return link
 
     def _wait(self, link: socket.socket, stop: threading.Event) -> bool:
-        """Wait until the connection is taken into use; return False where we are to leave.
-
-        Raises:
-            OSError: It is broken, or the door is silent.
-            EOFError: The door hung up.
-        """
+        """Wait until the connection is taken into use; return False where we are to leave."""
         heard_at = time.monotonic()
         while not stop.is_set():
             if select.select([link], [], [], SIGN_EVERY_S)[0]:

@@ -57,11 +57,6 @@ class _Waiting:
 class DialIn:
     """The dial-in port of one robot or gateway.
 
-    Args:
-        listen: ``host:port``; port 0 for any that is free.
-        pool_uid: Replicas of other pools are turned away.
-        revoked: Common names that are turned away.
-
     Raises:
         WireError: The port cannot be had.
     """

@@ -38,12 +38,7 @@ class Forwarder:
     """Passes requests on, and each answer back to all that await it.
 
     Args:
-        held: Requests under way at once; more are refused as overloaded.
         of_one: The same for one robot: nobody takes all the room.
-        kept_bytes: Answers kept for copies that come later, in bytes together.
-
-    Attributes:
-        joined: Copies of requests that were known.
     """
 
     def __init__(

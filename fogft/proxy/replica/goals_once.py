@@ -78,7 +78,6 @@ class GoalsOnce:
     """Passes on the goals that are new.
 
     Args:
-        outstanding: Goals that an action server is given at once.
         accepted_kept: Accepted goals that are known at once, for each; the oldest go first.
     """
 

@@ -20,7 +20,6 @@ class KnownRequests:
     """The jobs that are held, and those that were answered not long ago.
 
     Args:
-        kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
         kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
     """
 

@@ -23,11 +23,7 @@ _TOLD = 8  # names in a sentence
 
 
 class Offering:
-    """The services of one replica.
-
-    Args:
-        services: Those of the configuration; none to find them out.
-    """
+    """The services of one replica."""
 
     def __init__(
         self,

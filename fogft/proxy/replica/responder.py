@@ -39,10 +39,6 @@ class Responder:
     """Hands requests to the local services and gives each copy its answer.
 
     Args:
-        max_in_flight: Requests held at once; more are refused as overloaded, from whom has
-            most waiting.
-        held_bytes: Their bytes together; more are refused as overloaded.
-        outstanding: Requests passed on to one service at once, where no limit is given.
         limits: How many may be at work, by service, where it is not to be learned.
         latest: Services of which the newest request goes first.
         passing: Whether a service's answer holds for the moment only: a copy is run anew; None
@@ -51,10 +47,7 @@ class Responder:
         answered: Told of each request that the service has answered, and when.
 
     Attributes:
-        ran, ran_s: Requests passed on, and the time until their responses together.
-        joined: Copies of requests that were known.
         saved, interrupted: Requests dropped unbegun, or told to stop, that nobody wanted any more.
-        wasted, wasted_s: Requests that were run for nobody: too late, or unwanted.
     """
 
     def __init__(
@@ -113,9 +106,6 @@ class Responder:
 
     def hanging(self, *, stuck: bool = False) -> dict[str, float]:
         """Return the services that have ended none of their work for unusually long.
-
-        Args:
-            stuck: Only those that are to be started anew for it.
 
         Returns:
             For how many seconds, by service.

@@ -29,12 +29,9 @@ class Supervisor:
 
     Args:
         command: A shell command; ``exec`` in it saves a process.
-        environ: All that it inherits.
         backoff_s: Second and longest wait between a death and the next start; the first start
             after a death is at once. A run longer than the longest wait resets it, and so does a
             death while requests were at work.
-        domain_id: The ROS domain that it gets; None for what `environ` says.
-        stdout: Descriptor for its standard output; None for our own.
     """
 
     def __init__(

@@ -48,11 +48,7 @@ class ClientProxy:
     """Sends each request to all replicas and returns the first success.
 
     Args:
-        pool_uid: The pool's uid, part of every key.
-        node: The robot's side of ROS; none in a gateway, where requests come from the wire.
-        make_dispatcher: Makes the dispatcher of a service, given how to respond.
         define: Returns the definition of a service type here; None to compare none.
-        merge: Makes one status of an action of what its replicas say.
     """
 
     def __init__(
@@ -234,9 +230,6 @@ class ClientProxy:
 
         Returns:
             Whether something had changed.
-
-        Raises:
-            RosError: The node's thread has ended: nothing would be taken any more.
         """
         if self._node is not None and not self._node.alive:
             raise RosError("ROS has stopped; the log says why", "start the proxy again")

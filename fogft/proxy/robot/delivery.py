@@ -30,13 +30,7 @@ Respond = Callable[[Any, bytes], None]
 
 
 class Delivery:
-    """How one service's requests end.
-
-    Args:
-        respond: Sends a response to the caller of a handle. Any thread.
-        empty_response: The serialised default response, for ``on_timeout: empty``.
-        forget: Tells these replicas that a request is no longer wanted.
-    """
+    """How one service's requests end."""
 
     def __init__(
         self,

@@ -42,11 +42,7 @@ _COUNTS = (
 
 
 class Diagnosis:
-    """Turns reports into statuses.
-
-    Args:
-        robot: The robot's; it is the hardware that the pool's and the services' statuses name.
-    """
+    """Turns reports into statuses."""
 
     def __init__(self, pool: str, robot: str) -> None:
         self._pool = pool
@@ -208,13 +204,7 @@ _DIAGNOSE_EVERY_S = 1.0
 
 
 class SeenFromRos:
-    """The proxied services and the pool, as ROS's tools see them.
-
-    Args:
-        make_visible: Makes the visible node, given who judges parameters; returns None where
-            there is none, and then nothing is shown or set.
-        check_field: Says why a type's response has no boolean field of that name.
-    """
+    """The proxied services and the pool, as ROS's tools see them."""
 
     def __init__(
         self,

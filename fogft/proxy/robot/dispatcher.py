@@ -54,15 +54,11 @@ class Dispatcher:
     """The requests of one service, from the caller's request to the caller's response.
 
     Args:
-        respond: Sends a response to a caller. Any thread.
-        decide: What answers mean; the first success unless given.
         fault_of: Returns what is wrong with the bytes of a response; empty for nothing. One that
             is malformed is a failure of its replica, and another answer is awaited.
         ok_of: Returns, for a name of a boolean response field, whether a response is a success;
             asked where the spec names an `ok_field`.
-        empty_response: The serialised default response, for ``on_timeout: empty``.
         max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
-        id_of: Gives a caller's request its id, by service and handle.
 
     Attributes:
         leaving: Whether callers' requests are left to another proxy, which gets them too.
@@ -320,9 +316,6 @@ class Dispatcher:
 
     def adopt(self, spec: ServiceSpec, fallback: RosClient | None = None) -> None:
         """Follow another policy from now on; requests under way keep their deadlines.
-
-        Args:
-            fallback: The client of its fallback service, if it has one.
 
         Raises:
             RosError: The response has no such `ok_field`; nothing was changed.

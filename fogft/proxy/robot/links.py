@@ -125,11 +125,7 @@ Define = Callable[[str], Definition]
 
 
 class TypeCheck:
-    """Compares what replicas tell of their types with what they are here.
-
-    Args:
-        define: Returns a type's definition here; None where types are not known here.
-    """
+    """Compares what replicas tell of their types with what they are here."""
 
     def __init__(self, define: Define | None) -> None:
         self._define = define
@@ -175,11 +171,7 @@ class TypeCheck:
 
 
 class Links:
-    """Who is talked to.
-
-    Args:
-        keys: Returns the keys of all services and topics at a slot.
-    """
+    """Who is talked to."""
 
     def __init__(self, dialer: Dialer, events: LinkEvents, keys: Keys) -> None:
         self._dialer = dialer

@@ -27,7 +27,6 @@ class ManagerRestart:
     """Looks now and then whether the manager of this machine was killed.
 
     Args:
-        folder: The pool's. Without a manager's file in it nothing is ever started.
         environ: The environment for it: what our own was before ROS was prepared in it.
     """
 
@@ -48,11 +47,7 @@ class ManagerRestart:
         self.child: subprocess.Popen[bytes] | None = None
 
     def look(self) -> None:
-        """Start it where it has been missing for a while, less and less often.
-
-        Raises:
-            StateError: It cannot be started, or its file is damaged.
-        """
+        """Start it where it has been missing for a while, less and less often."""
         now = self._clock()
         if now < self._look_at:
             return

@@ -64,7 +64,6 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     """Run until a signal ends it.
 
     Args:
-        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
         standby: Where one runs already, wait until it ends, and take its place at once.
 
     Raises:
@@ -134,11 +133,6 @@ def make_dispatcher(
     id_of: Callable[[str, Any], bytes] | None = None,
 ) -> Dispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
-
-    Args:
-        respond: Sends a response to the caller of a handle.
-        speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
-        id_of: Gives a request its id, by service and handle; a random one unless given.
 
     Raises:
         RosError: The type is needed and cannot be loaded.

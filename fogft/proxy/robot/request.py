@@ -20,12 +20,7 @@ _TRACE_KEPT = 20_000  # lines until they are written, twice a second
 
 
 class RequestTrace:
-    """Who was asked for a traced request. Moments are on the dispatcher's clock, seconds.
-
-    Attributes:
-        asked: Each replica that took it, with the moment when it was asked first.
-        refused: Each replica that refused it, with its last reason.
-    """
+    """Who was asked for a traced request. Moments are on the dispatcher's clock, seconds."""
 
     __slots__ = ("asked", "refused")
 
@@ -40,11 +35,7 @@ class RequestTrace:
 
 
 class Request:
-    """A caller's request. `arrived` is on the dispatcher's clock, seconds.
-
-    Attributes:
-        trace: Who was asked; None where it is not traced.
-    """
+    """A caller's request. `arrived` is on the dispatcher's clock, seconds."""
 
     __slots__ = ("arrived", "handle", "payload", "trace")
 
@@ -56,11 +47,7 @@ class Request:
 
 
 class Ledger:
-    """One service's requests and counters. All is used under the lock.
-
-    Attributes:
-        lock: Held for moments, never while something is sent or delivered.
-    """
+    """One service's requests and counters. All is used under the lock."""
 
     def __init__(
         self, spec: ServiceSpec, requests: PendingRequests[Request], clock: Callable[[], float]

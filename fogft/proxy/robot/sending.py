@@ -24,8 +24,6 @@ class Sender:
     """Sends one service's requests.
 
     Attributes:
-        links: Those that may be asked, by replica.
-        able: The replicas that the policy may choose.
         next_look: When the policy wants to be asked, as `offer_more` found it.
     """
 

@@ -131,13 +131,7 @@ def hand_over(
     callers: Callable[[], Mapping[str, int]],
     release: Callable[[], None],
 ) -> None:
-    """Let the standby take over, if there is one; return when nothing is left to do.
-
-    Args:
-        config: This proxy's. Replicas that dial in have one door, so with it nothing is shared.
-        callers: Counts who may call each service that we offer.
-        release: Gives up the lock, and all else that the standby needs for itself.
-    """
+    """Let the standby take over, if there is one; return when nothing is left to do."""
     try:
         if config.dial_in or not disk.is_locked(disk.standby_lock(config.lock)):
             return

@@ -43,9 +43,7 @@ class ConnectionReaper:
     """Looks after one port until closed.
 
     Args:
-        port: The port that this process listens at.
         links: Returns the peers' addresses of authenticated links, with their common names.
-        revoked: Returns the names whose links are to be ended.
         counters: Counts ``unauthenticated``, ``revoked_links`` and ``stuck_links`` ended, and when
             the door was shut or no descriptors were left.
         stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.

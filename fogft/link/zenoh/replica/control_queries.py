@@ -36,11 +36,7 @@ _STRANGERS = b""  # in place of a token: replies to whose connection is not know
 
 
 class ControlQueries:
-    """Answers the queries of robots.
-
-    Args:
-        records: What the pool has signed, as far as it is known here.
-    """
+    """Answers the queries of robots."""
 
     def __init__(
         self,

@@ -38,11 +38,7 @@ Instruction = tuple[int, int, int, int]
 
 
 class ListenFilter:
-    """What is dropped at one port of this process. For one thread.
-
-    Args:
-        port: Where it listens; where no socket does, nothing is done.
-    """
+    """What is dropped at one port of this process. For one thread."""
 
     def __init__(self, port: int) -> None:
         self._listening = sockets.listening(port)

@@ -57,14 +57,8 @@ class ZenohListener:
     """A replica's end: it hears requests and probes of robots that its CA admits.
 
     Args:
-        listen: ``host:port``; port 0 for any that is free.
-        credentials: The replica's certificate and key, and the pool's CA.
-        id: Which replica this is: it hears the keys of its slot only.
         handshakes: Tells which handshakes were refused; None where they need not be counted.
         certificate_name: The common name of its certificate, where that is not the replica's.
-
-    Raises:
-        WireError: `listen` is not ``host:port``.
     """
 
     def __init__(

@@ -41,9 +41,6 @@ class QueryTurns:
 class QueryEnd:
     """A query that is to be ended, after a refusal if there is one.
 
-    Args:
-        turn: When it came, by `QueryTurns`.
-
     Attributes:
         refusal: What is said before; empty for nothing.
     """

@@ -107,11 +107,7 @@ class ReplyQueue:
         self._taken: list[Reply | QueryEnd | None] = []  # it did not fit to what was taken before
 
     def next(self, timeout_s: float) -> list[Reply] | QueryEnd:
-        """Wait for what is to be sent next, together, or to be ended; nothing where all ends.
-
-        Raises:
-            Empty: Nothing came.
-        """
+        """Wait for what is to be sent next, together, or to be ended; nothing where all ends."""
         first = self._taken.pop() if self._taken else self.replies.get(timeout=timeout_s)
         if first is None:
             return []
@@ -140,8 +136,6 @@ class ReplyQueues:
 
     Args:
         counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
-        thin: Whether the link of a connection was seen to be thin, by its token.
-        later: Has something done by a thread that may block; the collector of garbage calls it.
         idle_s: A thread that had nothing to send for so long ends.
     """
 
@@ -166,12 +160,7 @@ class ReplyQueues:
         return len(self._queues)
 
     def put(self, token: bytes, robot: str, reply: Reply, *, more: bool) -> None:
-        """Send a reply, or queue it. Never blocks; where too much waits, the robot gets none.
-
-        Args:
-            token: The robot's connection: replies of one never wait for another's.
-            more: Others will soon follow, to leave in one message with it.
-        """
+        """Send a reply, or queue it. Never blocks; where too much waits, the robot gets none."""
         may_send = not more and reply.small and not threads.is_this()
         if may_send and not self._closed and self._sent_at_once(reply):
             self._count(reply)

@@ -146,11 +146,7 @@ class Stream:
 
 
 class Streams:
-    """The open queries for answers, by the token of their connection.
-
-    Args:
-        slow: Whether the holder of a certificate is known to read slowly.
-    """
+    """The open queries for answers, by the token of their connection."""
 
     def __init__(self, limit: int = LIMIT, slow: Callable[[str], bool] = lambda _: False) -> None:
         self._limit = limit

@@ -34,12 +34,7 @@ class NotAdmittedError(Exception):
 
 
 class AuthenticatedSessions:
-    """The connections that were authenticated. Any thread.
-
-    Args:
-        pool_uid: Holders of other pools are not let in.
-        replica: This replica's common name, which a greeting is made out to.
-    """
+    """The connections that were authenticated. Any thread."""
 
     def __init__(self, pool_uid: str, replica: str, verify: Verify) -> None:
         self._pool_uid = pool_uid

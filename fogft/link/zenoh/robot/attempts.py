@@ -73,13 +73,7 @@ class Outlet(Protocol):
 
 @dataclass(frozen=True)
 class Callbacks:
-    """What a connection tells its link. Called from any thread; none may block.
-
-    Attributes:
-        room: A window that was full has room again.
-        large: Something large is sent, and `Attempts.watched` was not set.
-        lost: The connection is of no more use. Perhaps more than once.
-    """
+    """What a connection tells its link. Called from any thread; none may block."""
 
     answered: Callable[[Answer], None]
     late: Callable[[Answer], None]
@@ -92,7 +86,6 @@ class Attempts:
     """The attempts of one connection.
 
     Args:
-        origin: What the headers of all its requests say (`frame.origin`).
         cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
 
     Attributes:

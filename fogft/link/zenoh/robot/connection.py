@@ -62,12 +62,10 @@ class Connection:
     """An open session whose peer was found to be the right one.
 
     Attributes:
-        certificate: Ours (DER), which it uses.
         lost_because: Why it is of no more use; empty while it is.
         told: The records that the replica has taken from us.
 
     Raises:
-        zenoh.ZError: Nothing was reached.
         WireError: Somebody else was reached. Nothing was sent to them.
         CredentialError: Our own certificate or key cannot be used.
     """

@@ -24,14 +24,7 @@ _CLOSE_WAIT_S = 3.0
 
 
 class ZenohDialer:
-    """Makes links over Zenoh; see `port.Dialer`.
-
-    Args:
-        credentials: The robot's certificate and key, and the pool's CA.
-        pool_uid: The pool; peers of another are refused.
-        suspect_after_s: Probes unanswered for so long make a link suspect.
-        tell_losers: Whether replicas are told which requests are no longer wanted.
-    """
+    """Makes links over Zenoh; see `port.Dialer`."""
 
     def __init__(
         self,
@@ -59,11 +52,7 @@ class ZenohDialer:
         self._shared.options = options
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
-        """Start a link; return at once, in state CONNECTING.
-
-        Raises:
-            WireError: The peer belongs to another pool.
-        """
+        """Start a link; return at once, in state CONNECTING."""
         if peer.id.pool_uid != self._pool_uid:
             raise WireError(f"replica `{peer.id}` belongs to another pool than this robot")
         link = ZenohLink(self._shared, peer, services, events, self._closed)

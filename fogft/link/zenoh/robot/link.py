@@ -354,11 +354,7 @@ class ZenohLink:
             connection.lost_because = "the connection was lost"
 
     def _listen(self, connection: Connection) -> bool:
-        """Take what was heard; return whether the link is up by it.
-
-        Raises:
-            WireError: Another replica answers here, or nothing that can be read.
-        """
+        """Take what was heard; return whether the link is up by it."""
         up = False
         for heard in self._probing.heard(connection):
             if connection.begin():

@@ -117,11 +117,7 @@ class Probing:
                 yield heard
 
     def take(self, heard: Heard) -> ProbeAnswer:
-        """Take an answer, which ends the silence, and return it.
-
-        Raises:
-            WireError: Another replica answers here, or nothing that can be read.
-        """
+        """Take an answer, which ends the silence, and return it."""
         answer = self._read(heard.content)
         self._of_connection.ended()
         self._of_replica.ended()

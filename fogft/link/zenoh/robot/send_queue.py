@@ -21,11 +21,7 @@ Waiting = list[tuple[float, int, OpenAttempt]]
 
 
 class SendQueue:
-    """A queue of attempts; None ends the sender thread. Any thread.
-
-    Args:
-        latest: Services of which the newest is preferred.
-    """
+    """A queue of attempts; None ends the sender thread. Any thread."""
 
     def __init__(self, latest: Collection[str] = ()) -> None:
         self._queued: SimpleQueue[OpenAttempt | str | None] = SimpleQueue()

@@ -16,9 +16,6 @@ class Shared:
     """What all links of one robot share. Written by the dialer, read by its links.
 
     Attributes:
-        suspect_after_s: Probes unanswered for so long make a link suspect.
-        tell_losers: Whether replicas are told which requests are no longer wanted.
-        records: Signed records for every replica, packed; empty for none.
         newer: Slot -> what its replica said last in place of records that are out of date.
     """
 
