@@ -52,6 +52,7 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
     """The header of a request.
 
     Attributes:
+        may_pack: The answer may be compressed.
         reads_packed: It may be where the replica itself finds the link to be thin.
     """
 
@@ -132,7 +133,8 @@ def decode_request(frame: bytes) -> RequestHeader:
     if len(frame) < _ORIGIN_AT:
         raise FrameError(f"a request's header of {len(frame)} bytes")
     version, flags, request_id, remaining_s, seen = _REQUEST.unpack_from(frame)
-    check_version(version)
+    if version != VERSION:
+        check_version(version)
     handling = read_handling(flags & ~_PACKING)
     check_remaining(remaining_s)
     token, robot = read_origin(frame[_ORIGIN_AT:])
@@ -171,7 +173,7 @@ def decode_load(frame: bytes) -> Load | None:
     """Return what a replica has to do; None where it does not say. `frame` has `LOAD_BYTES`."""
     if frame == NO_LOAD:
         return None
-    load = Load._make(_LOAD.unpack(frame))
+    load = Load(*_LOAD.unpack(frame))
     if not (0 <= load.service_s <= LONGEST_S and 0 <= load.spent_s <= LONGEST_S):
         raise FrameError(f"a load of {load.service_s} s and {load.spent_s} s")
     return load
@@ -189,8 +191,9 @@ def decode_answer(frame: bytes) -> tuple[bytes, bytes, Load | None, bool]:
     if len(frame) != _ANSWER.size:
         raise FrameError(f"an answer's header of {len(frame)} bytes")
     first, stamp, request_id, load = _ANSWER.unpack(frame)
-    check_version(first & ~_ANSWER_PACKED)
-    return stamp, request_id, decode_load(load), bool(first & _ANSWER_PACKED)
+    if first != VERSION:
+        check_version(first & ~_ANSWER_PACKED)
+    return stamp, request_id, decode_load(load), first != VERSION
 
 
 def encode_refusal(stamp: bytes, request_id: bytes, reason: str, load: bytes = NO_LOAD) -> bytes:

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import bisect
 import threading
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import Enum
 from types import MappingProxyType
 from typing import Any
 
 from fogft.model.refusal import Effect, Refusal
-from fogft.model.replica import ReplicaId
 
 _LATENCIES_KEPT = 2000
 # Upper bounds of the histogram's buckets, seconds: from a local call to a planner that thinks.
@@ -38,14 +38,24 @@ class Outcome(str, Enum):
     POISON = "poison"  # services died while they worked on it
 
 
+@dataclass
+class OfReplica:
+    """How often a replica was first, and how often it answered a request well or not, at all."""
+
+    won: int = 0
+    well: int = 0
+    ill: int = 0
+
+
 class Outcomes:
-    """Counts since the start.
+    """Counts since the start. Replicas are numbers, as in `requests`.
 
     Attributes:
         count: By `OUTCOMES_COUNTED`. ``sent`` are copies of requests; ``fallback_failed`` calls of
             the fallback that came to nothing; ``rejected`` responses that were not ok;
             ``undelivered`` those that ROS did not take. ``request_bytes`` are those of all
             received requests together, ``response_bytes`` those of the first answers of replicas.
+        of: By replica.
         poisoned_at: When services last died over a request that was then given up; wall clock.
         trace: How each request ended, until somebody takes it; None where it is not wanted.
     """
@@ -53,9 +63,7 @@ class Outcomes:
     def __init__(self) -> None:
         self.count = dict.fromkeys(OUTCOMES_COUNTED, 0)
         self.refused: dict[str, int] = {}
-        self._won: dict[ReplicaId, int] = {}
-        self._well: dict[ReplicaId, int] = {}
-        self._ill: dict[ReplicaId, int] = {}
+        self.of: defaultdict[int, OfReplica] = defaultdict(OfReplica)
         self._latencies: deque[float] = deque(maxlen=_LATENCIES_KEPT)
         self._buckets = [0] * (len(BUCKETS_S) + 1)
         self._took_s = 0.0
@@ -68,11 +76,13 @@ class Outcomes:
         self.count["received"] += 1
         self.count["request_bytes"] += size_bytes
 
-    def won(self, replica: ReplicaId, took_s: float, size_bytes: int) -> None:
+    def won(self, replica: int, took_s: float, size_bytes: int) -> None:
         """Count a request that a replica has answered first, and the size of its response."""
         self.count["answered"] += 1
         self.count["response_bytes"] += size_bytes
-        self._won[replica] = self._won.get(replica, 0) + 1
+        ended = self.of[replica]
+        ended.won += 1
+        ended.well += 1
         self._latencies.append(took_s)
         self._buckets[bisect.bisect_left(BUCKETS_S, took_s)] += 1
         self._took_s += took_s
@@ -102,32 +112,16 @@ class Outcomes:
                 }
             )
 
-    def won_by(self, replica: ReplicaId) -> int:
-        """Return how many requests a replica has answered first."""
-        return self._won.get(replica, 0)
-
-    def refusal(self, reason: Refusal, replica: ReplicaId | None = None) -> None:
+    def refusal(self, reason: Refusal, replica: int | None = None) -> None:
         """Count a refusal, and hold it against the replica if it was of a request."""
         self.refused[reason.value] = self.refused.get(reason.value, 0) + 1
         if replica is not None and Effect.FAULT in reason.effect:
-            self.failed(replica)
+            self.of[replica].ill += 1
 
-    def served(self, replica: ReplicaId) -> None:
-        """Count a request that a replica has answered well, first or not."""
-        self._well[replica] = self._well.get(replica, 0) + 1
-
-    def failed(self, replica: ReplicaId) -> None:
-        """Count a request that came to nothing at a replica, by the fault of its service."""
-        self._ill[replica] = self._ill.get(replica, 0) + 1
-
-    def rejected(self, replica: ReplicaId) -> None:
+    def rejected(self, replica: int) -> None:
         """Count a response that was real, but not ok."""
         self.count["rejected"] += 1
-        self.failed(replica)
-
-    def by(self, replica: ReplicaId) -> tuple[int, int]:
-        """Return how many requests a replica has answered well, and how many failed there."""
-        return self._well.get(replica, 0), self._ill.get(replica, 0)
+        self.of[replica].ill += 1
 
     def late(self) -> None:
         """Count an answer that came too late to be used. Any thread, no other lock."""
@@ -143,7 +137,7 @@ class Outcomes:
         return {
             **self.count,
             "refused": dict(self.refused),
-            "won": {replica.short: count for replica, count in self._won.items()},
+            "won": {_short(key): one.won for key, one in self.of.items() if one.won},
             "poisoned_at": self.poisoned_at,
             "p50_s": ordered[len(ordered) // 2] if ordered else None,
             "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,

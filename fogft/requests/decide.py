@@ -122,7 +122,7 @@ class Decide:
         return True
 
     def request_of(self, id: bytes) -> bytes | None:
-        """Return the request that an attempt is about; None for one that is about none."""
+        """Return the request that an attempt is about, None for none. Without the lock, too."""
         return id
 
     def reach(self, replicas: Reachable, now: float) -> None:

@@ -199,12 +199,11 @@ class ClientProxy:
 
     def answered(self, link: Link, answer: Answer) -> None:
         """Pass the end of an attempt to its service: the one that knows the request."""
-        if answer.service in self._topics:
-            self._topics.answered(key_of(link), answer)
-            return
         service = self._services.get(answer.service)
         if service is not None:
             service.dispatcher.answered(link, answer)
+        elif answer.service in self._topics:
+            self._topics.answered(key_of(link), answer)
 
     def changed(self, link: Link) -> None:
         """Wake `run_once`: routes are worked out there, not on a link's thread."""

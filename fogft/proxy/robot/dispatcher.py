@@ -89,7 +89,6 @@ class Dispatcher:
         self.max_pending_bytes = max_pending_bytes
         self.max_pending = max_pending
         self._decide = Decide() if decide is None else decide
-        self._replication = self._decide if self._decide.replicates else None
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
         self._busy_until = NEVER if self._decide.replicates else -NEVER
@@ -154,7 +153,7 @@ class Dispatcher:
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
         self._sender.first(request, payload, links, chosen, timeout_s)
-        if self._replication is not None:
+        if self._decide.replicates:
             self._sender.replicate()
         if soon < self._sender.next_look:
             self._wake()
@@ -185,23 +184,22 @@ class Dispatcher:
         """Take the end of an attempt from a link's thread."""
         payload, replica, id = answer.payload, key_of(link), link.peer.id
         if payload is None:
-            self._refused(id, replica, answer, answer.refusal or Refusal.LOST)
+            self._refused(replica, answer, answer.refusal or Refusal.LOST)
             return
+        request = self._decide.request_of(answer.request_id)
         try:
-            fault = self._fault_of(payload) if self._is_response(answer.request_id) else ""
+            fault = "" if request is None else self._fault_of(payload)
             reading = None if fault else self._decide.read(payload)
         except RosError as error:
             fault = error.message
         if fault:  # no response of this type
             self._misread(replica, id, fault)
-            self._refused(id, replica, answer, Refusal.MALFORMED)
+            self._refused(replica, answer, Refusal.MALFORMED)
             return
         now, outcomes = self._clock(), self.outcomes
-        attempt, replication = answer.request_id, self._replication
         with self._lock:
-            request = attempt if replication is None else replication.request_of(attempt)
             means, pending, losers, verdict = self._requests.answered(
-                attempt, request, replica, payload, reading, answer.load, now
+                answer.request_id, request, replica, payload, reading, answer.load, now
             )
         if self._requests.choose.news:
             self._wake()
@@ -210,29 +208,21 @@ class Dispatcher:
             if losers:
                 self._sender.forget(request, losers)
             with self._lock:
-                outcomes.served(id)
-                outcomes.won(id, now - pending.item.arrived, len(payload))
+                outcomes.won(replica, now - pending.item.arrived, len(payload))
                 if outcomes.trace is not None:
                     self._ledger.trace(request, pending, Outcome.ANSWERED, now, replica=id.short)
         elif means is Means.SUCCESS or means is Means.LATE:
             with self._lock:
-                outcomes.served(id)
+                outcomes.of[replica].well += 1
             outcomes.late()
         elif means is Means.UNDECIDED and verdict is Verdict.LATE:
             outcomes.late()
         elif means is Means.REJECTION and request is not None:
             with self._lock:
-                outcomes.rejected(id)
+                outcomes.rejected(replica)
             self._after(request, verdict)
         elif isinstance(means, Refusal):
-            self._failed(id, replica, request, means)
-
-    def _is_response(self, attempt: bytes) -> bool:
-        """Whether an attempt was a caller's request, and not what else replicas must have."""
-        if self._replication is None:
-            return True
-        with self._lock:
-            return self._replication.request_of(attempt) is not None
+            self._failed(replica, request, means)
 
     def _misread(self, replica: int, id: ReplicaId, fault: str) -> None:
         """Hold it against a replica that it sent what is no response."""
@@ -259,20 +249,20 @@ class Dispatcher:
         if worked:
             self.outcomes.late()
 
-    def _refused(self, id: ReplicaId, replica: int, answer: Answer, refusal: Refusal) -> None:
-        attempt, replication = answer.request_id, self._replication
+    def _refused(self, replica: int, answer: Answer, refusal: Refusal) -> None:
+        attempt = answer.request_id
+        request = self._decide.request_of(attempt)
         with self._lock:
-            request = attempt if replication is None else replication.request_of(attempt)
             if answer.load is not None:
                 self._requests.choose.heard(attempt, replica, answer.load, self._clock())
             pending = self._requests.get(request)
             self._decide.refused(attempt, replica, refusal, answer.detail, pending)
-        self._failed(id, replica, request, refusal)
+        self._failed(replica, request, refusal)
 
-    def _failed(self, id: ReplicaId, replica: int, request: bytes | None, refusal: Refusal) -> None:
+    def _failed(self, replica: int, request: bytes | None, refusal: Refusal) -> None:
         now = self._clock()
         with self._lock:
-            self.outcomes.refusal(refusal, None if request is None else id)
+            self.outcomes.refusal(refusal, None if request is None else replica)
             pending = self._requests.get(request)
             if pending is not None and pending.item.trace is not None:
                 pending.item.trace.refused[replica] = refusal

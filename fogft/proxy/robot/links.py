@@ -18,6 +18,7 @@ from dataclasses import asdict
 from typing import Any
 
 from fogft.link.port import Dialer, GatewayView, Link, LinkEvents, LinkStatus, Peer
+from fogft.metrics.outcomes import OfReplica
 from fogft.model.replica import LinkState, Member, ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.type_definition import Definition, difference
@@ -39,7 +40,8 @@ def link_report(
     status, id = link.status(), link.peer.id
     answer = status.probe_answer
     ours = next(iter(differ.values()), "") if link.usable else ""
-    ended = [dispatcher.outcomes.by(id) for dispatcher in dispatchers]
+    key = key_of(link)
+    ended = [one.outcomes.of.get(key, OfReplica()) for one in dispatchers]
     return {
         "slot": id.slot,
         "generation": id.generation,
@@ -50,20 +52,19 @@ def link_report(
         "offered": dict(answer.offered) if answer and link.usable else {},
         "draining": draining,
         "at_risk": bool(answer and answer.at_risk),
-        "disagrees": status.ignores
-        or any(dispatcher.disagrees(key_of(link)) for dispatcher in dispatchers),
+        "disagrees": status.ignores or any(dispatcher.disagrees(key) for dispatcher in dispatchers),
         "ignores": status.ignores,
-        "misread": any(dispatcher.misreads(key_of(link)) for dispatcher in dispatchers),
+        "misread": any(dispatcher.misreads(key) for dispatcher in dispatchers),
         "heard_age_s": status.heard_age_s,
         "silent_for_s": status.silent_for_s,
         "rtt_s": status.rtt_s,
         "in_flight": status.in_flight,
         "reopened": status.reopened,
-        "won": sum(dispatcher.outcomes.won_by(id) for dispatcher in dispatchers),
+        "won": sum(one.won for one in ended),
         "restarts": answer.restarts if answer else 0,
         "strangers": answer.strangers if answer else 0,
-        "answered": sum(well for well, _ in ended),
-        "failed": sum(ill for _, ill in ended),
+        "answered": sum(one.well for one in ended),
+        "failed": sum(one.ill for one in ended),
         "work": dict(answer.work) if answer else {},
         "hanging": sorted(answer.hanging) if answer else [],
         "version": answer.version if answer else "",

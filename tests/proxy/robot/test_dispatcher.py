@@ -84,7 +84,7 @@ def test_the_first_answer_is_returned_and_the_second_is_late():
     scene.answer(0, b"slow")
     assert scene.responses == [("caller", b"fast")]
     assert scene.dispatcher.report()["late"] == 1
-    assert scene.dispatcher.outcomes.won_by(scene.links[1].peer.id) == 1
+    assert scene.dispatcher.outcomes.of[key_of(scene.links[1])].won == 1
 
 
 def test_bytes_of_requests_and_of_first_answers_are_counted():

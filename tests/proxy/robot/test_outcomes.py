@@ -6,9 +6,8 @@ import pytest
 
 from fogft.metrics.outcomes import Outcomes
 from fogft.model.refusal import Refusal
-from fogft.model.replica import ReplicaId
 
-REPLICA = ReplicaId("0123456789abcdef", 0, 1)
+REPLICA = 1
 
 
 @pytest.mark.parametrize(
@@ -26,8 +25,7 @@ def test_only_what_its_service_did_is_held_against_a_replica(reason, held):
     """A replica that still starts, is full or cut off says nothing about its version."""
     outcomes = Outcomes()
     outcomes.refusal(reason, REPLICA)
-    outcomes.served(REPLICA)
-    assert outcomes.by(REPLICA) == (1, held)
+    assert outcomes.of[REPLICA].ill == held
     assert outcomes.refused == {reason: 1}
 
 
@@ -35,4 +33,4 @@ def test_a_refusal_of_no_request_is_counted_and_held_against_nobody():
     outcomes = Outcomes()
     outcomes.refusal(Refusal.CRASHED)
     assert outcomes.refused == {Refusal.CRASHED: 1}
-    assert outcomes.by(REPLICA) == (0, 0)
+    assert not outcomes.of

@@ -86,9 +86,7 @@ class ZenohListener:
         self._turns = QueryTurns()
         self.revoke = self._sessions.revoke  # let these holders in no more
         self._work_queue = WorkQueue("fogft-probes", self._counters)
-        self._queues = ReplyQueues(
-            self._counters, self._turns, thin=self._thin, later=self._work_queue.add
-        )
+        self._queues = ReplyQueues(self._counters, self._turns, later=self._work_queue.add)
         self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
@@ -163,9 +161,6 @@ class ZenohListener:
     def _slow(self, holder: str) -> bool:
         """Whether what a robot is sent was seen to leave slowly."""
         return self._reaper is not None and holder in self._reaper.thin
-
-    def _thin(self, token: bytes) -> bool:
-        return self._slow(self._sessions.holder(token))
 
     def _count_handshakes(self) -> None:
         for reason in self._handshakes.refusals() if self._handshakes else ():

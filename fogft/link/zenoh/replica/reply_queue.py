@@ -144,11 +144,10 @@ class ReplyQueues:
         counters: Counters,
         turns: QueryTurns | None = None,
         *,
-        thin: Callable[[bytes], bool] = lambda token: False,
         later: Callable[[Callable[[], None]], None] = lambda job: job(),
         idle_s: float = _IDLE_S,
     ) -> None:
-        self.thin, self.later = thin, later
+        self.later = later
         self._counters = counters
         self._turns = turns or QueryTurns()
         self._idle_s = idle_s
@@ -308,7 +307,7 @@ class ZenohIncoming:
             return  # answered before
         self.payload = b""
         header = self._header
-        packs = header.may_pack or (header.reads_packed and self._queues.thin(header.token))
+        packs = header.may_pack or (header.reads_packed and stream.slow())
         said = frame.encode_load(load)
         reply = Reply(stream, header.request_id, payload, refusal, said, may_pack=packs)
         self._queues.put(header.token, header.robot, reply, more=more)

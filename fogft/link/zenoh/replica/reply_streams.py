@@ -54,7 +54,7 @@ class ReplyCredit:
         slow: Callable[[], bool] = lambda: False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._slow = slow
+        self.slow = slow
         self._clock = clock
         self._gate = threading.Lock()  # held by who sends at once, which does not take long
         self._lock = threading.Lock()
@@ -85,7 +85,7 @@ class ReplyCredit:
 
     def send_at_once(self, connection: object, send: Send) -> bool:
         """Call `send` for something of at most 16 KiB where it cannot block; return whether."""
-        if self._slow() or not self._gate.acquire(blocking=False):
+        if self.slow() or not self._gate.acquire(blocking=False):
             return False
         try:
             stamp = os.urandom(STAMP_BYTES)
@@ -139,6 +139,7 @@ class Stream:
     def __init__(self, query: zenoh.Query, credit: ReplyCredit | None = None) -> None:
         self.query = query
         credit = credit or ReplyCredit()
+        self.slow = credit.slow
         name = object()  # of this connection: it must not keep the query, which ends with us
         self.seen = partial(credit.seen, name)
         self.send = partial(credit.send, name)

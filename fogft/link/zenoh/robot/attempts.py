@@ -169,11 +169,12 @@ class Attempts:
             return True
         # It cannot block: the hop to another thread is saved.
         attempt.mark = mark
-        if (more or self._batch) and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
+        together = more or bool(self._batch)
+        if together and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
             self._send_together(self._batch.add(attempt))
         else:
             self._send_at_once(attempt, payload, remaining_s)
-        if not more:
+        if together and not more:
             self.send()
         return True
 
@@ -259,7 +260,8 @@ class Attempts:
     def _close(self, attempt: OpenAttempt, answer: Answer) -> None:
         if self.window.remove(attempt):
             attempt.payload = None
-            self._answered(answer._replace(service=attempt.service))
+            id, payload, refusal, _, detail, load = answer
+            self._answered(Answer(id, payload, refusal, attempt.service, detail, load))
             if self.window.regained_room():
                 self._room()
 
@@ -330,10 +332,10 @@ class Attempts:
             self._outlet.lose("it took nothing more, and Zenoh gave the session up")
 
     def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
-        compression = self._compressions.get(attempt.service)
+        compression, rate = self._compressions.get(attempt.service), self._progress.bytes_per_s
         packed = None
-        if compression is not None:
-            packed = compression.pack(payload, self._progress.bytes_per_s)
+        if compression is not None and rate is not None:
+            packed = compression.pack(payload, rate)
         reads_packed = attempt.reads_packed = compression is not None
         self._unanswered.add(attempt)
         header = frame.encode_request(
@@ -342,7 +344,7 @@ class Attempts:
             self._origin,
             seen=self._seen,
             packed=packed is not None,
-            may_pack=reads_packed and self._flow.thin,
+            may_pack=reads_packed and rate is not None and self._flow.thin,
             reads_packed=reads_packed,
             handling=attempt.handling,
         )
