@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from fogft.cli import output
 from fogft.cli.status_text import age
+from fogft.model.plain import to_plain
 from fogft.reason_words import words
 
 if TYPE_CHECKING:
@@ -58,9 +59,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
             {
                 "slot": replica.slot,
                 "group": replica.group,
-                "location": replica.offer.placement.location,
-                "instance": replica.offer.placement.instance,
-                "spot": replica.offer.placement.spot,
+                **_machine_json(replica.offer),
                 "usd_per_hour": replica.offer.usd_per_hour,
                 "extras_usd_per_hour": replica.offer.extras_usd_per_hour,
                 "rtt_s": replica.rtt_s,
@@ -72,8 +71,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
         "one_on_demand": None
         if plan.single is None
         else {
-            "location": plan.single[0].placement.location,
-            "instance": plan.single[0].placement.instance,
+            **_machine_json(plan.single[0]),
             **_cost_json(plan.single[1]),
         },
         "pool_is_cheapest": plan.is_cheapest,
@@ -82,12 +80,7 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
             "expected": plan.expected.correlated,
             "if_independent": plan.expected.independent,
             "services": dict.fromkeys(names or ["*"], vars(plan.expected)),
-            "assumed": {
-                "spot_uptime_s": plan.assumed.spot_uptime_s,
-                "on_demand_uptime_s": plan.assumed.on_demand_uptime_s,
-                "recovery_s": plan.assumed.recovery_s,
-                "correlation": vars(plan.assumed.correlation),
-            },
+            "assumed": to_plain(plan.assumed),
         },
         "traffic": {service.name: _traffic_json(shown, service) for service in shown.spec.services},
         "ready_p90_s": shown.ready_p90_s,
@@ -221,6 +214,11 @@ def _money(cost: Cost) -> str:
     return f"${cost.usd_per_hour:.3f}/h, ${cost.usd_per_month:,.0f} a month{egress}"
 
 
+def _machine_json(offer: Offer) -> dict[str, Any]:
+    place = offer.placement
+    return {"location": place.location, "instance": place.instance, "spot": place.spot}
+
+
 def _cost_json(cost: Cost) -> dict[str, float]:
     return {
         "machines_usd_per_hour": cost.machines,
@@ -233,13 +231,8 @@ def _cost_json(cost: Cost) -> dict[str, float]:
 def _offer_json(shown: PlanShown, one: Considered) -> dict[str, Any]:
     place = one.offer.placement
     distance = shown.distances.get(f"{place.cloud}/{place.region}")
-    slots: Sequence[int] = one.slots
     return {
-        "cloud": place.cloud,
-        "region": place.region,
-        "zone": place.zone,
-        "instance": place.instance,
-        "spot": place.spot,
+        **to_plain(place),
         "group": one.offer.group,
         "usd_per_hour": one.offer.usd_per_hour,
         "price_source": one.offer.source,
@@ -249,6 +242,6 @@ def _offer_json(shown: PlanShown, one: Considered) -> dict[str, Any]:
         "recent_losses": one.losses,
         "losses_per_hour": one.losses_per_hour,
         "losses_assumed": one.losses_assumed,
-        "slots": list(slots),
+        "slots": list(one.slots),
         "why_not": words(one.why_not),
     }

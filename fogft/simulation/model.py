@@ -122,13 +122,12 @@ def _number(key: str, text: str) -> float:
         value = float(text)
     except ValueError:
         raise FogftError(f"--model: `{key}` must be a number, not `{text:.40}`", HINT) from None
-    if not math.isfinite(value) or value < 0 or (key in _POSITIVE and value == 0):
-        range_ = "above 0" if key in _POSITIVE else "0 or more"
-        raise FogftError(f"--model: `{key}` must be {range_} and finite, not `{text:.40}`", HINT)
-    most = MAX_CORRELATION if key.startswith("correlation") else math.inf
-    most = 1.0 if key in _SHARES else most
-    if value > most:
-        raise FogftError(f"--model: `{key}` must be from 0 to {most:g}, not `{text:.40}`", HINT)
+    least = 1e-9 if key in _POSITIVE else 0.0
+    most = 1.0 if key in _SHARES else 1e12
+    most = MAX_CORRELATION if key.startswith("correlation") else most
+    if not least <= value <= most:
+        range_ = f"from {'above ' * bool(least)}0 to {most:g}"
+        raise FogftError(f"--model: `{key}` must be {range_}, not `{text:.40}`", HINT)
     return value
 
 

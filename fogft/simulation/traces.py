@@ -12,13 +12,15 @@ Not here: what is made of them (`comparison`).
 
 from __future__ import annotations
 
+import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from fogft.errors import FogftError
+from fogft.model.plain import stored, within
 from fogft.model.replica import Placement
 from fogft.poolfile.tree import nearest
 from fogft.simulation.timeline import Timeline, of_samples
@@ -35,6 +37,18 @@ class Trace:
     place: str  # ``cloud/region/zone``, or the zone alone
     gap_s: float
     timeline: Timeline
+
+
+@dataclass(frozen=True)
+class _Metadata:
+    gap_seconds: Annotated[float, within(1e-3, 1e9)]
+
+
+@dataclass(frozen=True)
+class _Written:
+    metadata: _Metadata
+    data: tuple[Annotated[float, within(0, 1e15)] | None, ...]
+    times: tuple[float, ...] | None = None
 
 
 def read(folder: Path, per_unit: int = 1) -> list[Trace]:
@@ -72,60 +86,37 @@ def _read_file(path: Path, folder: Path, per_unit: int) -> Trace:
 
 def parse(value: Any, file: str, per_unit: int = 1) -> Timeline:
     """Return the timeline of a trace. Raises FogftError, which names the place in the file."""
-    if not isinstance(value, Mapping):
-        raise FogftError(f"{file}: must be a JSON object", FORMAT)
-    metadata = value.get("metadata")
-    gap_s = metadata.get("gap_seconds") if isinstance(metadata, Mapping) else None
-    if gap_s is None or not _is_number(gap_s) or gap_s <= 0:
-        raise FogftError(f"{file}: metadata.gap_seconds: must be a number above 0", FORMAT)
-    data = value.get("data")
-    if not isinstance(data, list):
-        raise FogftError(f"{file}: data: must be a list of numbers", FORMAT)
-    if not data:
+    trace = stored(_Written, value, file, FORMAT)
+    gap_s = trace.metadata.gap_seconds
+    if not trace.data:
         raise FogftError(f"{file}: data: the trace is empty", "remove the file, or record again")
-    of = "of machines" if per_unit == 1 else "from 0"
-    for index, sample in enumerate(data):
+    samples = []
+    for index, sample in enumerate(trace.data):
         if sample is None:
             raise FogftError(
                 f"{file}: data[{index}]: the trace has a gap here ({gap_s:g} s a sample)",
                 "cut the trace before or after it: the state in between is unknown",
             )
-        whole = per_unit > 1 or (_is_number(sample) and sample == int(sample))
-        if not _is_number(sample) or sample < 0 or not whole:
-            raise FogftError(
-                f"{file}: data[{index}]: must be a number {of}, not `{sample!r:.40}`", FORMAT
-            )
-    if "times" in value:
-        _check_times(value["times"], len(data), float(gap_s), file)
-    return of_samples([round(sample * per_unit) for sample in data], float(gap_s))
+        if per_unit == 1 and sample % 1:
+            raise FogftError(f"{file}: data[{index}]: {sample:g} is no number of machines", FORMAT)
+        samples.append(round(sample * per_unit))
+    if trace.times is not None:
+        _check_times(trace.times, len(samples), gap_s, file)
+    return of_samples(samples, gap_s)
 
 
-def _check_times(times: Any, samples: int, gap_s: float, file: str) -> None:
-    if not isinstance(times, list) or len(times) != samples:
+def _check_times(times: Sequence[float], samples: int, gap_s: float, file: str) -> None:
+    if len(times) != samples:
         raise FogftError(
             f"{file}: times: must be a list as long as `data` ({samples})", "or leave it out"
         )
-    for index, at in enumerate(times):
-        if not _is_number(at):
-            raise FogftError(f"{file}: times[{index}]: must be a number of seconds", FORMAT)
-        if index == 0:
-            continue
-        step = at - times[index - 1]
-        if step <= 0:
+    for index, (before, at) in enumerate(itertools.pairwise(times), start=1):
+        if not 0.5 * gap_s <= at - before <= 1.5 * gap_s:
             raise FogftError(
-                f"{file}: times[{index}]: the clock jumps back by {-step:g} s",
-                "cut the trace there: the order of the samples is unknown",
-            )
-        if not 0.5 * gap_s <= step <= 1.5 * gap_s:
-            raise FogftError(
-                f"{file}: times[{index}]: {step:g} s after the sample before it, where "
+                f"{file}: times[{index}]: {at - before:g} s after the sample before it, where "
                 f"`gap_seconds` says {gap_s:g}: a gap or a clock that jumped",
                 "cut the trace there: the state in between is unknown",
             )
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e15
 
 
 def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, Timeline]:

@@ -92,7 +92,7 @@ def test_a_plot_is_drawn(file, tmp_path, name, magic):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--model", "mttf_s=-1"], "`mttf_s` must be above 0"),
+        (["--model", "mttf_s=-1"], "`mttf_s` must be from above 0"),
         (["--fit"], "`--fit` needs traces"),
         (["--traces", "nowhere"], "nowhere: is not a folder of traces"),
         (["--plot", "a.bmp"], "cannot draw a `.bmp` file"),
