@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from fogft.errors import PoolBusy, StateError
+from fogft.errors import StateError
 
 if sys.platform != "win32":  # where files are only read and written by one process
     import fcntl
@@ -135,23 +135,20 @@ def standby_lock(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def locked(path: Path, *, wait: bool = True) -> Iterator[None]:
-    """Hold a lock for a while.
+def locked(path: Path) -> Iterator[None]:
+    """Hold a lock for a while; wait for it.
 
     Raises:
-        PoolBusy: Another process holds it, and `wait` is false.
         StateError: There is no such folder, or the file cannot be made.
     """
     lock = Lock(path)
     try:
-        taken = lock.acquire(wait=wait)
+        lock.acquire(wait=True)
     except OSError as error:
         raise StateError(
             f"`{path}` cannot be opened: {error.strerror}",
             "check the disk's free space and the folder's owner",
         ) from error
-    if not taken:
-        raise PoolBusy(f"`{path}` is held by another process")
     try:
         yield
     finally:

@@ -13,7 +13,7 @@ import threading
 import pytest
 
 from fogft import disk
-from fogft.errors import PoolBusy, StateError
+from fogft.errors import StateError
 
 
 def test_a_file_is_replaced_whole_and_private(tmp_path):
@@ -118,15 +118,6 @@ def test_a_glance_at_a_lock_refuses_nobody(tmp_path):
     finally:
         stop.set()
         watcher.join()
-
-
-def test_locked_refuses_with_a_clear_error(tmp_path):
-    with disk.locked(tmp_path / "lock"):
-        with pytest.raises(PoolBusy, match="held by another process"):
-            with disk.locked(tmp_path / "lock", wait=False):
-                pass
-    with disk.locked(tmp_path / "lock", wait=False):
-        pass
 
 
 def test_nothing_is_locked_where_there_is_no_file(tmp_path):

@@ -20,6 +20,7 @@ from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolOption
 from fogft.cli.status_text import utc
 from fogft.errors import CredentialError, FogftError
+from fogft.model.plain import to_plain
 from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
@@ -317,13 +318,4 @@ def _read_passphrase(file: Path | None) -> str:
 
 
 def _as_data(entry: Entry, now: float) -> dict[str, object]:
-    return {
-        "role": entry.holder.role.value,
-        "name": entry.holder.name,
-        "generation": entry.holder.generation,
-        "state": entry.state(now),
-        "serial": entry.serial,
-        "issued_at": entry.issued_at,
-        "not_after": entry.not_after,
-        "revoked_at": entry.revoked_at,
-    }
+    return {**to_plain(entry.holder), **to_plain(entry), "state": entry.state(now)}

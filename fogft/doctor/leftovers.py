@@ -1,8 +1,4 @@
-"""Checks for what dead processes and forgotten pools left behind.
-
-A process that is killed cannot remove its segments. They are harmless but take memory
-until the machine restarts.
-"""
+"""Checks for what forgotten pools and faults on purpose left behind."""
 
 from __future__ import annotations
 
@@ -14,25 +10,6 @@ from fogft.doctor.finding import Check, Finding, Situation, ok, warn
 from fogft.errors import FogftError
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
-from fogft.ros import shared_memory
-
-
-def segments(_: Situation) -> Iterator[Finding]:
-    """No shared memory of ROS is left over from dead processes."""
-    abandoned = shared_memory.abandoned()
-    if not abandoned:
-        yield ok("leftovers", "no shared memory left by dead processes")
-        return
-    size = 0
-    for path in abandoned:
-        with contextlib.suppress(OSError):
-            size += path.stat().st_blocks * 512
-    yield warn(
-        "leftovers",
-        f"{len(abandoned)} files left by dead processes in {shared_memory.FOLDER} "
-        f"hold {size / 2**20:.1f} MiB",
-        "they are harmless but use memory; the next `fogft down` removes them",
-    )
 
 
 def orphaned_processes(situation: Situation) -> Iterator[Finding]:
@@ -69,4 +46,4 @@ def chaos(situation: Situation) -> Iterator[Finding]:
         )
 
 
-CHECKS: tuple[Check, ...] = (segments, orphaned_processes, chaos)
+CHECKS: tuple[Check, ...] = (orphaned_processes, chaos)

@@ -160,12 +160,7 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
     world = World(market, seed=0, length_s=0.0)
     target = target_of(spec, ask(world, spec))
     replicas = replicas_of(spec, ask(world, spec))
-    kind = max(groups_of(spec), key=lambda group: group.replicas).resources
-    spots = [o for o in market.offers(with_spot(kind, True)) if o.placement.spot]
-    reserved = sorted(
-        (o for o in market.offers(with_spot(kind, False)) if not o.placement.spot),
-        key=lambda o: (o.usd_per_hour, o.placement),
-    )
+    spots, reserved = _sold(spec, market)
     found: dict[str, Factory] = {"fogft": lambda world: Managed(world, spec, target)}
     if reserved:
         found["one on-demand"] = lambda world: Static(world, reserved[:1], target)
@@ -181,6 +176,14 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
             found["naive"] = partial(search, rule=Naive)
             found["round robin"] = partial(search, rule=InTurn)
     return found
+
+
+def _sold(spec: PoolSpec, market: Market) -> tuple[list[Offer], list[Offer]]:
+    """Return what suits the pool's largest group: spot; and on demand, the cheapest first."""
+    kind = max(groups_of(spec), key=lambda group: group.replicas).resources
+    spots = [o for o in market.offers(with_spot(kind, True)) if o.placement.spot]
+    reserved = [o for o in market.offers(with_spot(kind, False)) if not o.placement.spot]
+    return spots, sorted(reserved, key=lambda o: (o.usd_per_hour, o.placement))
 
 
 def replicas_of(spec: PoolSpec, offers: Sequence[Offer]) -> int:
@@ -247,19 +250,16 @@ def compare(
 def bound(scenario: Scenario, market: Market) -> Outcome | None:
     """Return what one who knows the future needs to have all ready always; None if he cannot."""
     spec = scenario.spec
-    kind = max(groups_of(spec), key=lambda group: group.replicas).resources
-    spots: dict[str, float] = {}
-    for offer in market.offers(with_spot(kind, True)):
-        place, usd = offer.placement.location, offer.usd_per_hour
-        if offer.placement.spot:
-            spots[place] = min(usd, spots.get(place, usd))
-    reserved = [o for o in market.offers(with_spot(kind, False)) if not o.placement.spot]
+    spots, reserved = _sold(spec, market)
+    cheapest = {
+        o.placement.location: o.usd_per_hour for o in sorted(spots, key=lambda o: -o.usd_per_hour)
+    }
     replicas = replicas_of(spec, ask(World(market, seed=0, length_s=0.0), spec))
     seconds = scenario.length_s - SETTLE_S
     usd_per_hour = least_usd_per_hour(
         {place: line.window(SETTLE_S, seconds) for place, line in market.timelines.items()},
-        spots,
-        min((o.usd_per_hour for o in reserved), default=None),
+        cheapest,
+        reserved[0].usd_per_hour if reserved else None,
         replicas,
         boot_s=scenario.timing.boot_s,
         length_s=seconds,

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 from fogft import __version__
-from fogft.model.plain import Moment, Seconds, from_plain, stored, to_plain
+from fogft.model.plain import Moment, from_plain, stored, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
 from fogft.model.topic import PREFIX, Origin
 from fogft.model.topology import Gateway, RobotRoute, Topology, trouble
 from fogft.planning.observed.history import MOVING, Event, EventKind, History
-from fogft.pool.manager.proxy_report import Counters, ProxyReport, TopicCounted
+from fogft.pool.manager.proxy_report import Counters, GatewayLink, ProxyReport, TopicCounted
 from fogft.reason_words import words
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
@@ -204,20 +204,12 @@ class _DrawnGateway:
 
 
 @dataclass(frozen=True)
-class _DrawnLink:
-    name: str
-    state: str
-    rtt_s: Seconds | None
-    detail: str
-
-
-@dataclass(frozen=True)
 class _Drawn:
     robot: str
     gateways: tuple[_DrawnGateway, ...]
     robots: Mapping[str, tuple[str, ...]]
     through: tuple[str, ...]
-    links: tuple[_DrawnLink, ...]
+    links: tuple[GatewayLink, ...]
 
 
 def _check_drawn(raw: Mapping[str, Any]) -> None:
