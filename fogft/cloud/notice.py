@@ -112,11 +112,7 @@ def watch(
     Args:
         source: ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers.
         on_notice: Called from that thread, once for each kind of notice; must not block.
-        poll_s: Seconds between two looks; None for what suits the source.
         metadata: ``host[:port]`` of the metadata server; None for where the environment says.
-
-    Raises:
-        CloudError: There is no such source.
     """
     if source.startswith("file:") and source != "file:":
         sources: list[Source] = [_File(Path(source.removeprefix("file:")))]

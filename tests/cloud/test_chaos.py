@@ -153,15 +153,6 @@ def test_a_blackhole_ends_by_itself_though_its_author_is_gone(local, call):
     assert caller.echo(), "it was not broken, and goes on"
 
 
-def test_a_link_is_reset_once(local, call):
-    machine = local.running()
-    caller = call(machine.endpoint)
-    local.chaos.reset(machine.id)
-    assert caller.ended()
-    wait_for(lambda: call(machine.endpoint).echo())
-    assert local.machine(machine.id) is not None
-
-
 def test_faults_of_one_machine_leave_the_others_alone(local, call):
     first, second = local.running(0), local.running(1)
     caller = call(second.endpoint)

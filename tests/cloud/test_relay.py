@@ -261,18 +261,6 @@ def test_what_a_delay_holds_back_stays_in_a_blackhole(path):
     assert receive(server, 4) == b"late"
 
 
-def test_a_reset_breaks_all_connections_once(path):
-    pairs = [path.pair() for _ in range(3)]
-    path.set(resets=1)
-    for sock in (sock for pair in pairs for sock in pair):
-        with pytest.raises(ConnectionResetError):
-            sock.recv(1)
-    path.set(resets=1)
-    client, server = path.pair()
-    client.sendall(b"again")
-    assert receive(server, 5) == b"again"
-
-
 def test_a_connection_waits_for_the_servers_first_time_only(path):
     host_port = path.server.getsockname()
     path.server.close()

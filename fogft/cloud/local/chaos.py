@@ -92,10 +92,6 @@ class Chaos:
         until = _deadline(for_s)
         self._change_link(id, lambda old: replace(old, blackhole=True, blackhole_until=until))
 
-    def reset(self, id: ReplicaId) -> None:
-        """Reset all connections to a machine once."""
-        self._change_link(id, lambda old: replace(old, resets=old.resets + 1))
-
     # -- locations; `region`, `region/zone`, with or without `local/` before -----------------
 
     def outage(self, location: str, for_s: float | None = None) -> list[ReplicaId]:
@@ -126,7 +122,7 @@ class Chaos:
         for folder, _ in self._cloud.living():
             with contextlib.suppress(CloudError):  # it has just ended, or has no relay
                 self.thaw(folder.id)
-                self._change_link(folder.id, lambda old: LinkFaults(resets=old.resets))
+                self._change_link(folder.id, lambda _: LinkFaults())
 
     # -- inside -----------------------------------------------------------------------------
 

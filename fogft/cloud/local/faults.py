@@ -27,7 +27,6 @@ class LinkFaults:
     slow_until: float | None = None  # when these two end
     blackhole: bool = False  # nothing passes, but connections stay
     blackhole_until: float | None = None
-    resets: int = 0  # counts up; each new value resets all connections once
 
     def at(self, now: float) -> LinkFaults:
         """Return what is in force at a time."""
@@ -37,7 +36,6 @@ class LinkFaults:
             delay_s=self.delay_s if slow else 0.0,
             rate_bytes_per_s=self.rate_bytes_per_s if slow else None,
             blackhole=black,
-            resets=self.resets,
         )
 
 

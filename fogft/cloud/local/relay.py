@@ -1,4 +1,4 @@
-"""The simulated network path to one machine: a TCP relay with delay, rate, blackhole and reset.
+"""The simulated network path to one machine: a TCP relay with delay, rate and blackhole.
 
 A path is modelled as networks are: a chunk occupies it for its size over the rate, after those
 before it, and arrives the delay later, in order whatever changes meanwhile. What the other side
@@ -111,7 +111,6 @@ class Relay:
 
     def __init__(self, upstream: tuple[str, int]) -> None:
         self._upstream = upstream
-        self._faults = LinkFaults()
         self._shapers = (Shaper(), Shaper())
         self._loop = asyncio.new_event_loop()
         self._passes = asyncio.Event()  # unless there is a blackhole
@@ -140,12 +139,8 @@ class Relay:
 
     def set_faults(self, faults: LinkFaults) -> None:
         """Change what is wrong with the path (deadlines already applied)."""
-        before, self._faults = self._faults, faults
         for shaper in self._shapers:
             shaper.set(faults.delay_s, faults.rate_bytes_per_s)
-        if faults.resets != before.resets:
-            for connection in self._connections:
-                connection.cancel()
         if faults.blackhole:
             self._passes.clear()
         else:
