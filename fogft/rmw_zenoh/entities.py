@@ -55,8 +55,9 @@ class Server:
     def __init__(
         self, session: Any, token: Callable[[str], naming.Token], hash: str,
         on_request: Callable[[bytes, Any], None], fault: Callable[[bytes], str],
-        *, probes: NodeProbes,
+        *, probes: NodeProbes, mismatch: Callable[[], str],
     ) -> None:  # fmt: skip
+        self.mismatch = mismatch
         self._answered_ns = OrderedDict[bytes, int]()  # client -> when it got its last answer
         self._session = session
         self._fault = fault
@@ -104,10 +105,6 @@ class Server:
             self._on_request(query.payload.to_bytes(), handle)
         except Exception:
             log.exception("%s: a request was lost", self.name)
-
-    def mismatch(self) -> str:
-        """Return nothing: only nodes of one middleware are in Zenoh's graph."""
-        return ""
 
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send the serialised response. Nothing happens once the service is withdrawn."""

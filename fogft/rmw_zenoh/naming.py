@@ -200,6 +200,12 @@ class Graph:
         nodes = {(t.node, t.namespace) for t in tokens if (t.kind, t.service) == (CLIENT, service)}
         return ClientNode(*nodes.pop(), unique=True) if len(nodes) == 1 else None
 
+    def servers(self, service: str) -> list[str]:
+        """Return the full name of each node that offers a service."""
+        wanted = (SERVER, service)
+        found = [t for t in self._all() if (t.kind, t.service) == wanted]
+        return [f"{token.namespace.rstrip('/')}/{token.node}" for token in found]
+
     def services_of(self, name: str, namespace: str) -> list[str]:
         """Return the names of a node's services."""
         node = (SERVER, name, namespace)

@@ -27,6 +27,7 @@ from fogft.model.type_definition import REQUEST, RESPONSE
 from fogft.rmw_zenoh import naming, session
 from fogft.rmw_zenoh.entities import Client, Server
 from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
+from fogft.ros import vendors
 from fogft.ros.pacing.client_probes import NodeProbes
 
 log = logging.getLogger(__name__)
@@ -136,6 +137,7 @@ class RmwZenohNode:
                 *(self._session, self._tokens(SERVER, name, type_name), known, on_request),
                 self._fault_of(type_name, RESPONSE),
                 probes=self._probes,
+                mismatch=lambda: vendors.of_others(name, self.graph.servers(name)),
             )
         )
         for hash in self.graph.hashes(CLIENT, name, type_name):

@@ -123,7 +123,7 @@ class SerialisedNode:
                 *(service, ServiceEnd(service, service_type), on_request, self._withdraw),
                 on_burst=on_burst,
                 probes=self._probes,
-                mismatch=partial(self._clients_mismatch, service.service_name),
+                mismatch=partial(self._server_trouble, service.service_name),
             )
 
         return self._add(name, create)
@@ -229,10 +229,23 @@ class SerialisedNode:
         """Count the clients of a service that discovery has found: those find us, too."""
         return len(self._identifiers(self._node.get_publishers_info_by_topic, service))
 
-    def _clients_mismatch(self, service: str) -> str:
+    def _server_trouble(self, service: str) -> str:
         writers = self._identifiers(self._node.get_publishers_info_by_topic, service)
         others = vendors.strangers(self._middleware, writers)
-        return vendors.of_client(service, self._middleware, others[0]) if others else ""
+        if others:
+            return vendors.of_client(service, self._middleware, others[0])
+        readers = self._endpoints(self._node.get_subscriptions_info_by_topic, f"rq{service}Request")
+        own = self._node.get_name()
+        return vendors.of_others(
+            service,
+            (
+                f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+                for one in readers
+                if one.node_name != own
+                and not one.node_name.startswith("_")  # not known yet
+                and not vendors.strangers(self._middleware, [bytes(one.endpoint_gid)])
+            ),
+        )
 
     def _servers_mismatch(self, service: str) -> str:
         readers = self._identifiers(self._node.get_subscriptions_info_by_topic, service)

@@ -42,7 +42,7 @@ class RosServer(Protocol):
         """
 
     def mismatch(self) -> str:
-        """Say why a client that is there is not heard; empty if all are. Cheap."""
+        """Say why a client is not heard, or who else answers; empty if all is well. Cheap."""
 
     def close(self) -> None:
         """Withdraw the service."""

@@ -1,4 +1,4 @@
-"""Which DDS an endpoint is of, and whether it understands our services. Pure.
+"""Which DDS an endpoint is of, whether it understands our services, and who else offers one. Pure.
 
 Two implementations of DDS find each other and exchange topics, but not services: Fast DDS and
 CycloneDDS put requests behind headers of their own. Discovery shows a service that never answers.
@@ -36,6 +36,17 @@ def of_client(service: str, ours: str, theirs: str) -> str:
         f"a client of `{service}` runs on {theirs} and the client proxy on {ours}: it gets no "
         f"answers; set RMW_IMPLEMENTATION={ours} where that node starts, or ={theirs} for "
         "`fogft up`, after `fogft down`"
+    )
+
+
+def of_others(service: str, nodes: Iterable[str]) -> str:
+    """Say that others offer a service as well, and what to do; empty where there are none."""
+    names = ", ".join(f"`{name}`" for name in sorted(set(nodes)))
+    if not names:
+        return ""
+    return (
+        f"`{service}` is also offered by {names}: a request goes to each, and the first answer "
+        "counts; end that node, or rename one of the services"
     )
 
 

@@ -234,6 +234,14 @@ def test_what_is_not_answered_ends_without_a_reply(
     assert set(seen) == {BODY}
 
 
+def test_whoever_offers_the_same_service_is_named(make: Callable[..., RmwZenohNode]) -> None:
+    first, second = echo(make("fogft_p")), echo(make("fogft_q"))
+    wait_for(first.mismatch, "the second")
+    assert "`/arm/grasp` is also offered by `/fogft_q`" in first.mismatch()
+    second.close()
+    wait_for(lambda: not first.mismatch(), "its end")
+
+
 def test_a_service_is_offered_under_the_hash_that_its_client_has(
     make: Callable[..., RmwZenohNode], peer: zenoh.Session
 ) -> None:

@@ -69,6 +69,22 @@ def cyclone(what: str, domain: int) -> Iterator[None]:
 
 
 @pytest.mark.ros
+def test_whoever_offers_the_same_service_is_named(
+    make_node: Callable[[int], Any], ros_domain: int
+) -> None:
+    """Another pool, or a node of the robot's: each request would go to both, unsaid."""
+    first, second = (
+        make_node(ros_domain).serve("/flag", SET_BOOL, lambda payload, handle: None)
+        for _ in range(2)
+    )
+    wait_for(first.mismatch, "the second")
+    assert "`/flag` is also offered by `/ours_1`" in first.mismatch()
+    wait_for(second.mismatch, "the first")
+    first.close()
+    wait_for(lambda: not second.mismatch(), "its end")
+
+
+@pytest.mark.ros
 @needs("rclpy", "fastdds", "cyclonedds")
 def test_real_ends_on_cyclone_dds_are_told(
     make_node: Callable[[int], Any], ros_domain: int

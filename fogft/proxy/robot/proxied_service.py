@@ -21,7 +21,7 @@ from fogft.ros.port import RosClient, RosNode, RosServer
 
 log = logging.getLogger(__name__)
 
-_LOOK_EVERY_S = 2.0  # whether clients are on a middleware that understands ours
+_LOOK_EVERY_S = 2.0  # whether clients understand our middleware, and who else offers it
 
 
 # Longer than the command of a lone replica takes to be started again.
@@ -52,7 +52,8 @@ class ProxiedService:
     """A service of the robot's.
 
     Attributes:
-        trouble: Why it cannot be offered, or a client of it gets no answers; empty for nothing.
+        trouble: Why it cannot be offered, or its clients get no answers, or others'; empty if
+            nothing.
     """
 
     def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher) -> None:
@@ -103,7 +104,7 @@ class ProxiedService:
             self._withdraw()
         elif self.server is not None and now > self._looked_at + _LOOK_EVERY_S:
             self._looked_at = now
-            self._note("client_not_answered", self.server.mismatch())
+            self._note("service_disturbed", self.server.mismatch())
 
     def _offer(self, node: RosNode) -> None:
         spec = self.spec

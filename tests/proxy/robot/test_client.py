@@ -83,7 +83,7 @@ def test_a_client_on_another_middleware_is_told(caplog):
         scene.clock.now += 5.0
         scene.proxy.run_once(0)
     assert scene.proxy.report()["services"]["/s"]["trouble"].endswith("rmw_cyclonedds_cpp")
-    assert caplog.text.count("client_not_answered") == 1
+    assert caplog.text.count("service_disturbed") == 1
     scene.node.servers["/s"].stranger = ""
     scene.clock.now += 5.0
     scene.proxy.run_once(0)
