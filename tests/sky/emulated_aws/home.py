@@ -68,7 +68,6 @@ def main(home: Path) -> None:
     text(
         home / ".aws/credentials", "[default]\naws_access_key_id=test\naws_secret_access_key=test\n"
     )
-    text(home / ".sky/config.yaml", "allowed_clouds: [aws]\n")
     for name in OF_OTHER_CLOUDS:
         text(home / name, MARK)
 

@@ -19,9 +19,6 @@ def main() -> int:
     environ = {
         **os.environ,
         "AWS_ENDPOINT_URL": "http://127.0.0.1:5566",
-        "AWS_DEFAULT_REGION": "us-east-1",
-        "AWS_EC2_METADATA_DISABLED": "true",
-        "SKYPILOT_API_SERVER_LOCAL_PORT": "46999",
         "EMULATED_AWS": "http://127.0.0.1:5567",
         "RUNPOD_API_BASE_URL": "http://127.0.0.1:5568",
         "PYTHONPATH": str(HERE.parents[2]),

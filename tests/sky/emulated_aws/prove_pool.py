@@ -64,9 +64,9 @@ fogft:
 step = Steps()
 
 
-def credentials_below(home: Path) -> Iterator[Path]:
-    """Yield the files of a VM's user that hold what should not leave the launching computer."""
-    for path in home.rglob("*"):
+def credentials_below(disk: Path) -> Iterator[Path]:
+    """Yield the files of a VM's disk that hold what should not leave the launching computer."""
+    for path in disk.rglob("*"):
         code = "site-packages" in path.parts or ".cache" in path.parts
         if code or path.name == "replica.key" or not path.is_file():
             continue
@@ -147,7 +147,7 @@ class Proof:
             (carried,) = (home / ".fogft/wheel").glob("fogft-*.whl")
             (made,) = (HOME / "sky/wheels").glob("*/fogft-*.whl")
             assert carried.read_bytes() == made.read_bytes()
-            left = list(credentials_below(home))
+            left = list(credentials_below(disk_of(instance)))
             assert not left, left
             # Ssh, which is SkyPilot's, and the link: to whom the file names, and to nobody else.
             for port in (22, 7448):
