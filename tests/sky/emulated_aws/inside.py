@@ -19,6 +19,8 @@ def main() -> int:
     environ = {
         **os.environ,
         "AWS_ENDPOINT_URL": "http://127.0.0.1:5566",
+        # With another address than AWS's own a region has to be named, and without not.
+        "AWS_DEFAULT_REGION": "us-east-1",
         "EMULATED_AWS": "http://127.0.0.1:5567",
         "RUNPOD_API_BASE_URL": "http://127.0.0.1:5568",
         "PYTHONPATH": str(HERE.parents[2]),

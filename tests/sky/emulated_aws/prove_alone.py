@@ -9,7 +9,7 @@ Runs inside a world (`world.sh`). Three pools, and two more things that only a V
 
 So does SkyPilot's API server: the robot is gone. Each VM has to find out by itself, and to ask the
 cloud to end it, or to shut itself down. To wait for minutes and not for hours, the template's five
-idle minutes are made one, the limit of a set-up one minute, and the one of a VM that no replica
+idle minutes are made one, the limit of a set-up four, and the one of a VM that no replica
 runs on four: of `unborn` only, since the others are to end before that limit on a slow machine
 too. The changes vanish with the world.
 """
@@ -39,7 +39,7 @@ from tests.sky.emulated_aws.pool import (
 TEMPLATES = Path(__file__).resolve().parents[3] / "templates"
 SHORTENED = (
     ("sky_task.yaml", "idle_minutes: 5", "idle_minutes: 1"),
-    ("sky_task.yaml", "@SETUP_LIMIT_S@", "60"),
+    ("sky_task.yaml", "@SETUP_LIMIT_S@", "240"),
 )
 OF_UNBORN = (("vm_guard.sh", "@ALONE_MINUTES@", "4"),)
 DOOR = "10.66.0.1:7460"  # where VMs find the robot
