@@ -23,6 +23,7 @@ from fogft.errors import FogftError
 SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "Start and stop": {
         "init": ("lifecycle", "planner --into my_pool"),
+        "bake": ("plan", "pool.yaml --tag registry.example.com/planner:1"),
         "up": ("lifecycle", "pool.yaml"),
         "join": ("credentials", "ada.join"),
         "down": ("lifecycle", ""),

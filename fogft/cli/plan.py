@@ -1,4 +1,4 @@
-"""``fogft check | plan``: what is wrong in a pool file, and what it would launch at what price."""
+"""``fogft check | plan | bake``: a pool file's mistakes, what it would launch, and its image."""
 
 from __future__ import annotations
 
@@ -46,6 +46,25 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     if plot is not None:
         plan_plot.draw(shown, plot)
         output.done(f"wrote `{plot}`")
+
+
+def bake(
+    tag: Annotated[str, typer.Option(metavar="IMAGE", help="Name of the image, as in a registry.")],
+    file: PoolFile = DEFAULT_FILE,
+    base: Annotated[
+        str | None,
+        typer.Option("--from", metavar="IMAGE", help="Build on this image, not the file's own."),
+    ] = None,
+    push: Annotated[bool, typer.Option("--push", help="Push it to its registry, too.")] = False,
+) -> None:
+    """Build a Docker image in which a pool's set-up is done, so that replicas are ready sooner.
+
+    Replicas use what fits in it and set up the rest. Needs Docker.
+    """
+    from fogft.pool.commands.bake import bake as build
+
+    build(file, tag, base, push=push)
+    output.done(f"built `{tag}`: write `image_id: docker:{tag}` under `resources`")
 
 
 def check(file: PoolFile = DEFAULT_FILE, as_json: AsJson = False) -> None:

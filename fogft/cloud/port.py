@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from fogft.model.names import LINK_PORT
@@ -124,6 +125,22 @@ class Accounts(Protocol):
 
     def unverified(self, cloud: str) -> str:
         """Return why what exists in a cloud cannot be checked there; empty when it can."""
+
+
+@runtime_checkable
+class Baking(Protocol):
+    """A cloud whose machines may start from an image that has a replica's environment already."""
+
+    def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> Sequence[str]:
+        """Write into a folder what an image is built of; return the arguments of `docker build`.
+
+        Args:
+            task: A pool file's task, with paths from its folder.
+            image: The image that it is built on.
+            folder: Empty; the build's context.
+
+        Raises `SpecError` for what an image cannot have.
+        """
 
 
 @dataclass(frozen=True)

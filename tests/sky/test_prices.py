@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.cloud.sky import extras, task
+from fogft.cloud.sky import prices, task
 from fogft.cloud.sky.prices import FRESH_S, USABLE_S, Prices
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudUnreachable, SpecError
 from fogft.model.replica import Offer, Placement
 from tests.sky.scripted_sky import EAST, WEST, ScriptedProvider, ScriptedSky
 
-MORE = extras.usd_per_hour(EAST, task.DISK_GB)
+MORE = prices.extras_usd_per_hour(EAST, task.DISK_GB)
 
 
 class Market:
@@ -119,7 +119,7 @@ def test_disk_and_address_are_part_of_the_price_and_named(market: Market):
     [(64, 64), ("100", 100), ("2t", 2000), ("512 MB", 0.512), ("much", 0), (None, 0)],
 )
 def test_a_disk_size_is_read_as_skypilot_reads_it(asked: object, gb: float):
-    assert extras.disk_gb(asked) == pytest.approx(gb)
+    assert prices.disk_gb(asked) == pytest.approx(gb)
 
 
 def test_skypilot_is_asked_with_all_that_a_launch_adds(market: Market):

@@ -6,6 +6,7 @@ Not here: each step's own module: `task`, `journal`, `following`, `ending`, `pre
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import threading
@@ -16,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.port import Audit, Launch
-from fogft.cloud.sky import listing, task, wheel
+from fogft.cloud.sky import bake, listing, task, wheel
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.following import Following
@@ -238,6 +239,13 @@ class SkyCloud:
                 )
             )
         return [one for one in found if one]
+
+    def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> Sequence[str]:
+        """See `Baking`."""
+        packed, lock = self.make_wheel(self.folder / "wheels"), dict[str, bytes]()
+        with contextlib.suppress(CloudError):  # then the image resolves, as a VM would
+            lock |= self._locks.renew(packed)
+        return bake.write(folder, task, image, packed, lock)
 
     def unverified(self, cloud: str) -> str:
         """See `Accounts`."""

@@ -12,13 +12,13 @@ from __future__ import annotations
 import json
 import logging
 import math
+import re
 import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
-from fogft.cloud.sky import extras
 from fogft.cloud.sky.catalogue import best
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.provider import NotAllowedError, Provider
@@ -33,6 +33,15 @@ K = TypeVar("K")
 V = TypeVar("V")
 FRESH_S = 300.0
 USABLE_S = 3600.0
+# List prices of 2024-11 in each cloud's cheapest regions, for the disk that SkyPilot orders where
+# no `disk_tier` is named. Of others nothing is known; many sell machines with both.
+HOURS_A_MONTH = 730.0
+# gp3 on AWS, a balanced disk on GCP; Azure's Premium SSDs have steps, of which this is the usual.
+DISK_USD_PER_GB_MONTH = {"aws": 0.08, "azure": 0.15, "gcp": 0.10}
+ADDRESS_USD_PER_HOUR = {"aws": 0.005, "azure": 0.005, "gcp": 0.005}
+SPOT_ADDRESS_USD_PER_HOUR = {"gcp": 0.0025}
+_SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kmgtp]?)i?b?\+?", re.IGNORECASE)
+_GB = {"k": 1e-6, "m": 1e-3, "": 1.0, "g": 1.0, "t": 1e3, "p": 1e6}
 
 
 @dataclass
@@ -221,5 +230,21 @@ def _side_by_side(wanted: Collection[K], ask: Callable[[K], V]) -> dict[K, V]:
 
 def _with_extras(offer: Offer, resources: Mapping[str, Any]) -> Offer:
     disk_size = alternative(resources, offer.placement).get("disk_size", DISK_GB)
-    more = extras.usd_per_hour(offer.placement, disk_size)
+    more = extras_usd_per_hour(offer.placement, disk_size)
     return replace(offer, usd_per_hour=offer.usd_per_hour + more, extras_usd_per_hour=more)
+
+
+def extras_usd_per_hour(placement: Placement, disk_size: Any) -> float:
+    """Return what an address and a disk of a `disk_size` cost."""
+    cloud = placement.cloud
+    address = ADDRESS_USD_PER_HOUR.get(cloud, 0.0)
+    if placement.spot:
+        address = SPOT_ADDRESS_USD_PER_HOUR.get(cloud, address)
+    disk = disk_gb(disk_size) * DISK_USD_PER_GB_MONTH.get(cloud, 0.0)
+    return address + disk / HOURS_A_MONTH
+
+
+def disk_gb(asked: Any) -> float:
+    """Return a `disk_size` as SkyPilot reads it, in GB; 0 for what is none."""
+    match = _SIZE.fullmatch(str(asked).strip())
+    return float(match[1]) * _GB[match[2].lower()] if match else 0.0

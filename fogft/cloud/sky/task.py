@@ -101,21 +101,18 @@ def build(
         instead: What else is tried there, in this order, where the first has no capacity.
     """
     refuse_what_cannot_be_honoured(order.task)
-    setup = str(order.task.get("setup") or ":").rstrip()
     marks = {
         "@FILES@": str(files),
         "@WHEEL@": str(wheel),
         "@PORT@": str(order.link_port),
         "@LISTEN@": f"{'127.0.0.1' if order.dials_out else '0.0.0.0'}:{order.link_port}",
-        "@SETUP_LIMIT_S@": str(SETUP_LIMIT_S),
-        "@SETUP@": setup,  # the user's text last, as it is
     }
     ours = _filled(template, marks)
     if order.dials_out:
         del ours["resources"]["ports"]
     task = copy.deepcopy({k: v for k, v in order.task.items() if k != "num_nodes"})
     task["name"] = order.pool
-    task["setup"], task["run"] = ours["setup"], ours["run"]
+    task["setup"], task["run"] = setup_of(order.task, template), ours["run"]
     if isinstance(task.get("workdir"), str):
         task["workdir"] = _absolute(task["workdir"], base)
     mounts = {k: _absolute(v, base) for k, v in (task.get("file_mounts") or {}).items()}
@@ -127,6 +124,14 @@ def build(
         resources["ordered"] = [_kind(one) for one in (order.placement, *instead)]
     task["resources"] = resources
     return task
+
+
+def setup_of(asked: Mapping[str, Any], template: Mapping[str, Any]) -> str:
+    """Return the set-up of a pool file's task, which makes the environment and installs fogft."""
+    setup = str(asked.get("setup") or ":").rstrip()
+    # The user's text last, as it is.
+    marks = {"@SETUP_LIMIT_S@": str(SETUP_LIMIT_S), "@SETUP@": setup}
+    return str(_filled(template["setup"], marks))
 
 
 def _kind(placement: Placement) -> dict[str, str]:

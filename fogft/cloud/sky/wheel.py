@@ -142,8 +142,8 @@ class LockFolder:
         self._folder = folder
         self._resolve = resolve
 
-    def renew(self, wheel: Path) -> None:
-        """Make the lock anew that the next generations of a wheel get.
+    def renew(self, wheel: Path) -> Mapping[str, bytes]:
+        """Make the lock anew that the next generations of a wheel get; return it as files.
 
         Raises CloudError: it cannot be made, and there is none of before.
         """
@@ -152,6 +152,7 @@ class LockFolder:
         except CloudError:
             if self._read(self._newest(wheel)) is None:
                 raise
+        return _as_files(self._read(self._newest(wheel)))
 
     def of(self, generation: str, wheel: Path) -> Mapping[str, bytes]:
         """Return a generation's lock as files; none where none can be made at its first launch."""
@@ -165,7 +166,7 @@ class LockFolder:
                     with contextlib.suppress(CloudError):  # as `up` has told
                         found = self._resolve(wheel)
                 self._write(kept, found)
-        return {name: content.encode() for name, content in found.files.items()}
+        return _as_files(found)
 
     def _newest(self, wheel: Path) -> Path:
         return self._folder / f"{wheel.name}.json"
@@ -177,3 +178,7 @@ class LockFolder:
     def _write(self, path: Path, locks: Locks) -> None:
         make_folder(self._folder)
         write_json(path, to_plain(locks))
+
+
+def _as_files(locks: Locks | None) -> Mapping[str, bytes]:
+    return {name: content.encode() for name, content in locks.files.items()} if locks else {}

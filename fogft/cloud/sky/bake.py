@@ -1,0 +1,73 @@
+"""An image with a replica's environment: the set-up of `task`, run once by Docker.
+
+A VM that starts from it runs the same set-up, which finds what there is already: the image is never
+wrong, only late. It holds no certificate, key or secret.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from fogft.cloud.sky import task
+from fogft.disk import make_folder, write_whole
+from fogft.errors import SpecError
+
+# What SkyPilot and the set-up need of a container, and would load onto each machine.
+_NEEDED = (
+    *("bash", "ca-certificates", "curl", "fuse", "openssh-server", "patch", "procps"),
+    *("python3", "python3-pip", "python3-venv", "rsync", "sudo", "wget"),
+)
+_DOCKERFILE = """\
+FROM {image}
+SHELL ["/bin/bash", "-c"]
+RUN apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends {needed} && rm -rf /var/lib/apt/lists/*
+COPY fogft /root/.fogft
+{workdir}WORKDIR /root/sky_workdir
+RUN export HOME=/root && {exports}bash /root/.fogft/setup.sh && rm -rf /root/.fogft/setup.sh /root/.fogft/wheel /root/.fogft/replica
+"""  # noqa: E501
+
+
+def write(
+    folder: Path, asked: Mapping[str, Any], image: str, wheel: Path, lock: Mapping[str, bytes]
+) -> list[str]:
+    """Write the context of a build into an empty folder; return the arguments of `docker build`.
+
+    Args:
+        folder: Where to.
+        asked: The pool file's task, with absolute paths.
+        image: The image that it is built on.
+        wheel: Folder with fogft's wheel.
+        lock: What fogft needs, as files; see `wheel.LockFolder`.
+
+    Raises:
+        SpecError: The set-up needs what no image may have.
+    """
+    for key in ("secrets", "file_mounts"):
+        if asked.get(key):
+            raise SpecError(
+                f"{key}: an image cannot be baked with it",
+                "put what `setup` needs of it into your own image, and bake on that: `--from`",
+            )
+    task.refuse_what_cannot_be_honoured(asked)
+    ours = folder / "fogft"
+    make_folder(ours / "replica")
+    shutil.copytree(wheel, ours / "wheel")
+    for name, content in lock.items():
+        write_whole(ours / "replica" / name, content)
+    write_whole(ours / "setup.sh", task.setup_of(asked, task.read()))
+    exports = "".join(
+        f"export {name}={shlex.quote(str(value))} && "
+        for name, value in (asked.get("envs") or {}).items()
+    )
+    carried = isinstance(asked.get("workdir"), str)
+    text = _DOCKERFILE.format(
+        image=image, needed=" ".join(_NEEDED), exports=exports,
+        workdir="COPY --from=workdir . /root/sky_workdir\n" if carried else "",
+    )  # fmt: skip
+    write_whole(folder / "Dockerfile", text)
+    named = ["--build-context", f"workdir={asked['workdir']}"] if carried else []
+    return [*named, str(folder)]

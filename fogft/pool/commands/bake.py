@@ -1,0 +1,61 @@
+"""``fogft bake``: build an image that has a pool file's environment already.
+
+Not here: what the image is built of (`fogft.cloud.port.Baking`).
+"""
+
+from __future__ import annotations
+
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from fogft.cloud.port import Baking
+from fogft.errors import CloudError, SpecError
+from fogft.pool.commands.composition import cloud_named_by, make_cloud
+from fogft.pool.manager.configuration import absolute, with_build
+from fogft.poolfile.file import parse, read_text
+from fogft.poolfile.named_clouds import alternatives
+
+PLAIN = "ubuntu:24.04"
+_DOCKER = "docker:"
+
+
+def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
+    """Build an image of a pool file, and push it. Docker's own words go to this process's stderr.
+
+    Args:
+        file: The pool file.
+        tag: The image's name.
+        base: What it is built on; None for the pool file's own image, else plain Ubuntu.
+        push: Whether it is pushed.
+
+    Raises:
+        SpecError: The pool file runs on no real cloud, or cannot be baked.
+        CloudError: Docker is not there, or fails.
+    """
+    text = read_text(file)
+    spec = parse(text, file=str(file))
+    cloud = make_cloud(cloud_named_by(spec, text, file), file.parent)
+    if not isinstance(cloud, Baking):
+        raise SpecError(f"`{file}` names no real cloud", "the local cloud needs no image")
+    task = with_build(absolute(spec.task, file.parent.resolve()))
+    named = {str(one.get("image_id", "")) for _, one in alternatives(task.get("resources") or {})}
+    images = sorted(one.removeprefix(_DOCKER) for one in named if one.startswith(_DOCKER))
+    if base is None:
+        base = next((image for image in images if image != tag), PLAIN)
+    with tempfile.TemporaryDirectory(prefix="fogft-bake-") as folder:
+        arguments = cloud.bake(task, base, Path(folder))
+        _docker("build", "--tag", tag, *arguments)
+    if push:
+        _docker("push", tag)
+
+
+def _docker(*arguments: str) -> None:
+    words: Sequence[str] = ("docker", *arguments)
+    try:
+        code = subprocess.run(words, stdout=2, check=False).returncode
+    except OSError as error:
+        raise CloudError(f"Docker cannot be started: {error}", "install Docker") from error
+    if code:
+        raise CloudError(f"`docker {arguments[0]}` failed with status {code}: see above")

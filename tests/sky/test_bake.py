@@ -1,0 +1,120 @@
+"""An image that is baked has what the set-up makes, nothing secret, and is never wrong."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fogft.cloud.sky import bake, task
+from fogft.errors import CloudError, SpecError
+from fogft.pool.commands import bake as commands
+from tests.sky.scene import Scene
+from tests.sky.test_task import installed, new_vm, on_skypilot, wheel_of  # noqa: F401 - a fixture
+
+TASK: dict[str, Any] = {
+    "setup": "set -e\necho baked $GREETING >> ~/setups\npip install -q userlib==1.0",
+    "envs": {"GREETING": "it's"},
+    "run": "serve",
+}
+FILE = """\
+name: planner
+resources: {infra: aws, image_id: "docker:lab/ros:1"}
+workdir: .
+setup: pip install numpy
+run: exec python3 serve.py
+fogft: {services: [{name: /plan, type: nav_msgs/srv/GetPlan}]}
+"""
+
+
+def carry(home: Path, version: str) -> None:
+    """Give a machine the wheel of one version of fogft, and no other."""
+    made = home / f"fogft-{version}"
+    if not made.exists():
+        wheel_of(made, "fogft", version, requires="userlib>=1", extra="rclpy")
+    shutil.rmtree(home / ".fogft/wheel", ignore_errors=True)
+    shutil.copytree(made, home / ".fogft/wheel")
+
+
+@pytest.fixture
+def image(new_vm: Path) -> Path:  # noqa: F811
+    """A home as on a machine that has booted from a baked image."""
+    carry(new_vm, "0.1.0")
+    folder = new_vm / "context"
+    folder.mkdir()
+    assert bake.write(folder, TASK, "lab/ros:1", new_vm / ".fogft/wheel", {}) == [str(folder)]
+    text = (folder / "Dockerfile").read_text()
+    (command,) = re.findall(r"^RUN (export HOME.*)$", text, re.MULTILINE)
+    shutil.rmtree(new_vm / ".fogft")
+    shutil.copytree(folder / "fogft", new_vm / ".fogft")
+    (new_vm / ".fogft/setup.sh").write_text(
+        (folder / "fogft/setup.sh").read_text().replace("/opt/ros", str(new_vm / "no-ros"))
+    )
+    done = on_skypilot(new_vm, f"true /opt/ros\n{command.replace('/root', str(new_vm))}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return new_vm
+
+
+@pytest.mark.parametrize("version", ["0.1.0", "0.2.0"])
+def test_a_machine_takes_from_an_image_what_fits_and_makes_the_rest(image: Path, version: str):
+    """Its own `setup` always runs: what that installed may have changed since."""
+    assert sorted(path.name for path in (image / ".fogft").iterdir()) == [
+        *("setup-installed.txt", "there-before.txt", "venv")
+    ]
+    (image / ".fogft/venv/baked").touch()
+    carry(image, version)
+    done = on_skypilot(image, f"export GREETING=\n{task.setup_of(TASK, task.read())}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (image / "setups").read_text().splitlines() == ["baked it's", "baked"]
+    assert (installed(image)["fogft"], installed(image)["userlib"]) == (version, "1.0")
+    assert (image / ".fogft/venv/baked").exists() == (version == "0.1.0")
+
+
+@pytest.mark.parametrize("asked", [{"secrets": {"TOKEN": "t"}}, {"file_mounts": {"~/m": "m"}}])
+def test_what_no_image_may_have_is_refused_by_name(tmp_path: Path, asked: dict[str, Any]):
+    with pytest.raises(SpecError, match=f"{next(iter(asked))}: an image cannot be baked"):
+        bake.write(tmp_path, {**TASK, **asked}, "lab/ros:1", tmp_path, {})
+
+
+@pytest.fixture
+def docker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Stand in for Docker: notes how it is called and what is built; it cannot push."""
+    program = tmp_path / "bin/docker"
+    program.parent.mkdir()
+    program.write_text(
+        f'#!/bin/sh\necho "$*" >> {tmp_path}/calls\n[ "$1" != push ] || exit 3\n'
+        f'for last; do :; done\ncp "$last/Dockerfile" {tmp_path}\n'
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
+    scene = Scene(tmp_path)
+    (tmp_path / "state/wheels").mkdir()
+    monkeypatch.setattr(commands, "make_cloud", lambda name, base: scene.cloud)
+    (tmp_path / "pool.yaml").write_text(FILE)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("base", "tag", "found"),
+    [(None, "lab/baked:1", "lab/ros:1"), (None, "lab/ros:1", "ubuntu:24.04"),
+     ("lab/own:2", "lab/ros:1", "lab/own:2")],
+)  # fmt: skip
+def test_an_image_is_built_on_the_files_own_but_never_on_itself(
+    docker: Path, base: str | None, tag: str, found: str
+):
+    commands.bake(docker / "pool.yaml", tag, base, push=False)
+    assert (docker / "Dockerfile").read_text().startswith(f"FROM {found}\n")
+    (call,) = (docker / "calls").read_text().splitlines()
+    assert call.startswith(f"build --tag {tag} --build-context workdir={docker} ")
+    assert not Path(call.split()[-1]).exists(), "the context is left behind"
+
+
+def test_what_docker_cannot_do_is_told(docker: Path, monkeypatch: pytest.MonkeyPatch):
+    with pytest.raises(CloudError, match="`docker push` failed with status 3"):
+        commands.bake(docker / "pool.yaml", "lab/baked:1", None, push=True)
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(CloudError, match="Docker cannot be started"):
+        commands.bake(docker / "pool.yaml", "lab/baked:1", None, push=False)
