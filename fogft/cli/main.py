@@ -52,7 +52,6 @@ def root(
     \b
     fogft init          write an example pool
     fogft up            start the pool that a file describes
-    fogft status        show its state
     fogft down          shut it down
     """
     if version:

@@ -57,9 +57,9 @@ def bake(
     ] = None,
     push: Annotated[bool, typer.Option("--push", help="Push it to its registry, too.")] = False,
 ) -> None:
-    """Build a Docker image in which a pool's set-up is done, so that replicas are ready sooner.
+    """Build a Docker image in which a pool's set-up is done.
 
-    Replicas use what fits in it and set up the rest. Needs Docker.
+    Replicas that start from it are ready sooner: they use what fits and set up the rest.
     """
     from fogft.pool.commands.bake import bake as build
 
