@@ -25,8 +25,16 @@ _PATIENCE_S = 0.2
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that only this user can enter, and those above it."""
-    path.mkdir(parents=True, exist_ok=True)
+    """Make a folder that only this user can enter, and those above it.
+
+    Raises:
+        StateError: It cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        hint = "check the disk and the owner, or set FOGFT_HOME to another folder"
+        raise StateError(f"`{path}` cannot be made: {error.strerror}", hint) from error
     with contextlib.suppress(OSError):
         path.chmod(0o700)
 

@@ -102,7 +102,7 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
     return own_process.run(pyfuncitem) or None
 
 
-def _lock_domain(taken: dict[int, int]) -> int:
+def lock_domain(taken: dict[int, int]) -> int:
     """Lock a free domain id against this user's other test runs; its descriptor goes to `taken`."""
     folder = Path(tempfile.gettempdir()) / f"fogft-test-domains-{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
@@ -123,7 +123,7 @@ def _lock_domain(taken: dict[int, int]) -> int:
 def ros_domains() -> Iterator[Callable[[], int]]:
     """Hand out ROS domain ids that no other test has, until this test ends."""
     taken: dict[int, int] = {}
-    yield lambda: _lock_domain(taken)
+    yield lambda: lock_domain(taken)
     for descriptor in taken.values():
         os.close(descriptor)
 

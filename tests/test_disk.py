@@ -44,6 +44,12 @@ def test_a_missing_folder_is_a_clear_error(tmp_path):
         disk.write_whole(tmp_path / "missing" / "file", "x")
 
 
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(StateError, match="/file/home` cannot be made: Not a directory"):
+        disk.make_folder(tmp_path / "file" / "home")
+
+
 def test_json_goes_round_and_a_missing_file_is_none(tmp_path):
     disk.write_json(tmp_path / "x.json", {"a": [1, None]})
     assert disk.read_json(tmp_path / "x.json") == {"a": [1, None]}

@@ -31,8 +31,9 @@ def _node(name: str) -> Iterator[tuple[Any, Any]]:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
-    context = rclpy.Context()
-    rclpy.init(context=context)
+    from fogft.ros.participant.joining import new_context
+
+    context = new_context(None)
     node = rclpy.create_node(name, context=context, enable_rosout=False)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)

@@ -209,10 +209,13 @@ class Machine:
 class Client:
     """A running plan_client.py."""
 
-    def __init__(self, environ: dict[str, str], seconds: float, rate: float, limit_s: float):
+    def __init__(
+        self, environ: dict[str, str], seconds: float, rate: float, limit_s: float, *file: str
+    ):
         self._seconds = seconds + limit_s
+        given = (str(seconds), str(rate), str(limit_s), *file)
         self._process = subprocess.Popen(
-            [sys.executable, f"{NODES}/plan_client.py", str(seconds), str(rate), str(limit_s)],
+            [sys.executable, f"{NODES}/plan_client.py", *given],
             env=environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert self._process.stderr is not None
@@ -223,6 +226,10 @@ class Client:
     @property
     def asking(self) -> bool:
         return self._process.poll() is None
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.communicate()
 
     def finish(self) -> dict[str, Any]:
         """Let it ask no more; return its summary once all is answered or given up."""

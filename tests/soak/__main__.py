@@ -20,7 +20,7 @@ from tests.estimates import median, p99
 from tests.link.namespaces import can_make_namespaces
 from tests.link.wire_pool import wait_for
 from tests.proxy.gateway_pool import ran
-from tests.soak import schedule
+from tests.soak import robot, schedule
 from tests.soak.clocks import can_set
 from tests.soak.damage import do
 from tests.soak.load import CALM, Load
@@ -37,7 +37,14 @@ def main() -> int:
     parser.add_argument("--minutes", type=float, default=10.0, help="how long (default 10)")
     parser.add_argument("--seed", type=int, default=1, help="of the schedule (default 1)")
     parser.add_argument("--keep", type=Path, help="folder for what the processes write")
+    parser.add_argument("--robot", action="store_true", help="the robot's own side, under ROS")
     given = parser.parse_args()
+    nightly = given.minutes >= LONG_MIN
+    if given.robot:
+        with tempfile.TemporaryDirectory(prefix="fogft-soak-") as folder:
+            where = (given.keep or Path(folder)).resolve()
+            where.mkdir(parents=True, exist_ok=True)
+            return robot.soak(where, given.seed, 60.0 * given.minutes, nightly=nightly)
     kinds, namespaces = list(schedule.KINDS), can_make_namespaces()
     if not namespaces:
         kinds = [kind for kind in kinds if "uplink" not in kind]
@@ -45,7 +52,7 @@ def main() -> int:
     if not can_set():
         kinds.remove("clock set")
         print("not run: clock set: needs gcc", file=sys.stderr)
-    if given.minutes < LONG_MIN:
+    if not nightly:
         kinds = [kind for kind in kinds if kind not in schedule.NIGHTLY]
     with tempfile.TemporaryDirectory(prefix="fogft-soak-") as folder:
         where = given.keep or Path(folder)

@@ -92,8 +92,8 @@ def cloud_lock(root: Path, limit_s: float = _LOCK_LIMIT_S) -> Iterator[None]:
                     "is a fogft process stopped or hanging?",
                 )
             time.sleep(_POLL_S)
-    except OSError as error:
-        raise CloudUnreachable(f"`{path}` cannot be used: {error.strerror}") from error
+    except (OSError, StateError) as error:
+        raise CloudUnreachable(f"`{path}` cannot be used: {error}") from error
     try:
         yield
     finally:
@@ -110,7 +110,7 @@ def _remove(root: Path, folder: MachineFolder, *, keep_log: bool) -> None:
             os.replace(folder.log, kept_log(root, folder.id))
             _prune(root / "logs")
         remove(folder.path)
-    except OSError as error:
+    except (OSError, StateError) as error:
         raise CloudUnreachable(f"`{folder.path}` cannot be removed: {error}") from error
 
 

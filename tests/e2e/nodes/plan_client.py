@@ -1,13 +1,15 @@
 """An ordinary rclpy client: asks at a steady rate, checks each answer against its request.
 
-Usage: plan_client.py SECONDS RATE_HZ [LIMIT_S]. Ends after SECONDS or at SIGINT, once every
+Usage: plan_client.py SECONDS RATE_HZ [LIMIT_S [FILE]]. Ends after SECONDS or at SIGINT, once every
 request is answered or given up, and prints one JSON object; a request without an answer after
-LIMIT_S has failed. Nothing here knows of fogft.
+LIMIT_S has failed. FILE gets a line for each request at its end: when it was asked and answered,
+and whether rightly. Nothing here knows of fogft.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import time
@@ -20,8 +22,9 @@ from rclpy.signals import SignalHandlerOptions
 
 
 class PlanClient(Node):
-    def __init__(self, rate_hz: float, limit_s: float) -> None:
+    def __init__(self, rate_hz: float, limit_s: float, path: str = os.devnull) -> None:
         super().__init__("plan_client")
+        self._ends = open(path, "w", buffering=1)  # noqa: SIM115
         self._plan_client = self.create_client(GetPlan, "/plan")
         self._limit_s = limit_s
         self._period_s = 1 / rate_hz
@@ -63,6 +66,7 @@ class PlanClient(Node):
             and plan.header.frame_id == f"{number}"
         )
         self.wrong += not right
+        print(json.dumps([asked, now, right]), file=self._ends)
 
     def run(self, seconds: float) -> None:
         """Ask by a timer and spin, as programs do.
@@ -90,6 +94,7 @@ class PlanClient(Node):
             if asked > limit:
                 break
             self.failed += 1
+            print(json.dumps([asked, None, False]), file=self._ends)
             del self.open[number]
 
     def summary(self) -> dict:
@@ -111,7 +116,7 @@ class PlanClient(Node):
 def main() -> None:
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     seconds, rate_hz = float(sys.argv[1]), float(sys.argv[2])
-    node = PlanClient(rate_hz, float(sys.argv[3]) if len(sys.argv) > 3 else 12.0)
+    node = PlanClient(rate_hz, float(sys.argv[3]) if len(sys.argv) > 3 else 12.0, *sys.argv[4:5])
     signal.signal(signal.SIGINT, lambda *_: setattr(node, "enough", True))
     if not node.wait():
         print(json.dumps({"error": "the service never appeared"}))
