@@ -46,7 +46,6 @@ class OrderMark:
                 "it says how far a stateful service has come; `fogft down` and `up` begin anew",
             ) from error
         self._words = memoryview(self._map).cast("Q")
-        self._version = self.holder or ""
         if self._words[0] != _MAGIC or self._words[1] != uid:
             raise StateError(f"`{path}` is not the order mark of this pool", "move it away")
 
@@ -63,6 +62,7 @@ class OrderMark:
 
     def new_term(self, nonce: int, *, above: int = 0) -> int:
         """Return an epoch above `above` and all that the file knows of; it is remembered."""
+        self._version = self.holder or ""  # another process may have written meanwhile
         epoch = orders.next_epoch(max(self._words[_TERM], above), nonce)
         self._words[_TERM] = epoch
         self._map.flush()

@@ -116,6 +116,17 @@ class Decide:
 
     # -- what replicas must have ----------------------------------------------------------
 
+    def hold(self) -> None:
+        """Order no more: another proxy does."""
+
+    def take_over(self, now: float) -> None:
+        """Order from now on, where that was held: another proxy has given it up."""
+
+    @property
+    def held(self) -> Collection[bytes]:
+        """Return the requests that wait for that."""
+        return ()
+
     @property
     def ready(self) -> bool:
         """Whether a request that is taken now can be answered, where `sends_requests`."""

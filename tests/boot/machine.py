@@ -36,7 +36,9 @@ class Machine:
 
     def __init__(self, folder: Path, cgroup: Path) -> None:
         self._cgroup = cgroup
-        kept = {str(ROOT), sys.prefix, sys.base_prefix} - {"/", "/usr"}
+        wanted = {Path(one) for one in (str(ROOT), sys.prefix, sys.base_prefix)}
+        kept = [str(one) for one in wanted if not wanted & set(one.parents)]
+        kept = [one for one in kept if one not in ("/", "/usr")]
         self._log = (folder.parent / f"{folder.name}.log").open("w+b")
         script = str(Path(__file__).with_name("boot.sh"))
         boots = ["unshare", *_NAMESPACES, "bash", script, str(folder), str(cgroup), *sorted(kept)]

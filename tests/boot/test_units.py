@@ -42,6 +42,11 @@ fogft:
   services:
     - {{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10.0}}
 """
+GATEWAY, MEETING = "127.0.0.1:7461", "127.0.0.1:7462"
+BEHIND_A_GATEWAY = f"""\
+  rendezvous: ['{MEETING}']
+  topology: {{gateways: [{{name: east, endpoint: '{GATEWAY}'}}], default_gateways: [east]}}
+"""
 PARTS = tuple(f"fogft-e2e-{part}.service" for part in ("manager", "proxy-a", "proxy-b"))
 
 
@@ -59,15 +64,33 @@ class Robot:
             self._own["XDG_RUNTIME_DIR"] = f"/run/user/{uid}"
             runs = ("systemctl", "is-active", f"user@{uid}")
             wait(lambda: made.run(*runs, ok=False).strip() == "active", made.log)
-        self._write(f"{HOME}/pool.yaml", POOL)
+        self.write(f"{HOME}/pool.yaml", POOL)
 
-    def _write(self, path: str, text: str) -> None:
+    def write(self, path: str, text: str) -> None:
         self.machine.run("bash", "-c", f"cat >{path} <<'END'\n{text}\nEND", user="robot")
 
     def fogft(self, *words: str, ok: bool = True) -> str:
         """Run a command as the user."""
         command = [sys.executable, "-m", "fogft", *words]
         return self.machine.run(*command, user="robot", environ=self._own, ok=ok, limit_s=240)
+
+    def join(self, role: str, name: str, listen: str) -> str:
+        """Let another machine of the pool in, with a home of its own; return its configuration."""
+        secret, other = f"{HOME}/secret", f"{HOME}/{name}"
+        self.write(secret, "a passphrase that unknown")
+        given = ("--passphrase-file", secret)
+        out = ("--out", f"{HOME}/{name}.join")
+        bundle = self.fogft("credentials", "issue", role, name, *out, *given).strip()
+        joined = self.machine.run(
+            *(sys.executable, "-m", "fogft", "join", bundle, *given),
+            user="robot", environ={**self._own, "FOGFT_HOME": other},
+        )  # fmt: skip
+        config = joined.strip()
+        text = "import sys, yaml; p = sys.argv[1]; given = yaml.safe_load(open(p)); "
+        text += "given['listen'] = sys.argv[2]; open(p, 'w').write(yaml.safe_dump(given))"
+        words = (sys.executable, "-c", text, config, listen)
+        self.machine.run(*words, user="robot", environ=self._own)
+        return config
 
     def path(self, path: str) -> None:
         """Have commands find fogft there."""
@@ -236,6 +259,45 @@ def test_a_pool_goes_on_whatever_dies_and_after_each_boot(robot: Robot) -> None:
     assert left == "", left
     # Before, a unit whose cgroup holds the local cloud's machines is not forgotten.
     assert robot.systemctl("list-units", "--all", "--no-legend", "fogft*") == ""
+
+
+def test_a_gateway_and_a_rendezvous_go_on_whatever_dies_and_after_a_boot(tmp_path: Path) -> None:
+    """A rendezvous costs nothing; a lone gateway that is killed or hangs is started again."""
+    with machine(tmp_path / "machine") as made:
+        robot = Robot(made, system=True)
+        robot.write(f"{HOME}/pool.yaml", POOL + BEHIND_A_GATEWAY)
+        up = (sys.executable, "-m", "fogft", "up", f"{HOME}/pool.yaml", "--yes", "--timeout", "1")
+        robot.fogft(*up[3:], ok=False)  # it answers once there is a gateway
+        units = []
+        for part, name, listen in (
+            ("rendezvous", "meet", MEETING),
+            ("gateway", "east", GATEWAY),
+        ):
+            config = Path(robot.join(part, name, listen))
+            robot.service("install", f"--{part}", str(config))
+            units.append(f"fogft-{part}-{config.stem}.service")
+            wait(lambda: robot.pid(units[-1]), robot.told)
+        robot.service("install")
+        robot.whole()
+
+        for how in ("KILL", "STOP"):
+            for unit in units:
+                client = robot.client()
+                before = robot.pid(unit)
+                robot.signal(how, before)
+                wait(lambda u=unit, b=before: robot.pid(u) not in (0, b), robot.told, 240)
+                robot.whole()
+                failed = client.finish()["failed"]
+                assert "gateway" in unit or not failed, (how, unit)
+            robot.answers()
+
+        booted = made.init()
+        made.run("systemctl", "reboot", "--no-block")
+        made.await_boot(after=booted)
+        wait(lambda: all(map(robot.pid, units)), robot.told, 240)
+        robot.whole()
+        robot.answers()
+        robot.fogft("down", "--yes")
 
 
 def test_an_upgrade_hands_the_client_proxy_over_on_an_overlay(tmp_path: Path) -> None:

@@ -58,6 +58,17 @@ def folder(tmp_path: Path) -> Path:
 # --- its text
 
 
+def test_each_check_is_told_when_it_begins(monkeypatch, tmp_path):
+    """A check of ROS takes seconds: what a pool reported since is not from the future."""
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path))
+    clock = iter(range(100, 200))
+    monkeypatch.setattr(time, "time", lambda: float(next(clock)))
+    told: list[float] = []
+    monkeypatch.setattr(checks, "ALL", (lambda situation: told.append(situation.now) or (),) * 3)
+    assert list(checks.examine()) == []
+    assert told == sorted(set(told))
+
+
 def test_a_finding_is_a_line_and_its_advice_another(monkeypatch, capsys):
     findings = [ok("clock", "2026-11-21"), warn("ports", "7448 is taken", "free it")]
     monkeypatch.setattr(checks, "examine", lambda _: iter(findings))

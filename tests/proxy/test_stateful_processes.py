@@ -308,3 +308,30 @@ def test_another_robot_is_refused_and_told_so(parts, clients):
     before = client.answered
     wait_for(lambda: client.answered > before + 5, "the first robot to go on")
     assert linearizable(client.history, counter, 0)
+
+
+def test_a_client_proxy_that_is_told_to_end_hands_its_order_over_without_losing_a_request(
+    parts, clients
+):
+    """Twice under load: what the first took is not run again, what it left is not lost."""
+    replicas = [parts.replica(0), parts.replica(1)]
+    robot = parts.robot("robot", *replicas)
+    counters = [clients(robot, "/count", lambda: ("add", 1)) for _ in range(3)]
+    wait_for(lambda: all(c.answered >= 5 for c in counters), "answers")
+    for _ in range(2):
+        leaving, robot.process = robot.process, robot.start_standby()
+        leaving.terminate()
+        assert leaving.wait(LIMIT_S) == 0
+        wait_for(lambda: robot.report().get("pid") == robot.process.pid, "the standby's report")
+        before = [c.answered for c in counters]
+        wait_for(
+            lambda b=before: all(c.answered > n for c, n in zip(counters, b, strict=True)),
+            "answers of the standby",
+        )
+    for client in counters:
+        client.stop()
+    history = [call for client in counters for call in client.history]
+    assert all(call.answered for call in history)
+    assert linearizable(history, counter, 0)
+    assert counters[0].ask(("get", 0)) == len(history)
+    settled(robot, *replicas)

@@ -107,6 +107,32 @@ def test_topics_and_an_action_pass_and_outlive_their_replicas(fog, person):
     person.wait(lambda: fog.noted(2, "map") == ["of the house"], "what is latched, there too")
 
 
+def test_a_client_proxy_that_is_told_to_end_hands_an_action_over(fog, person):
+    """A goal that it gave has its result, those made meanwhile are accepted, and have theirs."""
+    from rclpy.action import ActionClient
+    from test_msgs.action import Fibonacci
+
+    fog.add(1, 0.1)
+    person.wait(lambda: fog.ready(0, 1), "both replicas")
+    client = ActionClient(person.node, Fibonacci, "/count")
+    person.wait(client.server_is_ready, "the action")
+    leaving, fog.robot.process = fog.robot.process, fog.robot.start_standby()
+    goals = [send(client, person, 40)]
+    results = [goals[0].get_result_async()]
+    leaving.terminate()
+    while leaving.poll() is None or len(goals) < 5:
+        goals.append(send(client, person, 5))
+        results.append(goals[-1].get_result_async())
+    assert leaving.returncode == 0
+    goals.append(send(client, person, 5))
+    results.append(goals[-1].get_result_async())
+    for result in results:
+        person.wait(result.done, "the result")
+        assert result.result().status == 4
+    begun = fog.noted(0, "begun")
+    assert sorted(begun) == sorted(bytes(goal.goal_id.uuid).hex() for goal in goals)
+
+
 def check_topics(fog: Fog, person: Person) -> None:
     """Every message reaches every replica, and what they all say is heard once, in order."""
     from rclpy.qos import DurabilityPolicy, QoSProfile

@@ -301,12 +301,12 @@ class Actions:
         spec: ServiceSpec,
         respond: Callable[[Any, bytes], None],
         wake: Callable[[], None],
-        fault_of: Callable[[bytes], str] = lambda payload: "",
+        **how: Any,
     ) -> Dispatcher:
-        """Make the dispatcher of an action's part."""
+        """Make the dispatcher of an action's part; `how` is as `Dispatcher` takes it."""
         name = spec.name.rpartition("/")[0]
         action = self._actions.setdefault(name, _Action(self._clock, wake))
-        make = partial(Dispatcher, spec, respond, wake=wake, clock=self._clock, fault_of=fault_of)
+        make = partial(Dispatcher, spec, respond, wake=wake, clock=self._clock, **how)
         if spec.part is Part.GOAL:
             return make(decide=_GoalPart(action, spec.name))
         if spec.part is Part.CANCEL:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -307,20 +307,37 @@ class ClientProxy:
         """Services that are offered in ROS now."""
         return [name for name, service in self._services.items() if service.server is not None]
 
-    def take_no_more(self, *, shared: bool) -> None:
-        """Leave callers' requests to another proxy; only those of services that two can share."""
+    def begin_leaving(self) -> None:
+        """Leave topics to another proxy, and note which requests are taken beside it."""
         with self._lock:
             for service in self._services.values():
-                if service.shared is shared:
-                    service.dispatcher.leaving = True
-            if not shared:
-                self._topics.close()
+                service.dispatcher.taken = []
+            self._topics.close()
 
-    def waiting(self, *, shared: bool) -> int:
-        """Count the requests without an answer of services that two proxies can share, or not."""
+    def take_no_more(self) -> None:
+        """Leave callers' requests to another proxy."""
         with self._lock:
-            services = [s for s in self._services.values() if s.shared is shared]
+            for service in self._services.values():
+                service.dispatcher.leaving = True
+
+    def waiting(self, *, ordered: bool = False) -> int:
+        """Count the requests without an answer; only those of stateful services if asked."""
+        with self._lock:
+            services = [s for s in self._services.values() if s.spec.state or not ordered]
             return sum(service.dispatcher.waiting for service in services)
+
+    def hold(self) -> dict[str, list[bytes]]:
+        """Order stateful services no more; return what was taken of each since we are leaving."""
+        with self._lock:
+            services = [s for s in self._services.values() if s.spec.state]
+            return {s.spec.name: s.dispatcher.hold() for s in services}
+
+    def take_over(self, taken: Mapping[str, Collection[bytes]] | None) -> None:
+        """Order stateful services, but what another proxy has taken; None if that is not known."""
+        with self._lock:
+            for name, service in self._services.items():
+                service.dispatcher.take_over(None if taken is None else taken.get(name, ()))
+        self.look_again()
 
     def trace(self) -> list[dict[str, Any]]:
         """Return how requests ended since the last call, of the services that are traced."""

@@ -20,7 +20,7 @@ import logging
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 from fogft.errors import RosError
@@ -62,6 +62,7 @@ class Dispatcher:
 
     Attributes:
         leaving: Whether callers' requests are left to another proxy, which gets them too.
+        taken: The callers' requests that were taken, once another proxy may get them too.
     """
 
     def __init__(
@@ -81,6 +82,7 @@ class Dispatcher:
     ) -> None:
         self._id_of = id_of
         self.leaving = False
+        self.taken: list[bytes] | None = None
         self._fault_of = fault_of
         self._malformed: Counter[int] = Counter()
         self._ok_of = ok_of
@@ -123,9 +125,14 @@ class Dispatcher:
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to whom the policy chooses."""
-        if not self.leaving:
-            spec = self._ledger.spec
-            self.forward(self._id_of(spec.name, handle), payload, handle, spec.timeout_s)
+        spec = self._ledger.spec
+        request = self._id_of(spec.name, handle)
+        with self._lock:
+            if self.leaving:
+                return
+            if self.taken is not None:
+                self.taken.append(request)
+        self.forward(request, payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Do the same for a request that has its id, and so much time left; whether it was taken.
@@ -169,6 +176,21 @@ class Dispatcher:
             limit = f"at most {self.max_pending_bytes} B and {self.max_pending} requests may wait"
             log.warning("request_turned_away service=%s reason=%r count=%d",
                         self.spec.name, f"{held}: {limit}", count["turned_away"])  # fmt: skip
+
+    def hold(self) -> list[bytes]:
+        """Order no more; return the callers' requests that were taken beside another proxy."""
+        with self._lock:
+            self._decide.hold()
+            return list(self.taken or ())
+
+    def take_over(self, taken: Collection[bytes] | None) -> None:
+        """Order what was held, but for what another proxy has taken; None for perhaps all of it."""
+        for request in self._decide.held:
+            if taken is None or request in taken:
+                self.cancel(request)
+        with self._lock:
+            self._decide.take_over(self._clock())
+        self._wake()
 
     def cancel(self, request: bytes) -> None:
         """End a request that its caller no longer wants; unknown ids are fine."""

@@ -131,6 +131,7 @@ def make_dispatcher(
     actions: Actions,
     speaks: Speaks = Speaks.RCLPY,
     id_of: Callable[[str, Any], bytes] | None = None,
+    held: Callable[[], bool] = lambda: False,
 ) -> Dispatcher:
     """Make the dispatcher of a service, with what its policy needs of its ROS type.
 
@@ -138,22 +139,19 @@ def make_dispatcher(
         RosError: The type is needed and cannot be loaded.
     """
     fault_of = middleware.fault_of(spec.type, RESPONSE)
+    shared: dict[str, Any] = {"fault_of": fault_of, **({"id_of": id_of} if id_of else {})}
     if spec.part is not Part.NONE:
-        return actions.make(spec, respond, wake, fault_of)
+        return actions.make(spec, respond, wake, **shared)
     from fogft.ros import messages
     from fogft.ros.comparison import Comparison
 
     # The policy may become `empty` later.
     empty = middleware.empty_response(speaks, spec.type, needed=spec.needs_type)
-    make = functools.partial(
-        Dispatcher, spec, respond, empty_response=empty, wake=wake, fault_of=fault_of
-    )
+    make = functools.partial(Dispatcher, spec, respond, empty_response=empty, wake=wake, **shared)
     if spec.state is not None:
         mark = marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}"
-        order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake)
+        order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake, held=held())
         return make(decide=order, max_pending_bytes=_STATEFUL_BYTES)
-    if id_of is not None:
-        make = functools.partial(make, id_of=id_of)
     ok_of = functools.partial(messages.bool_field, spec.type)
     if spec.quorum > 1:
         comparison = Comparison(spec.type, spec.tolerance)
@@ -186,6 +184,7 @@ class _Running:
         began = time.monotonic()
         self.config_path, self.metrics, self.config = config_path, metrics, config
         self.lock, self.managing = lock, managing
+        self.held = in_line.is_held(config.lock)
         made: list[ClientProxy] = []  # the node asks the proxy that is made with it
         joined = self.joined = middleware.join(
             config.rmw,
@@ -202,6 +201,7 @@ class _Running:
             actions=Actions(),
             speaks=config.rmw,
             id_of=in_line.request_ids(config.credentials.key),
+            held=lambda: self.held,
         )
         self.dialer, merge = make_dialer(config), goal_status.merged
         proxy = self.proxy = ClientProxy(
@@ -276,6 +276,8 @@ class _Running:
             memory.look()
             watchdog.work()
             try_step(self.managing.look, config.lock)
+            if self.held:
+                try_step(self._take_over, config.lock)
             if watched_config.changed():
                 try_step(self._reconfigure, self.config_path)
             if (services := self.seen.changed()) is not None:
@@ -300,6 +302,11 @@ class _Running:
                 try_step(functools.partial(self._report, told, now), config.status)
                 trace = config.status.with_name(TRACE_NAME)
                 try_step(functools.partial(_trace, trace, proxy, self.spans), trace)
+
+    def _take_over(self) -> None:
+        if not in_line.is_held(self.config.lock):
+            self.held = False
+            self.proxy.take_over(in_line.taken_before(self.config.lock))
 
     def _reconfigure(self) -> None:
         path = self.config_path

@@ -66,11 +66,6 @@ class ProxiedService:
         self._advertising = Advertising()
         self._looked_at = 0.0
 
-    @property
-    def shared(self) -> bool:
-        """Whether two proxies can serve it at once: it has no order, and no goals."""
-        return self.spec.state is None and self.spec.part is Part.NONE
-
     def adopt(self, spec: ServiceSpec, node: RosNode | None) -> None:
         """Have the dispatcher follow a policy, with a client of its fallback service."""
         name = spec.fallback.service if spec.fallback is not None else ""

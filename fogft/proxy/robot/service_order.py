@@ -29,7 +29,11 @@ _ATTEMPT_S = 60.0
 
 
 class ServiceOrder(Decide):
-    """Numbers requests, and says what to send to whom and when an answer counts."""
+    """Numbers requests, and says what to send to whom and when an answer counts.
+
+    Args:
+        held: Whether another proxy orders still: requests wait until `take_over`.
+    """
 
     replicates = sends_requests = True
 
@@ -40,8 +44,10 @@ class ServiceOrder(Decide):
         *,
         wake: Callable[[], None] = lambda: None,
         clock: Callable[[], float] = time.monotonic,
+        held: bool = False,
     ) -> None:
         super().__init__()
+        self._held = held
         self._name = name
         self._mark = mark
         self._wake = wake
@@ -54,15 +60,32 @@ class ServiceOrder(Decide):
         self._term = self._begin_term()
 
     def _begin_term(self, above: int = 0, begin: Handover | None = None) -> Sequencer:
+        self._numbers.clear()  # what has one has its answer, or gets none: it was another term's
+        self._requests.clear()
         epoch = self._mark.new_term(secrets.randbits(32), above=above)
         mark = self._mark.position
         log.info("term_began service=%s epoch=%x mark=%d", self._name, epoch, mark.index)
         return Sequencer(epoch, mark=mark, holder=self._mark.holder, begin=begin)
 
+    def hold(self) -> None:
+        """Order no more: another proxy does, whose term ends this one."""
+        self._held = True
+
+    def take_over(self, now: float) -> None:
+        """Begin a term from what was answered last, if another proxy has ordered until now."""
+        if self._held:
+            self._held, self._term = False, self._begin_term()
+            self._reach(now)
+
+    @property
+    def held(self) -> Collection[bytes]:
+        """Return the requests that wait while another proxy orders."""
+        return tuple(self._waiting) if self._held else ()
+
     @property
     def ready(self) -> bool:
         """Whether a request taken now can be answered."""
-        return self._term.ready
+        return self._held or self._term.ready
 
     @property
     def trouble(self) -> str:
@@ -85,7 +108,7 @@ class ServiceOrder(Decide):
             self._waiting[request] = payload
 
     def _number(self, request: bytes, payload: bytes) -> bool:
-        number = self._term.submit(payload) if self._term.ready else None
+        number = None if self._held or not self._term.ready else self._term.submit(payload)
         if number is None:
             return False
         self._numbers[request], self._requests[number] = number, request
@@ -158,7 +181,7 @@ class ServiceOrder(Decide):
             order = decode(id)
         except OrderError:
             return None
-        return order if order[1] == self._term.epoch else None
+        return None if self._held or order[1] != self._term.epoch else order
 
     def _wake_if_due(self) -> None:
         if self._term.due:
@@ -177,6 +200,8 @@ class ServiceOrder(Decide):
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
         """Number what waits, and return the orders to send, in their order."""
+        if self._held:
+            return []
         self._tick(now)
         for request, payload in list(self._waiting.items()):
             if not self._number(request, payload):

@@ -6,21 +6,23 @@ ends, whatever ends it.
 
 A holder that is told to end lets the standby take over while it still serves. For half a second
 both serve: each request goes to both, under one id, so that a replica runs it once and the caller
-gets one answer. Then the first takes no more, and finishes what it has taken. What only one may
-serve, stateful services and actions, is not shared: there the first stops first.
+gets one answer. Then the first takes no more, and finishes what it has taken. A stateful service is
+ordered by one only: the other holds what it hears until the first, which keeps a lock meanwhile,
+has written down which of it was taken there. If it is killed before, what was held is given up.
 
 Owns: the place in line, and that order. Not here: a client proxy's work (`process`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib
 import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,7 +43,8 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.2
 BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
 KNOWN_AFTER_S = 0.5  # once it offers them and knows the callers: until they know its services
-FINISH_LIMIT_S = 60.0
+ORDER_LIMIT_S = 20.0  # what was ordered is answered by then, or not at all
+FINISH_LIMIT_S = 130.0  # in all less than systemd and `fogft service install` wait
 _PACED_S = 0.5  # until responses that are spread for their client are out
 # What a client proxy imports only when it needs it.
 _NEEDED = ("fogft.link.zenoh.robot.dialer", "fogft.proxy.robot.process", "fogft.ros.goal_status")
@@ -132,22 +135,50 @@ def hand_over(
     release: Callable[[], None],
 ) -> None:
     """Let the standby take over, if there is one; return when nothing is left to do."""
+    taken, order = _files(config.lock)
+    lock = disk.Lock(order)
     try:
         if config.dial_in or not disk.is_locked(disk.standby_lock(config.lock)):
             return
+        taken.unlink(missing_ok=True)
+        if not lock.acquire(wait=False):
+            raise BlockingIOError("another one is handing over to this one")
     except OSError as error:
         log.error("handover_failed reason=%r", str(error))
         return
     log.info("handover_began pool=%s", config.pool)
-    proxy.take_no_more(shared=False)
-    _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting(shared=False) == 0)
+    proxy.begin_leaving()
     release()
     if _run(proxy, BEGIN_LIMIT_S, lambda: _takes(config.status, callers())):
         _run(proxy, KNOWN_AFTER_S, lambda: False)
-    proxy.take_no_more(shared=True)
-    if _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting(shared=True) == 0):
+    proxy.take_no_more()
+    _run(proxy, ORDER_LIMIT_S, lambda: proxy.waiting(ordered=True) == 0)
+    told = {name: [id.hex() for id in ids] for name, ids in proxy.hold().items()}
+    try:
+        disk.write_json(taken, told, durable=False)
+    except StateError as error:
+        log.error("handover_failed reason=%r", error.message)
+    lock.release()
+    if _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting() == 0):
         _run(proxy, _PACED_S, lambda: False)
     log.info("handover_ended pool=%s", config.pool)
+
+
+def is_held(lock: Path) -> bool:
+    """Whether the one that hands over to us orders stateful services still."""
+    return disk.is_locked(_files(lock)[1])
+
+
+def taken_before(lock: Path) -> Mapping[str, Collection[bytes]] | None:
+    """Return which requests it has taken, by service; None where it was killed, or had no room."""
+    with contextlib.suppress(StateError, ValueError, TypeError, AttributeError):
+        told = disk.read_json(_files(lock)[0])
+        return {str(name): set(map(bytes.fromhex, ids)) for name, ids in told.items()}
+    return None
+
+
+def _files(lock: Path) -> tuple[Path, Path]:
+    return lock.with_name(f"{lock.stem}-taken.json"), lock.with_name(f"{lock.stem}-order.lock")
 
 
 def _run(proxy: ClientProxy, limit_s: float, done: Callable[[], bool]) -> bool:

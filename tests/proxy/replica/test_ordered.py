@@ -59,6 +59,7 @@ class Scene:
 
     def __init__(self, folder, replicas=2, **spec):
         self.clock = Clock()
+        self.rounds = 50
         self.responses = []
         self.answers = []
         self.spec = ServiceSpec("/s", "p/srv/S", timeout_s=5.0, state=STATE, **spec)
@@ -72,21 +73,23 @@ class Scene:
             responder.tick(alive=True)
         self.dispatcher = self.start()
 
-    def start(self):
-        order = ServiceOrder("/s", OrderMark(self.folder / "mark", UID), clock=self.clock)
+    def start(self, *, held=False):
+        mark = OrderMark(self.folder / "mark", UID)
+        order = ServiceOrder("/s", mark, clock=self.clock, held=held)
         dispatcher = Dispatcher(
             self.spec,
             lambda handle, payload: self.responses.append((handle, payload)),
             decide=order,
             empty_response=b"empty",
             clock=self.clock,
+            id_of=lambda service, handle: f"{handle}".encode().ljust(16),
         )
         dispatcher.route(self.links)
         return dispatcher
 
     def run(self, *slots):
         """Carry orders and answers until nothing moves; services stay as they are."""
-        for _ in range(50):
+        for _ in range(self.rounds):
             for slot in slots or range(len(self.links)):
                 offered, self.links[slot].offered = self.links[slot].offered, []
                 for _, request, payload, _ in offered:
@@ -133,6 +136,57 @@ def test_a_service_is_given_one_request_at_a_time(scene):
         assert scene.serve(0, b"a%d" % i) == b"q%d" % i
     scene.run()
     assert scene.responses == [(i, b"a%d" % i) for i in range(5)]
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_another_proxy_orders_what_was_not_taken_and_nothing_twice(scene, known):
+    """Both hear all; where it is not known what the first has taken, all that waited is lost."""
+    scene.run()
+    scene.rounds = 8  # what is held does not wait for ever
+    first, second = scene.dispatcher, scene.start(held=True)
+    assert second.able
+    first.taken = []
+    for i in range(3):
+        first.leaving = i == 2
+        first.submit(b"q%d" % i, i)
+        second.submit(b"q%d" % i, i)
+        scene.run()
+    for i in range(2):
+        assert scene.serve(0, b"a%d" % i) == b"q%d" % i
+        assert scene.serve(1, b"a%d" % i) == b"q%d" % i
+        scene.run()
+    taken = first.hold()
+    assert len(taken) == 2
+    scene.dispatcher = second
+    second.take_over(taken if known else None)
+    scene.rounds = 25
+    scene.run()
+    assert len(scene.clients[1].service.calls) == known  # the other is asked for its state
+    second.submit(b"q3", 3)
+    if known:
+        assert scene.serve(1, b"a2") == b"q2"
+    scene.run()
+    assert scene.serve(1, b"a3") == b"q3"
+    scene.run()
+    expected = [0, 1, 2, 3] if known else [0, 1, 3]
+    assert scene.responses == [(i, b"a%d" % i) for i in expected]
+
+
+def test_numbers_of_a_term_that_another_has_ended_are_given_anew(scene):
+    """What waited for its answer has none, and does not get another's."""
+    scene.run()
+    scene.rounds = 12
+    first = scene.dispatcher
+    scene.dispatcher = scene.start()
+    scene.run()  # a term of another's, of which the first does not know
+    scene.dispatcher = first
+    for i in range(2):
+        first.submit(b"q%d" % i, i)
+        scene.run()
+    scene.clock.now += 10.0
+    first.tick()
+    assert first.waiting == 0
+    assert scene.responses == []
 
 
 def test_requests_wait_until_a_replica_has_joined(tmp_path):
