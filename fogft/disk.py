@@ -144,11 +144,7 @@ def standby_lock(path: Path) -> Path:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold a lock for a while; wait for it.
-
-    Raises:
-        StateError: There is no such folder, or the file cannot be made.
-    """
+    """Hold a lock for a while; wait for it."""
     lock = Lock(path)
     try:
         lock.acquire(wait=True)

@@ -15,11 +15,7 @@ MAX_BYTES = 1 << 20
 
 
 def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
-    """Return what a pool file asks for. Its `workdir`, relative to its own folder, must exist.
-
-    Raises:
-        SpecError: The file cannot be read, or its first mistake: ``file:line: key: what``.
-    """
+    """Return what a pool file asks for. Its `workdir`, relative to its own folder, must exist."""
     return parse(read_text(path), str(path), checks, Path(path).parent)
 
 

@@ -46,9 +46,6 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
     """Return a service's policy with other values for some keys.
 
     A `fallback_service` is left out where `on_timeout` asks for none any more.
-
-    Raises:
-        ValueError: The pool file's reader would refuse it, or it has no such parameter; with why.
     """
     now = shown(spec)
     news = {key: value for key, value in values.items() if now.get(key) != value}
@@ -109,11 +106,7 @@ class Policies:
         self._file = new
 
     def set(self, values: Mapping[str, Value]) -> None:
-        """Set parameters by their full names: all of them, or none.
-
-        Raises:
-            ValueError: One of them is unknown, or its value is refused; with why.
-        """
+        """Set parameters by their full names: all of them, or none."""
         by_prefix = {prefix(name): name for name in self._file}
         wanted: dict[str, dict[str, Value]] = {}
         for full, value in values.items():

@@ -220,12 +220,7 @@ def binding_of(certificate: bytes) -> bytes:
 
 
 async def first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
-    """Return the first message; what came along with it stays in the unframer.
-
-    Raises:
-        RecordError: Something else came.
-        EOFError: Nothing came.
-    """
+    """Return the first message; what came along with it stays in the unframer."""
     while data := await reader.read(16 << 10):
         for message in unframer.feed(data):
             return message

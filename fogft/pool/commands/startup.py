@@ -42,13 +42,7 @@ def start(order: Preview) -> bool:
 
 
 def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: str) -> Identity:
-    """Create a pool, or apply a changed file to it.
-
-    Raises:
-        SpecError: A pool of this name was started from another file, or runs elsewhere.
-        PoolBusy: It is being ended right now.
-        StateError: It cannot be written; nothing has changed.
-    """
+    """Create a pool, or apply a changed file to it."""
     paths = store.paths
     disk.make_folder(paths.folder)
     with disk.locked(paths.intent_lock):

@@ -40,11 +40,7 @@ class HistoryFile:
             return self._history
 
     def append(self, event: Event) -> None:
-        """Remember an event, on disk before this returns.
-
-        Raises:
-            StateError: It cannot be written. The event did not happen.
-        """
+        """Remember an event, on disk before this returns."""
         history = self.history()
         with self._lock:
             try:

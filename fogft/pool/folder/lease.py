@@ -38,11 +38,7 @@ class Lease:
 
     @classmethod
     def take(cls, paths: PoolPaths, *, at_least: int = 0) -> Lease:
-        """Take the lease under an epoch above all earlier ones, and above `at_least`.
-
-        Raises:
-            PoolBusy: Another manager has it.
-        """
+        """Take the lease under an epoch above all earlier ones, and above `at_least`."""
         lock = disk.Lock(paths.manager_lock)
         if not lock.acquire(wait=False):
             said = paths.manager_lock.read_text()

@@ -41,10 +41,8 @@ class _File:
 class PoolPaths:
     """The files of one pool; each has one writer.
 
-    Written by `up`, `scale`, `drain`, `exclude` and `down` (under `intent_lock`):
-    `identity`, `spec`, `intent`. By the manager (under `manager_lock`): `lease`,
-    `status`, `membership`, `proxy_config`, `history`, `credentials`, `good_spec`, `trial`,
-    `discovered`. By the client proxy (under `proxy_lock`): `proxy_status`.
+    Commands write `identity`, `spec` and `intent` (under `intent_lock`), the client proxy its own
+    `proxy_status` (under `proxy_lock`), and the manager all else (under `manager_lock`).
     """
 
     folder: Path

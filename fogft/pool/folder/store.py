@@ -235,13 +235,7 @@ def digest(source: bytes) -> str:
 
 
 def read_identity(paths: PoolPaths) -> Identity:
-    """Return what the pool in a folder is.
-
-    Raises:
-        PoolNotFound: There is none.
-        PoolBusy: Another machine manages it.
-        StateError: Its file is damaged.
-    """
+    """Return what the pool in a folder is."""
     raw = disk.read_json(paths.identity)
     if raw is None and paths.exported.exists():
         name = paths.folder.name

@@ -57,11 +57,7 @@ class Distance:
 
 
 def connect_time(host: str, port: int) -> float:
-    """Return how long a TCP connect takes, in seconds: about one round trip.
-
-    Raises:
-        OSError: Nothing answers.
-    """
+    """Return how long a TCP connect takes, in seconds: about one round trip."""
     found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     times = []
     for _ in range(CONNECTS):

@@ -131,11 +131,7 @@ class Manager:
         )
 
     def run(self, stop: threading.Event) -> None:
-        """Manage until `stop` is set or the pool's folder is gone.
-
-        Raises:
-            PoolBusy: A later manager has taken over.
-        """
+        """Manage until `stop` is set or the pool's folder is gone."""
         log.info("manager_started pool=%s epoch=%d", self._identity.name, self._lease.epoch)
         try:
             self._attempt(lambda: proxy_supervisor.allow_restart(self._paths))
@@ -183,11 +179,7 @@ class Manager:
         return False
 
     def _step_back(self) -> None:
-        """Leave the pool, as an export does, where another machine took it over later.
-
-        Raises:
-            PoolBusy: It did.
-        """
+        """Leave the pool, as an export does, where another machine took it over later."""
         report = self._fresh_report(time.time())
         heard = max(self._records.newest_epoch, report.manager_epoch if report else 0)
         if not supersedes(heard, self._lease.epoch):
@@ -350,10 +342,7 @@ class Manager:
 
 
 def run(store: PoolStore, cloud_of: Callable[[Identity], Cloud], **how: Any) -> None:
-    """Run a pool's manager in this process until a signal ends it, or the pool has ended.
-
-    What it takes besides, and raises, is as of `Manager`.
-    """
+    """Run a pool's manager in this process until a signal ends it, or the pool has ended."""
     start_log()
     stop = stop_on_signal()
     Manager(store, cloud_of(store.identity()), **how).run(stop)

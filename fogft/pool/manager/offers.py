@@ -25,12 +25,7 @@ class Seller(Protocol):
 
 
 def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
-    """Return all offers for a pool, each with the name of the group that it is for.
-
-    Raises:
-        CloudUnreachable: Prices cannot be had now.
-        SpecError: The resources can never be met.
-    """
+    """Return all offers for a pool, each with the name of the group that it is for."""
     found: list[Offer] = []
     places = {group.name: f"fogft.groups[{n}]." for n, group in enumerate(spec.groups)}
     for name, resources in sales(spec):
