@@ -38,8 +38,7 @@ def written_anew(*files: Path) -> None:
 
 
 @pytest.mark.ros
-@pytest.mark.parametrize("fault", FAULTS)
-def test_client_proxy_and_server_proxy_go_on(folder, ros_domains: Callable[[], int], fault):
+def test_client_proxy_and_server_proxy_go_on(folder, ros_domains: Callable[[], int]):
     parts = Parts(folder, ros_domains)
     caller = None
     try:
@@ -47,35 +46,35 @@ def test_client_proxy_and_server_proxy_go_on(folder, ros_domains: Callable[[], i
         robot = parts.robot("robot", replica)
         caller = Caller(robot.domain)
         caller.wait()
-        pids = [replica.process.pid, robot.process.pid]
-        log = os.open(folder / "robot.log", os.O_RDONLY)
-        with FAULTS[fault](folder, pids):
+        for fault, breaks in FAULTS.items():
+            log = os.open(folder / "robot.log", os.O_RDONLY)
+            os.lseek(log, 0, os.SEEK_END)
+            with breaks(folder, [replica.process.pid, robot.process.pid]):
+                if fault == "removed":
+                    assert robot.process.wait(60) == 0
+                    assert b"folder_gone" in os.read(log, 1 << 20)
+                else:
+                    for _ in range(LONG):
+                        caller.ask()
+                        caller.spin(0.02)
+                    assert caller.all_answered(), fault
+                    if fault != "full":  # then there is no room for the log either
+                        assert b"file_failed" in os.read(log, 1 << 20), fault
+            os.close(log)
             if fault == "removed":
-                assert robot.process.wait(60) == 0
-                assert b"folder_gone" in os.read(log, 1 << 20)
-            else:
-                for _ in range(LONG):
-                    caller.ask()
-                    caller.spin(0.02)
-                assert caller.all_answered()
-                if fault != "full":  # then there is no room for the log either
-                    assert b"file_failed" in os.read(log, 1 << 20)
-        os.close(log)
-        if fault == "removed":
-            robot.process = parts.start("proxy", robot.config)
-        written_anew(folder / "robot-status.json")
-        caller.wait()
-        caller.ask(20)
-        assert caller.all_answered()
-        assert replica.process.poll() is None
+                robot.process = parts.start("proxy", robot.config)
+            written_anew(folder / "robot-status.json")
+            caller.wait()
+            caller.ask(20)
+            assert caller.all_answered(), fault
+            assert replica.process.poll() is None, fault
     finally:
         if caller is not None:
             caller.close()
         parts.close()
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_gateway_and_rendezvous_go_on(folder, fault):
+def test_gateway_and_rendezvous_go_on(folder):
     pool = GatewayPool(folder)
     rendezvous = Rendezvous(pool.authority, "a")
     try:
@@ -87,24 +86,25 @@ def test_gateway_and_rendezvous_go_on(folder, fault):
         wait_for(lambda: ada.ready() and ada.tell()["report"]["gateways"])
         ada.ask(5)
         ada.all_right()
-        assert rendezvous.process is not None
-        pids = [edge.process.pid, rendezvous.process.pid]
-        log = os.open(folder / "edge.log", os.O_RDONLY)
-        with FAULTS[fault](folder, pids):
-            for _ in range(LONG):
-                ada.ask(1)
-                ada.all_right()
-            if fault != "full":
-                wait_for(lambda: b"file_failed" in os.pread(log, 1 << 20, 0))
-        os.close(log)
-        written_anew(folder / "edge-status.json")
-        (rendezvous.folder / "status.json").unlink()
-        pool.robot("bob", extra=meeting)  # news, which the rendezvous writes down
-        written_anew(rendezvous.folder / "status.json", rendezvous.folder / "records.json")
-        ada.ask(20)
-        ada.all_right()
-        assert edge.process.poll() is None
-        assert rendezvous.alive()
+        for fault, breaks in FAULTS.items():
+            assert rendezvous.process is not None
+            log = os.open(folder / "edge.log", os.O_RDONLY)
+            begins = os.lseek(log, 0, os.SEEK_END)
+            with breaks(folder, [edge.process.pid, rendezvous.process.pid]):
+                for _ in range(LONG):
+                    ada.ask(1)
+                    ada.all_right()
+                if fault != "full":
+                    wait_for(lambda: b"file_failed" in os.pread(log, 1 << 20, begins))  # noqa: B023
+            os.close(log)
+            written_anew(folder / "edge-status.json")
+            (rendezvous.folder / "status.json").unlink()
+            pool.robot(f"after-{fault}", extra=meeting)  # news, which the rendezvous writes down
+            written_anew(rendezvous.folder / "status.json", rendezvous.folder / "records.json")
+            ada.ask(20)
+            ada.all_right()
+            assert edge.process.poll() is None, fault
+            assert rendezvous.alive(), fault
     finally:
         pool.close()
         rendezvous.kill()
