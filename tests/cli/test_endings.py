@@ -134,6 +134,6 @@ def test_control_c_while_it_waits_is_one_line(tmp_path):
         assert process.stdout is not None
         assert process.stdout.readline() == "waiting\n"
         process.send_signal(signal.SIGINT)
-        _, stderr = process.communicate(timeout=30)
+        _, stderr = process.communicate(timeout=100)
     assert stderr == "interrupted\n"
     assert process.returncode == 130

@@ -32,7 +32,7 @@ def going_on(*arguments: str) -> Iterator[subprocess.Popen[str]]:
 def interrupted(process: subprocess.Popen[str]) -> bool:
     """Interrupt a command; return whether it ended as it should."""
     process.send_signal(signal.SIGINT)
-    _, stderr = process.communicate(timeout=30)
+    _, stderr = process.communicate(timeout=100)
     return (stderr, process.returncode) == ("interrupted\n", 130)
 
 
@@ -68,7 +68,7 @@ def test_a_watch_ends_with_its_pool(home):
         assert process.stdout.readline().startswith("planner  not answering")
         paths.status.unlink()
         paths.identity.unlink()
-        _, stderr = process.communicate(timeout=30)
+        _, stderr = process.communicate(timeout=100)
     assert stderr.startswith("error: there is no pool `planner`")
     assert process.returncode == 1
 

@@ -31,7 +31,7 @@ def launcher(local, step: str, slot: int = 0, where: str = "us-west-1/a") -> sub
 
 def killed_at(local, step: str) -> ReplicaId:
     process = launcher(local, step)
-    _, complaint = process.communicate(timeout=60)
+    _, complaint = process.communicate(timeout=100)
     assert process.returncode == -signal.SIGKILL, complaint
     return ReplicaId(local.uid, 0, 1)
 
@@ -98,7 +98,7 @@ def test_a_machine_outlives_its_launcher(local, step):
 def test_a_full_disk_is_told_and_nothing_is_started(local):
     (local.root / "machines").mkdir()
     process = launcher(local, "full")
-    _, complaint = process.communicate(timeout=60)
+    _, complaint = process.communicate(timeout=100)
     assert process.returncode == 1
     assert complaint.startswith("CloudError: machine `0.1` cannot be made: "), complaint
     assert "File too large" in complaint
@@ -127,7 +127,7 @@ def test_a_second_process_for_the_same_folder_ends_and_disturbs_nothing(local):
         cwd=CHECKOUT,
         env={**os.environ, processes.MACHINE: str(machine.id)},
         capture_output=True,
-        timeout=60,
+        timeout=100,
         check=True,
     )
     assert second.stdout + second.stderr == b""

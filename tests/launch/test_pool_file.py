@@ -31,7 +31,7 @@ def prefix_with(folder: Path, script: str = f"#!{sys.executable}\n{SHOW}\n") -> 
 
 def bash(text: str, folder: Path, environ: dict[str, str]) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        ["bash", "-c", text], cwd=folder, env=environ, capture_output=True, text=True, timeout=20,
+        ["bash", "-c", text], cwd=folder, env=environ, capture_output=True, text=True, timeout=100,
         check=False,
     )  # fmt: skip
 
@@ -42,7 +42,7 @@ def test_every_word_arrives_as_it_was_written(words: list[str], environ: dict[st
     environ.pop("PATH", None)
     node = NodeCommand("", sys.executable, ("-c", SHOW, *words), environ)
     shown = subprocess.run(
-        ["bash", "-c", run_text([node])], capture_output=True, check=True, timeout=20
+        ["bash", "-c", run_text([node])], capture_output=True, check=True, timeout=100
     ).stdout
     arguments, seen = json.loads(shown)
     assert arguments == words

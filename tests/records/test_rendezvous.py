@@ -300,7 +300,7 @@ def test_it_ends_at_a_signal_and_tells_a_taken_port(rendezvous):
         [sys.executable, "-m", "fogft", "rendezvous", "--config", str(place.config)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=100,
         check=False,
     )
     assert taken.returncode == 1

@@ -77,7 +77,7 @@ def test_a_node_maps_a_segment_as_large_as_its_profile_says(prepared: bool) -> N
     )
     clean = {k: v for k, v in os.environ.items() if not k.endswith("_DEFAULT_PROFILES_FILE")}
     out = subprocess.run(
-        [sys.executable, "-c", program], env=clean, capture_output=True, check=True, timeout=60
+        [sys.executable, "-c", program], env=clean, capture_output=True, check=True, timeout=100
     )
     mapped = json.loads(out.stdout.splitlines()[-1])["segment_bytes"]
     assert mapped > 0
@@ -142,7 +142,7 @@ def test_a_child_in_this_environment_can_use_ros() -> None:
         [sys.executable, "-c", "import rclpy.impl.implementation_singleton"],
         env=environment.child_environment(),
         check=True,
-        timeout=60,
+        timeout=100,
     )
 
 

@@ -181,7 +181,7 @@ def test_a_node_leaves_the_process_as_it_was(ros_domain: int, tmp_path: Path) ->
     environ = {**os.environ, "HOME": str(tmp_path), "ROS_DOMAIN_ID": str(ros_domain)}
     environ.pop("ROS_LOG_DIR", None)
     done = subprocess.run(
-        [sys.executable, "-c", CHILD], env=environ, timeout=60, capture_output=True, text=True
+        [sys.executable, "-c", CHILD], env=environ, timeout=100, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     assert list(tmp_path.iterdir()) == []

@@ -94,7 +94,7 @@ def test_checking_a_type_does_not_start_ros() -> None:
         f"assert check('{SET_BOOL}') is None\n"
         "assert 'rclpy' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=100)
 
 
 def test_installed_types_are_listed() -> None:

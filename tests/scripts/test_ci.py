@@ -46,7 +46,7 @@ def run(
     environ |= {"PATH": f"{folder}:{os.environ['PATH']}", **more}
     return subprocess.run(
         [tree / words[0], *words[1:]], env=environ, capture_output=True, text=True, check=False,
-        timeout=60,
+        timeout=100,
     )  # fmt: skip
 
 

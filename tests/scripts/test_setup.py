@@ -35,7 +35,7 @@ def setup(tmp_path: Path, python: str, **environ: str) -> subprocess.CompletedPr
         cwd=tmp_path,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=100,
         check=False,
     )
 

@@ -71,7 +71,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A home with the emulation's catalogue: SkyPilot must not fetch one, nor touch the user's."""
     folder = tmp_path_factory.mktemp("home")
     made = Path(__file__).parent / "emulated_aws" / "home.py"
-    subprocess.run([sys.executable, made, str(folder)], check=True, timeout=60)
+    subprocess.run([sys.executable, made, str(folder)], check=True, timeout=100)
     isolated = {
         "HOME": str(folder),
         "SKYPILOT_DISABLE_LOCAL_API_SERVER": "1",

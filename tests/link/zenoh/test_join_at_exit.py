@@ -28,7 +28,7 @@ def _left(needs_s: float, wait_s: float) -> bool:
         capture_output=True,
         text=True,
         check=True,
-        timeout=60,
+        timeout=100,
     )
     return ended.stdout == "left\n"
 

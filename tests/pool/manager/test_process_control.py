@@ -91,7 +91,7 @@ def test_the_holder_is_known_in_a_container_too(tmp_path: Path) -> None:
     words = ["unshare", "--mount", "bash", "-c", OVERLAY, "bash"]
     done = subprocess.run(
         [*words, str(tmp_path), sys.executable, HOLD],
-        capture_output=True, text=True, timeout=60, check=False,
+        capture_output=True, text=True, timeout=100, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     found, holder = done.stdout.split()
