@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from fogft.pool.commands import init
-from tests.e2e.pool import Machine, Pool
+from tests.e2e.pool import NODES, Machine, Pool
 from tests.examples.loading import modules
 from tests.needs import need
 from tests.ports import free_port
@@ -88,34 +88,42 @@ def ada(pool: Pool, etcd: str, ros_domains: Callable[[], int]) -> Iterator[Machi
 @pytest.mark.ros
 def test_two_robots_get_every_place_once_though_replicas_are_killed(pool, etcd, ada):
     """Each request goes to both replicas: none is applied twice, and none is lost."""
-    program = pool.file.parent / "inspection_client.py"
-    ended = threading.Event()
-
-    def ask(environ: dict[str, str]) -> list[tuple[float, float]]:
-        """Run the example's client again and again; return all places that it was told."""
-        told = []
-        while not ended.is_set():
-            client = [sys.executable, str(program), "--count", str(4 * COUNT)]
-            said = subprocess.run(client, env=environ, stdout=subprocess.PIPE, check=True).stdout
-            told += [tuple(json.loads(line)) for line in said.splitlines()]
-        return told
-
     store = places.Places([etcd])
-    with ThreadPoolExecutor(2) as robots:
-        asking = [robots.submit(ask, environ) for environ in (pool.environ, ada.environ)]
-        try:
-            for slot in ("0", "1"):
-                before = store.given_out()
-                pool.wait(lambda before=before: store.given_out() > before + COUNT)
-                pool.fogft("chaos", "kill", slot)
-                pool.wait(lambda slot=slot: slot in replaced(pool) and reaches_both(ada))
-        finally:
-            ended.set()
-        one, two = (each.result() for each in asking)
+    program = pool.file.parent / "inspection_client.py"
+    client = [sys.executable, str(program), "--count", str(COUNT)]
+    said = subprocess.run(client, env=pool.environ, stdout=subprocess.PIPE, check=True).stdout
+    first = [tuple(json.loads(line)) for line in said.splitlines()]
+    assert len(first) == COUNT
+    robots = [Asking(program.parent, environ) for environ in (pool.environ, ada.environ)]
+    try:
+        for slot in ("0", "1"):
+            before = store.given_out()
+            pool.wait(lambda before=before: store.given_out() > before + COUNT)
+            pool.fogft("chaos", "kill", slot)
+            pool.wait(lambda slot=slot: slot in replaced(pool) and reaches_both(ada))
+        one, two = (robot.finish() for robot in robots)
+    finally:
+        for robot in robots:
+            robot.process.kill()
     assert min(len(one), len(two)) >= COUNT
-    total = len(one) + len(two)
-    assert sorted(one + two) == sorted((float(n % 10), float(n // 10)) for n in range(total))
-    assert store.given_out() == total
+    told = first + one + two
+    assert sorted(told) == sorted((float(n % 10), float(n // 10)) for n in range(len(told)))
+    assert store.given_out() == len(told)
+
+
+class Asking:
+    """A robot that asks for one place after the other; see `inspecting_robot.py`."""
+
+    def __init__(self, folder: Path, environ: dict[str, str]) -> None:
+        words = [sys.executable, str(NODES / "inspecting_robot.py"), str(folder)]
+        self.process = subprocess.Popen(words, env=environ, stdout=subprocess.PIPE, text=True)
+
+    def finish(self) -> list[tuple[float, float]]:
+        """Have it end with what it asks now; return all places that it was told."""
+        self.process.send_signal(signal.SIGINT)
+        said = self.process.communicate(timeout=100)[0]
+        assert self.process.returncode == 0
+        return [tuple(json.loads(line)) for line in said.splitlines()]
 
 
 def replaced(pool: Pool) -> set[str]:
