@@ -52,6 +52,7 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
     workspace = tmp_path / "workspace"
     init.copy_example("words", workspace)
     pool.file = workspace / "pool.yaml"
+    pool.file.write_text(pool.file.read_text().replace("replicas: 2", "replicas: 1"))
     said = pool.fogft("up", str(pool.file), "--yes", ok=False)
     assert "there is no package `word_interfaces` with services here" in said
     assert "source its workspace" in said
@@ -61,7 +62,7 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
     pool.fogft("up", str(pool.file), "--yes", limit_s=200)
     words = [sys.executable, str(workspace / "count_client.py"), "one two", "three"]
     done = subprocess.run(
-        words, env=pool.environ, capture_output=True, text=True, timeout=60, check=False
+        words, env=pool.environ, capture_output=True, text=True, timeout=100, check=False
     )
     assert (done.stdout, done.returncode) == ("3 words, 11 letters\n", 0), done.stderr
     pool.fogft("down")
@@ -96,7 +97,7 @@ def test_what_was_built_elsewhere_is_not_trusted(pool: Pool, tmp_path: Path):
     for left in (False, True):
         subprocess.run(
             ["bash", str(template_files.folder() / "workspace.sh")],
-            cwd=workspace, env=environ, check=True, timeout=60,
+            cwd=workspace, env=environ, check=True, timeout=100,
         )  # fmt: skip
         assert (install / "left").exists() is left
         (install / "left").touch()
