@@ -198,6 +198,13 @@ class Robot:
         except FileNotFoundError:
             return {}
 
+    def news(self) -> dict[str, Any]:
+        """Return a report that was begun after this call: the next but one."""
+        for _ in range(2):
+            last = self.report().get("written_at")
+            wait_for(lambda: self.report().get("written_at") != last, "a new report")  # noqa: B023
+        return self.report()
+
     def links(self) -> list[dict[str, Any]]:
         return list(self.report().get("links", []))
 

@@ -44,11 +44,24 @@ def call() -> Iterator[Callable[[Robot], Caller]]:
         caller.close()
 
 
-def test_a_burst_to_an_ordinary_service_is_answered_in_full(parts, call):
-    """Its queue of ten, the default, loses none of them, with one replica or two."""
+def test_a_robot_and_its_replicas_lose_nothing_whoever_of_them_ends(parts, call):
+    """What may happen to one pool of processes, one after the other, under load."""
     replicas = [parts.replica(0), parts.replica(1)]
     robot = parts.robot("robot", *replicas)
     caller = call(robot)
+    wait_for(lambda: robot.ready() == [0, 1], "both replicas")
+    a_burst_is_answered_in_full(robot, replicas, caller)
+    a_frozen_robot_does_not_hold_up_a_live_one(parts, robot, replicas[1], caller, call)
+    a_proxy_starts_again_without_a_manager(robot, caller)
+    a_proxy_that_is_told_to_end_hands_over(robot, caller)
+    a_killed_proxy_is_replaced_by_the_one_in_line(parts, robot, caller)
+    last = parts.replica(2, 0.02)
+    a_membership_change_loses_nothing(robot, replicas[1], last, caller)
+    what_a_dying_command_worked_on_is_answered_by_the_next(robot, last, caller)
+
+
+def a_burst_is_answered_in_full(robot, replicas, caller):
+    """The service's queue of ten, the default, loses none of them, with two replicas or one."""
     for _ in range(2):
         caller.ask(200)
         assert caller.all_answered()
@@ -57,20 +70,134 @@ def test_a_burst_to_an_ordinary_service_is_answered_in_full(parts, call):
     assert caller.all_answered()
 
 
-def test_a_frozen_robot_does_not_hold_up_a_live_one(parts, call):
+def a_frozen_robot_does_not_hold_up_a_live_one(parts, live, replica, caller, call):
     """Two robots share a replica; one stops with requests under way, and goes on later."""
-    replica = parts.replica(0)
-    frozen, live = parts.robot("frozen", replica), parts.robot("live", replica)
-    caller, other = call(live), call(frozen)
+    frozen = parts.robot("frozen", replica)
+    other = call(frozen)
+    wait_for(lambda: live.ready() == [1], "the one that both have")
+    before = live.links()[0]["reopened"]
     other.ask(50)
     freeze(frozen.process.pid)
     for _ in range(200):
         caller.ask()
         caller.spin(0.005)
     assert caller.all_answered()
-    assert live.links()[0]["reopened"] == 0
+    assert live.news()["links"][0]["reopened"] == before
     os.kill(frozen.process.pid, signal.SIGCONT)
     assert other.all_answered()
+    frozen.process.kill()
+
+
+def a_proxy_starts_again_without_a_manager(robot, caller):
+    """Its configuration and the last membership on disk are all that it needs."""
+    robot.restart()
+    wait_for(robot.ready, "the replica")
+    caller.wait()
+    caller.ask(50)
+    assert caller.all_answered()
+
+
+def a_proxy_that_is_told_to_end_hands_over(robot, caller):
+    """The standby serves before the old one leaves; twice, under load."""
+    for _ in range(2):
+        leaving, robot.process = robot.process, robot.start_standby()
+        caller.ask(20)
+        leaving.terminate()
+        while leaving.poll() is None:
+            caller.ask()
+            caller.spin(0.01)
+        caller.ask(20)
+        assert caller.all_answered()
+        assert leaving.returncode == 0
+    wait_for(lambda: robot.report()["pid"] == robot.process.pid, "the standby's report")
+
+
+def a_killed_proxy_is_replaced_by_the_one_in_line(parts, robot, caller):
+    """It serves under the same name; ROS knows at once that the first is gone, not by its lease.
+
+    A third is refused: one works, one waits.
+    """
+    for _ in range(2):
+        standby = robot.start_standby()
+        assert parts.start("proxy", robot.config, {}, "--standby").wait(LIMIT_S) == 1
+        wait_for(lambda: robot.report().get("participant"), "its id in DDS")
+        robot.process.kill()
+        robot.process.wait()
+        caller.wait()
+        assert caller.servers() == 1
+        robot.process = standby
+        wait_for(lambda: robot.report()["pid"] == robot.process.pid, "the standby's report")
+        caller.ask(50)
+        assert caller.all_answered()
+
+
+def a_membership_change_loses_nothing(robot, old, new, caller):
+    """A replica is exchanged for another while requests flow, then the old one dies."""
+
+    def load_until(ready: list[int]) -> None:
+        end = time.monotonic() + LIMIT_S
+        while robot.ready() != ready:
+            assert time.monotonic() < end, f"{ready} are never ready"
+            caller.ask()
+            caller.spin(0.01)
+
+    robot.follow(old, new)
+    load_until([old.id.slot, new.id.slot])
+    caller.ask(20)
+    robot.follow(new)
+    load_until([new.id.slot])
+    old.process.kill()
+    caller.ask(20)
+    assert caller.all_answered()
+
+
+def what_a_dying_command_worked_on_is_answered_by_the_next(robot, replica, caller):
+    """With one replica there is nobody else: the requests wait for the command's restart."""
+    caller.ask(30)
+    caller.spin(0.1)
+    os.kill(first := replica.run_pid(), signal.SIGKILL)
+    assert caller.all_answered()
+    assert replica.run_pid() != first
+    wait_for(lambda: robot.links()[0]["restarts"] == 1, "the restart in the report")
+
+
+def test_a_machine_that_is_told_of_its_end_gets_no_more_requests(parts, call):
+    """The metadata server's words reach the robot, which asks the others; none is lost.
+
+    A rebalance is a hint: the replica is marked, and goes on answering. Where no cloud gives
+    notice, the machine's SIGTERM is one: what is under way is answered, then it ends.
+    """
+    nowhere = {
+        "AWS_EC2_METADATA_SERVICE_ENDPOINT": "http://127.0.0.1:1/",
+        "GCE_METADATA_HOST": "127.0.0.1:1",
+    }
+    with serving("aws") as metadata:
+        told = parts.replica(0, AWS_EC2_METADATA_SERVICE_ENDPOINT=f"http://{metadata.address}/")
+        ended = parts.replica(1, **nowhere)
+        robot = parts.robot("robot", told, ended, parts.replica(2))
+        caller = call(robot)
+        wait_for(lambda: robot.ready() == [0, 1, 2], "all replicas")
+
+        metadata.rebalance = {"noticeTime": "2026-01-01T00:00:00Z"}
+        wait_for(lambda: robot.links()[0]["at_risk"], "the hint")
+        assert not robot.links()[0]["draining"]
+        assert not robot.links()[1]["at_risk"]
+
+        caller.ask(20)
+        metadata.action = {"action": "terminate", "time": "2026-01-01T00:02:00Z"}
+        wait_for(lambda: robot.links()[0]["draining"], "the notice")
+        assert caller.all_answered()
+        freeze(told.process.pid)  # whoever is asked now, it is not this one
+        caller.ask(100)
+        assert caller.all_answered()
+        assert robot.news()["links"][0]["in_flight"] == 0
+
+    caller.ask(20)
+    ended.process.send_signal(signal.SIGTERM)
+    wait_for(lambda: robot.links()[1]["draining"], "the notice")
+    caller.ask(100)
+    assert caller.all_answered()
+    assert ended.process.wait(LIMIT_S) == 0
 
 
 def test_requests_that_kill_the_service_harm_only_themselves(parts, call):
@@ -91,24 +218,11 @@ def test_requests_that_kill_the_service_harm_only_themselves(parts, call):
             caller.spin(0.02)
         assert caller.all_answered()
         wait_for(lambda: robot.ready() == [0, 1, 2], "all to be back")
-    report = robot.report()["services"]["/plan"]
-    assert report["poison"] == 2
-    assert report["silent"] == 0
-    deaths = sum(link["restarts"] for link in robot.links())
+    report = robot.news()
+    assert report["services"]["/plan"]["poison"] == 2
+    assert report["services"]["/plan"]["silent"] == 0
+    deaths = sum(link["restarts"] for link in report["links"])
     assert deaths <= (3 + 1) + (2 + 1)  # the copies of each, and then alone
-
-
-def test_what_a_dying_command_worked_on_is_answered_by_the_next(parts, call):
-    """With one replica there is nobody else: the requests wait for the command's restart."""
-    replica = parts.replica(0, 0.02)
-    robot = parts.robot("robot", replica)
-    caller = call(robot)
-    caller.ask(30)
-    caller.spin(0.1)
-    os.kill(first := replica.run_pid(), signal.SIGKILL)
-    assert caller.all_answered()
-    assert replica.run_pid() != first
-    wait_for(lambda: robot.links()[0]["restarts"] == 1, "the restart in the report")
 
 
 def test_a_spare_process_takes_over_when_the_one_at_work_dies(parts, call):
@@ -136,87 +250,8 @@ def test_a_spare_process_takes_over_when_the_one_at_work_dies(parts, call):
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in (at_work, spare)), "the end")
 
 
-def test_a_membership_change_under_load_loses_nothing(parts, call):
-    """Every replica is exchanged for another while requests flow, then the old ones die."""
-    old, new = parts.replica(0), parts.replica(1)
-    robot = parts.robot("robot", old)
-    caller = call(robot)
-
-    def load_until(ready: list[int]) -> None:
-        end = time.monotonic() + LIMIT_S
-        while robot.ready() != ready:
-            assert time.monotonic() < end, f"{ready} are never ready"
-            caller.ask()
-            caller.spin(0.01)
-
-    robot.follow(old, new)
-    load_until([0, 1])
-    caller.ask(20)
-    robot.follow(new)
-    load_until([1])
-    old.process.kill()
-    caller.ask(20)
-    assert caller.all_answered()
-
-
-def test_a_machine_that_is_told_of_its_end_gets_no_more_requests(parts, call):
-    """The metadata server's words reach the robot, which asks the others; none is lost.
-
-    A rebalance is a hint: the replica is marked, and goes on answering.
-    """
-    with serving("aws") as metadata:
-        told = parts.replica(0, AWS_EC2_METADATA_SERVICE_ENDPOINT=f"http://{metadata.address}/")
-        robot = parts.robot("robot", told, parts.replica(1))
-        caller = call(robot)
-        wait_for(lambda: robot.ready() == [0, 1], "both replicas")
-
-        metadata.rebalance = {"noticeTime": "2026-01-01T00:00:00Z"}
-        wait_for(lambda: robot.links()[0]["at_risk"], "the hint")
-        assert not robot.links()[0]["draining"]
-        assert not robot.links()[1]["at_risk"]
-
-        caller.ask(20)
-        metadata.action = {"action": "terminate", "time": "2026-01-01T00:02:00Z"}
-        wait_for(lambda: robot.links()[0]["draining"], "the notice")
-        assert caller.all_answered()
-        freeze(told.process.pid)  # whoever is asked now, it is not this one
-        caller.ask(100)
-        assert caller.all_answered()
-        assert robot.links()[0]["in_flight"] == 0
-
-
-def test_where_no_cloud_gives_notice_the_machines_sigterm_is_one(parts, call):
-    """The robot asks the others, what is under way is answered, then it ends."""
-    nowhere = {
-        "AWS_EC2_METADATA_SERVICE_ENDPOINT": "http://127.0.0.1:1/",
-        "GCE_METADATA_HOST": "127.0.0.1:1",
-    }
-    told = parts.replica(0, **nowhere)
-    robot = parts.robot("robot", told, parts.replica(1))
-    caller = call(robot)
-    wait_for(lambda: robot.ready() == [0, 1], "both replicas")
-    caller.ask(20)
-    told.process.send_signal(signal.SIGTERM)
-    wait_for(lambda: robot.links()[0]["draining"], "the notice")
-    caller.ask(100)
-    assert caller.all_answered()
-    assert told.process.wait(LIMIT_S) == 0
-
-
-def test_a_proxy_starts_again_without_a_manager(parts, call):
-    """Its configuration and the last membership on disk are all that it needs."""
-    robot = parts.robot("robot", parts.replica(0))
-    caller = call(robot)
-    robot.restart()
-    wait_for(robot.ready, "the replica")
-    caller.wait()
-    caller.ask(50)
-    assert caller.all_answered()
-
-
 @needs("history")
-@pytest.mark.parametrize("old", ["replica", "robot"])
-def test_a_robot_and_a_replica_one_minor_version_apart_work_together(parts, call, old):
+def test_a_robot_and_a_replica_one_minor_version_apart_work_together(parts, call):
     """The version before is taken out of the history: 0.2.0, the first that others stay true to."""
     before = parts.folder / "before"
     before.mkdir()
@@ -224,14 +259,15 @@ def test_a_robot_and_a_replica_one_minor_version_apart_work_together(parts, call
         ["git", "archive", BEFORE, "fogft", "templates"], cwd=ROOT, check=True, capture_output=True
     )
     subprocess.run(["tar", "-x"], cwd=before, input=archive.stdout, check=True)
-    parts.tree = before if old == "replica" else ROOT
-    replicas = [parts.replica(0), parts.replica(1)]
-    parts.tree = ROOT if old == "replica" else before
-    robot = parts.robot("robot", *replicas)
-    wait_for(lambda: robot.ready() == [0, 1], "both replicas")
-    caller = call(robot)
-    caller.ask(200)
-    assert caller.all_answered()
+    new_replica = parts.replica(1)
+    parts.tree = before
+    old_replica, old_robot = parts.replica(0), parts.robot("old", new_replica)
+    parts.tree = ROOT
+    new_robot = parts.robot("new", old_replica)
+    for robot in (old_robot, new_robot):
+        caller = call(robot)
+        caller.ask(200)
+        assert caller.all_answered()
 
 
 def test_a_proxy_ends_when_its_folder_is_gone(parts):
@@ -242,42 +278,3 @@ def test_a_proxy_ends_when_its_folder_is_gone(parts):
     assert robot.process.wait(LIMIT_S) == 0
     gone.rename(parts.folder)
     assert "folder_gone" in (parts.folder / "robot.log").read_text()
-
-
-def test_a_killed_client_proxy_is_replaced_by_the_one_in_line(parts, call):
-    """It serves under the same name; ROS knows at once that the first is gone, not by its lease.
-
-    A third is refused: one works, one waits.
-    """
-    robot = parts.robot("robot", parts.replica(0))
-    caller = call(robot)
-    for _ in range(2):
-        standby = robot.start_standby()
-        assert parts.start("proxy", robot.config, {}, "--standby").wait(LIMIT_S) == 1
-        wait_for(lambda: robot.report().get("participant"), "its id in DDS")
-        robot.process.kill()
-        robot.process.wait()
-        caller.wait()
-        assert caller.servers() == 1
-        robot.process = standby
-        wait_for(lambda: robot.report()["pid"] == robot.process.pid, "the standby's report")
-        caller.ask(50)
-        assert caller.all_answered()
-
-
-def test_a_client_proxy_that_is_told_to_end_hands_over_without_losing_a_request(parts, call):
-    """The standby serves before the old one leaves; twice, under load."""
-    replica = parts.replica(0)
-    robot = parts.robot("robot", replica)
-    caller = call(robot)
-    for _ in range(2):
-        leaving, robot.process = robot.process, robot.start_standby()
-        caller.ask(20)
-        leaving.terminate()
-        while leaving.poll() is None:
-            caller.ask()
-            caller.spin(0.01)
-        caller.ask(20)
-        assert caller.all_answered()
-        assert leaving.returncode == 0
-    wait_for(lambda: robot.report()["pid"] == robot.process.pid, "the standby's report")
