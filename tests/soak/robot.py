@@ -33,7 +33,7 @@ from tests.soak.schedule import Fault, faults
 
 REPLICAS = 2
 RATE_HZ = 10.0
-LIMIT_S = 180.0  # for whatever has to come about on a machine that is busy
+LIMIT_S = 400.0  # for whatever has to come about on a machine that is busy
 TIMEOUT_S = 120.0  # of the service: longer than the longest suspend
 LATE_S = 1.0
 LONG_S = 60.0
@@ -375,7 +375,7 @@ def soak(folder: Path, seed: int, lasts_s: float, *, nightly: bool) -> int:
         run(world, kinds, seed, lasts_s, times)
         assert world.client is not None
         twice = int(world.client.finish()["twice"])
-    except AssertionError as error:
+    except (AssertionError, subprocess.TimeoutExpired) as error:
         trouble = str(error)
     finally:
         world.close()
