@@ -41,6 +41,8 @@ def main() -> int:
     given = parser.parse_args()
     nightly = given.minutes >= LONG_MIN
     if given.robot:
+        if not can_make_namespaces():
+            parser.error("--robot needs root: it mounts disks of its own")
         with tempfile.TemporaryDirectory(prefix="fogft-soak-") as folder:
             where = (given.keep or Path(folder)).resolve()
             where.mkdir(parents=True, exist_ok=True)
