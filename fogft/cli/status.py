@@ -117,7 +117,7 @@ def _remark(seen: Seen) -> None:
         output.hint(f"`fogft up {seen.status.file}` upgrades it while it serves")
     elif seen.age_s is not None and seen.stale:
         output.warn(f"the manager has not observed the pool for {seen.age_s:.0f} s")
-        output.hint("see `fogft logs`")
+        output.hint("see `fogft logs`, and `fogft doctor`: is the disk full?")
 
 
 def logs(

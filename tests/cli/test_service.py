@@ -69,6 +69,15 @@ def test_units_are_written_started_shown_and_removed(home, units, tmp_path, monk
     assert capsys.readouterr().out == ""
 
 
+def test_a_home_in_which_no_unit_can_be_written_is_one_clear_error(
+    home, units, tmp_path, monkeypatch, capsys
+):
+    Systemd(tmp_path / "bin", monkeypatch)
+    (tmp_path / "config").touch()
+    assert main.run(["service", "install"]) == 1
+    assert f"error: `{units}` cannot be made: Not a directory" in capsys.readouterr().err
+
+
 def test_units_of_a_gateway_and_of_the_machine(tmp_path, monkeypatch):
     """A part with its own file; units of the machine run as the file's owner."""
     config = tmp_path / "edge 1%.yaml"

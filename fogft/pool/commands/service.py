@@ -147,7 +147,8 @@ def install(where: Services, units: Sequence[Unit]) -> list[str]:
     Returns what systemd said against it; nothing where they were started.
     """
     disk.write_whole(units[0].environment, environment())
-    where.folder.mkdir(parents=True, exist_ok=True)
+    if not where.folder.is_dir():
+        disk.make_folder(where.folder)
     for unit in units:
         disk.write_whole(where.folder / unit.name, unit.text)
         (where.folder / unit.name).chmod(0o644)
