@@ -85,6 +85,7 @@ def tail(log: str, lines: int = 20, width: int = 200) -> str:
 
 def _short(text: str, pattern: str, room: int = 300) -> str:
     """Return the part of a text around what matched, and of a refusal what was not allowed."""
+    text = text.partition(" Encoded authorization failure message")[0]  # only AWS can read it
     found = _NOT_ALLOWED.search(text) or re.search(pattern, text) if pattern else None
     start = max(0, found.start() - 80) if found and len(text) > room else 0
     return ("... " if start else "") + text[start : start + room]
