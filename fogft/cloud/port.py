@@ -131,8 +131,8 @@ class Accounts(Protocol):
 class Baking(Protocol):
     """A cloud whose machines may start from an image that has a replica's environment already."""
 
-    def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> Sequence[str]:
-        """Write into a folder what an image is built of; return the arguments of `docker build`.
+    def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
+        """Write into a folder what `docker build` builds an image of.
 
         Args:
             task: A pool file's task, with paths from its folder.

@@ -45,7 +45,7 @@ def image(new_vm: Path) -> Path:  # noqa: F811
     carry(new_vm, "0.1.0")
     folder = new_vm / "context"
     folder.mkdir()
-    assert bake.write(folder, TASK, "lab/ros:1", new_vm / ".fogft/wheel", {}) == [str(folder)]
+    bake.write(folder, TASK, "lab/ros:1", new_vm / ".fogft/wheel", {})
     text = (folder / "Dockerfile").read_text()
     (command,) = re.findall(r"^RUN (export HOME.*)$", text, re.MULTILINE)
     shutil.rmtree(new_vm / ".fogft")
@@ -86,14 +86,16 @@ def docker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     program.parent.mkdir()
     program.write_text(
         f'#!/bin/sh\necho "$*" >> {tmp_path}/calls\n[ "$1" != push ] || exit 3\n'
-        f'for last; do :; done\ncp "$last/Dockerfile" {tmp_path}\n'
+        f'for last; do :; done\ncp -r "$last" {tmp_path}/context\n'
     )
     program.chmod(0o755)
     monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
     scene = Scene(tmp_path)
     (tmp_path / "state/wheels").mkdir()
     monkeypatch.setattr(commands, "make_cloud", lambda name, base: scene.cloud)
-    (tmp_path / "pool.yaml").write_text(FILE)
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab/serve.py").write_text("serve")
+    (tmp_path / "lab/pool.yaml").write_text(FILE)
     return tmp_path
 
 
@@ -105,16 +107,19 @@ def docker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_an_image_is_built_on_the_files_own_but_never_on_itself(
     docker: Path, base: str | None, tag: str, found: str
 ):
-    commands.bake(docker / "pool.yaml", tag, base, push=False)
-    assert (docker / "Dockerfile").read_text().startswith(f"FROM {found}\n")
+    commands.bake(docker / "lab/pool.yaml", tag, base, push=False)
+    text = (docker / "context/Dockerfile").read_text()
+    assert text.startswith(f"FROM {found}\n")
+    assert "\nCOPY workdir /root/sky_workdir\n" in text
+    assert (docker / "context/workdir/serve.py").read_text() == "serve"
     (call,) = (docker / "calls").read_text().splitlines()
-    assert call.startswith(f"build --tag {tag} --build-context workdir={docker} ")
+    assert call.startswith(f"build --tag {tag} ")
     assert not Path(call.split()[-1]).exists(), "the context is left behind"
 
 
 def test_what_docker_cannot_do_is_told(docker: Path, monkeypatch: pytest.MonkeyPatch):
     with pytest.raises(CloudError, match="`docker push` failed with status 3"):
-        commands.bake(docker / "pool.yaml", "lab/baked:1", None, push=True)
+        commands.bake(docker / "lab/pool.yaml", "lab/baked:1", None, push=True)
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(CloudError, match="Docker cannot be started"):
-        commands.bake(docker / "pool.yaml", "lab/baked:1", None, push=False)
+        commands.bake(docker / "lab/pool.yaml", "lab/baked:1", None, push=False)

@@ -240,12 +240,12 @@ class SkyCloud:
             )
         return [one for one in found if one]
 
-    def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> Sequence[str]:
+    def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
         """See `Baking`."""
         packed, lock = self.make_wheel(self.folder / "wheels"), dict[str, bytes]()
         with contextlib.suppress(CloudError):  # then the image resolves, as a VM would
             lock |= self._locks.renew(packed)
-        return bake.write(folder, task, image, packed, lock)
+        bake.write(folder, task, image, packed, lock)
 
     def unverified(self, cloud: str) -> str:
         """See `Accounts`."""

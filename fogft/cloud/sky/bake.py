@@ -33,8 +33,8 @@ RUN export HOME=/root && {exports}bash /root/.fogft/setup.sh && rm -rf /root/.fo
 
 def write(
     folder: Path, asked: Mapping[str, Any], image: str, wheel: Path, lock: Mapping[str, bytes]
-) -> list[str]:
-    """Write the context of a build into an empty folder; return the arguments of `docker build`.
+) -> None:
+    """Write the context of a build into an empty folder.
 
     Args:
         folder: Where to.
@@ -64,10 +64,10 @@ def write(
         for name, value in (asked.get("envs") or {}).items()
     )
     carried = isinstance(asked.get("workdir"), str)
+    if carried:
+        shutil.copytree(asked["workdir"], folder / "workdir", symlinks=True)
     text = _DOCKERFILE.format(
         image=image, needed=" ".join(_NEEDED), exports=exports,
-        workdir="COPY --from=workdir . /root/sky_workdir\n" if carried else "",
+        workdir="COPY workdir /root/sky_workdir\n" if carried else "",
     )  # fmt: skip
     write_whole(folder / "Dockerfile", text)
-    named = ["--build-context", f"workdir={asked['workdir']}"] if carried else []
-    return [*named, str(folder)]

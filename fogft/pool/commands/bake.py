@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 from fogft.cloud.port import Baking
@@ -45,16 +44,15 @@ def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
     if base is None:
         base = next((image for image in images if image != tag), PLAIN)
     with tempfile.TemporaryDirectory(prefix="fogft-bake-") as folder:
-        arguments = cloud.bake(task, base, Path(folder))
-        _docker("build", "--tag", tag, *arguments)
+        cloud.bake(task, base, Path(folder))
+        _docker("build", "--tag", tag, folder)
     if push:
         _docker("push", tag)
 
 
 def _docker(*arguments: str) -> None:
-    words: Sequence[str] = ("docker", *arguments)
     try:
-        code = subprocess.run(words, stdout=2, check=False).returncode
+        code = subprocess.run(["docker", *arguments], stdout=2, check=False).returncode
     except OSError as error:
         raise CloudError(f"Docker cannot be started: {error}", "install Docker") from error
     if code:
