@@ -6,15 +6,18 @@ import gc
 import importlib.util
 import os
 import random
+import subprocess
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from fogft.ros.environment import child_environment
 from tests.bench.caller import CALL_LIMIT_S, Caller, milliseconds, payloads
 from tests.bench.floor import Floor
-from tests.bench.rig import Rig
+from tests.bench.rig import ROOT, Rig
 from tests.bench.service import ACTION_SERVICES, FLAG, TOPICS
 from tests.estimates import estimate_of_rounds, median, overhead_ratio, percentile
 
@@ -139,25 +142,61 @@ def _row(kind: str, sides: dict[str, list[float]]) -> dict[str, Any]:
 
 
 def bursts(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
-    """Send bursts of 100 requests, all at once; count what is lost."""
-    count = 5 if quick else 50
-    payload = payloads()[FLAG[0]]
+    """Send bursts of requests through two replicas; count the answers that are lost.
+
+    Once from a client that keeps every answer, then from plain rclpy clients with default settings,
+    of whose requests some may not arrive: their queue has ten places as well.
+    """
+    times = 1 if quick else 10
     rows = []
     with Rig(folder, 2) as rig:
         for way, domain in (("direct", rig.domains[0]), ("proxied", rig.robot_domain)):
             caller = Caller(domain, f"bench_{way}")
             caller.wait()
+            payload = payloads()[FLAG[0]]
             caller.flood(FLAG[0], payload, _BURST, _BURST)
-            made = [caller.flood(FLAG[0], payload, _BURST, _BURST) for _ in range(count)]
+            made = [caller.flood(FLAG[0], payload, _BURST, _BURST) for _ in range(5 * times)]
             caller.close()
-            rows.append(
-                {
-                    "way": way,
-                    "replicas": 2,
-                    "in_flight": _BURST,
-                    "requests": _BURST * count,
-                    "lost": _BURST * count - sum(one.answered for one in made),
-                    "burst_ms": median([one.seconds * 1000 for one in made]),
-                }
-            )
+            answered = sum(one.answered for one in made)
+            seconds = sum(one.seconds for one in made)
+            rows.append(_burst(f"keeps all, {way}", _BURST, 5 * times, 0, answered, seconds))
+        for count, hold_s, rounds in ((50, 0.0, 10), (200, 0.03, 1), (1000, 0.0, 1)):
+            received, answered, seconds = 0, 0, 0.0
+            for _ in range(times):
+                before = _received(rig)
+                words = [f"plain_{count}", str(count), str(hold_s), str(rounds), FLAG[0]]
+                began = time.monotonic()
+                told = _plain_client(rig.robot_domain, words)
+                seconds += time.monotonic() - began
+                answered += told
+                received += _received(rig) - before
+            lost = count * rounds * times - received
+            what = f"default, callback {hold_s:g} s"
+            rows.append(_burst(what, count, rounds * times, lost, answered, seconds))
     return rows
+
+
+def _burst(
+    client: str, at_once: int, bursts: int, not_arrived: int, answered: int, seconds: float
+) -> dict[str, Any]:
+    asked = at_once * bursts
+    return {
+        "client": client,
+        "at_once": at_once,
+        "requests": asked,
+        "did_not_arrive": not_arrived,
+        "lost": asked - not_arrived - answered,
+        "burst_ms": seconds * 1000 / bursts,
+    }
+
+
+def _plain_client(domain: int, words: Sequence[str]) -> int:
+    """Run a plain client; return how many answers it got."""
+    command = [sys.executable, str(ROOT / "tests" / "ros" / "plain_client.py"), *words]
+    environ = {**child_environment(), "ROS_DOMAIN_ID": str(domain)}
+    done = subprocess.run(command, env=environ, input=b"\n", capture_output=True, check=True)
+    return int(done.stdout.split()[-1])
+
+
+def _received(rig: Rig) -> int:
+    return int(rig.report(time.time() + 1.0)["services"][FLAG[0]]["received"])

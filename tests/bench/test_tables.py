@@ -55,6 +55,7 @@ def test_there_is_a_measurement_for_each_promise():
         "simulation",
         "ordering",
         "graph",
+        "images",
         "bursts",
         "first",
         "uplink",

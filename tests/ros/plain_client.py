@@ -1,4 +1,4 @@
-"""A client as users write it, as a process: ``plain_client.py NAME COUNT CALLBACK_S ROUNDS``.
+"""A client as users write it: ``plain_client.py NAME COUNT CALLBACK_S ROUNDS [SERVICE]``.
 
 Default quality of service, rclpy's own executor: it sends COUNT requests of ``/burst`` at once,
 spends CALLBACK_S in each response's callback, and does so again ROUNDS times. It waits for a line
@@ -32,10 +32,10 @@ def answered(node: rclpy.node.Node, client: rclpy.client.Client, count: int, hol
 
 
 def main() -> None:
-    name, count, hold_s, rounds = sys.argv[1:]
+    name, count, hold_s, rounds, *service = sys.argv[1:]
     rclpy.init()
     node = rclpy.create_node(name)
-    client = node.create_client(SetBool, "/burst")
+    client = node.create_client(SetBool, *(service or ["/burst"]))
     if not client.wait_for_service(LIMIT_S):
         sys.exit("no service was found")
     print("ready", flush=True)

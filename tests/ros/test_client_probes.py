@@ -74,9 +74,9 @@ def test_a_node_with_parameters_answers_probes():
 def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
     graph = Graph()
     probes = NodeProbes(graph)
-    assert probes.answers("/detect", b"?" * 16) is None
+    assert not probes.answers("/detect", b"?" * 16)
     graph.client = lambda name, type_name: _missing()
-    assert probes.answers("/detect", CLIENT) is None
+    assert not probes.answers("/detect", CLIENT)
 
 
 def _missing() -> End:

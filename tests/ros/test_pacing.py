@@ -307,6 +307,29 @@ def test_one_clients_burst_does_not_hold_up_another():
     pacer.close()
 
 
+def test_a_client_whose_node_is_found_late_is_not_paced_by_time():
+    """Discovery tells of a node before it tells that the node has a service to probe."""
+    now, sent, probed, looks = [0.0], [], threading.Event(), [0]
+
+    class Node:
+        def answers(self, service, client):
+            looks[0] += 1
+            now[0] += 0.05
+            return looks[0] > 10
+
+        def send(self, client, on_answer):
+            probed.set()
+
+    pacer = Pacer(lambda handle, payload: sent.append(handle), Node(), "/s", clock=lambda: now[0])
+    for number in range(30):
+        pacer.requested(handle(1, number), together=True)
+    for number in range(30):
+        pacer.respond(handle(1, number), b"")
+    assert probed.wait(30)
+    assert len(sent) <= QUEUE
+    pacer.close()
+
+
 @pytest.mark.parametrize("unique", [True, False])
 def test_a_node_that_was_started_again_releases_nothing_of_its_predecessor(unique):
     """It answers what that was asked; ten responses to that one would push out its own."""

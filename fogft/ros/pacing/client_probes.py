@@ -44,11 +44,14 @@ class NodeProbes:
         self._by_client: dict[bytes, RosClient] = {}
         self._lock = threading.Lock()
 
-    def answers(self, service: str, client: bytes) -> bool | None:
-        """Whether the node of a service's client answers; None while discovery does not tell."""
+    def answers(self, service: str, client: bytes) -> bool:
+        """Whether discovery has found that the node of a service's client answers.
+
+        It finds a node, and each of its services, one after another.
+        """
         found = self._graph.node_of(service, client)
         if found is None:
-            return None
+            return False
         name, namespace, _ = found
         asked = f"{namespace.rstrip('/')}/{name}/{_SERVICE}"
         if asked not in self._graph.services_of(name, namespace):
@@ -63,7 +66,7 @@ class NodeProbes:
                 except RosError:
                     return False
             if not end.available():
-                return None
+                return False
             if len(self._by_client) >= 4 * KEPT:  # long gone
                 self._by_client.pop(next(iter(self._by_client)))
             self._by_client[client] = end

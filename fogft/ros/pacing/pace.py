@@ -14,6 +14,7 @@ Owns: that account. Not here: sending, probing, waiting (`pacer`).
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterator
 from enum import Enum, auto
@@ -55,6 +56,7 @@ class ClientPace:
         probed_at: When the oldest probe was sent that is not answered; None for none.
         finding_until: Until when discovery is given to find it; None where it has.
         find_again_at: When to try again.
+        ask_again_at: When to look again whether its node answers probes.
     """
 
     def __init__(self, now: float, sent: int) -> None:
@@ -63,7 +65,7 @@ class ClientPace:
         self.probing = Probing.UNASKED
         self.probed_at: float | None = None
         self.finding_until: float | None = None
-        self.find_again_at = now
+        self.find_again_at = self.ask_again_at = now
         self.asked_at = now
         self._probes: deque[int] = deque()  # the last response before each that is not answered
         self._probe_again_at = now
@@ -175,7 +177,7 @@ class ClientPace:
             grown = self._usual + steps * (_USUAL_GROWS + self._open // 20)
             self._usual = max(self._usual, min(grown, self._open + self._open // 4))
         if self.silent(now, _GIVEN_UP_S):
-            self.probing, self.probed_at = Probing.NO, None
+            self.probing, self.probed_at, self.ask_again_at = Probing.NO, None, math.inf
             self._probes.clear()
 
     def _took(self, number: int) -> None:

@@ -27,7 +27,8 @@ from fogft.ros.port import NotFoundYet
 
 log = logging.getLogger(__name__)
 
-_ASK_EVERY_S, _ASK_LIMIT_S = 0.02, 1.0  # whether a node answers probes
+# Whether a node answers probes. On a busy machine discovery takes long to tell.
+_ASK_EVERY_S, _ASK_LIMIT_S, _ASK_AGAIN_S = 0.02, 2.0, 10.0
 _LOOK_EVERY_S = 0.2
 _GUID_BYTES = 16
 
@@ -75,7 +76,8 @@ class Pacer:
         with self._wake:
             client = self._pace.client(id, now)
             client.requested(now, together=together)
-            if client.probing is Probing.ASKED and id not in self._asked:
+            if client.probing in (Probing.ASKED, Probing.NO) and now >= client.ask_again_at:
+                client.ask_again_at = now + _ASK_AGAIN_S
                 self._asked[id] = now + _ASK_LIMIT_S
                 self._begin()
             elif client.waiting:
@@ -176,8 +178,7 @@ class Pacer:
         answers = self._probes.answers(self._service, id)
         now = self._clock()
         with self._wake:
-            until = self._asked.get(id, now)
-            if answers is None and now < until:
+            if not answers and now < self._asked.get(id, now):
                 return
             self._asked.pop(id, None)
             self._pace.client(id, now).probing = Probing.YES if answers else Probing.NO
