@@ -11,6 +11,7 @@ from fogft.cli.screens.top import sparkline
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.commands import composition
 from tests.cli.pools import alive, lay_down
+from tests.docs.browser import browser
 from tests.needs import needs
 
 EVENTS = [
@@ -63,3 +64,31 @@ def test_a_page_tells_a_pools_life(home, capsys, tmp_path):
     assert "148 ms" in page
     assert not re.findall(r'(?:src|href)="https?:', page), "it needs no other file"
     assert "done: wrote" in capsys.readouterr().err
+
+
+@needs("matplotlib", "browser")
+def test_a_browser_shows_the_page_whole_narrow_wide_and_dark(home, tmp_path):
+    """Nothing is wider than the window, figures are drawn, and dark colours are turned round."""
+    with alive(lay_down(home)):
+        for event in EVENTS:
+            composition.make_store("planner").append(event)
+        assert main.run(["report", "planner", "--into", str(tmp_path / "page.html")]) == 0
+    with browser(tmp_path / "profile") as driver:
+        for width in (360, 1400):
+            window = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+            driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", window)
+            driver.get((tmp_path / "page.html").as_uri())
+            assert driver.execute_script("return innerWidth") == width
+            assert driver.execute_script("return document.documentElement.scrollWidth") <= width
+            heights = driver.execute_script(
+                "return [...document.querySelectorAll('svg')]"
+                ".map(one => one.getBoundingClientRect().height)"
+            )
+            assert heights
+            assert min(heights) > 50
+        look = "return getComputedStyle(document.querySelector('svg')).filter"
+        assert driver.execute_script(look) == "none"
+        dark = {"features": [{"name": "prefers-color-scheme", "value": "dark"}]}
+        driver.execute_cdp_cmd("Emulation.setEmulatedMedia", dark)
+        assert "invert" in driver.execute_script(look)
+        assert [line for line in driver.get_log("browser") if line["level"] == "SEVERE"] == []
