@@ -124,9 +124,9 @@ class Auto(Learning):
             return ()
         best = self._best(request, able, now)
         known = self._replicas[best]
-        self._spares.request(known.service_s(), now)
+        self._spares.request(known.service_s, now)
         if self._spares.open and not known.free(now):
-            self._spares.made_wait(known.service_s() / len(able))
+            self._spares.made_wait(known.service_s / len(able))
         others = able if self._spares.chosen(request) else self._stale(able, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
         if self._spares.share < 1.0 and others is able:
@@ -156,7 +156,7 @@ class Auto(Learning):
     def _stale(self, able: Sequence[int], now: float) -> list[int]:
         """Return those of which nothing was heard for long: one spare copy shows how they do."""
         due = now - TRIAL_EVERY_S
-        return [r for r in able if self._of(r).asked_at <= due or self._replicas[r].doubted]
+        return [r for r in able if self._replicas[r].asked_at <= due or self._replicas[r].doubted]
 
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
@@ -165,12 +165,12 @@ class Auto(Learning):
         if not candidates:
             return ()
         if open:
-            free = [c for c in candidates if self._of(c).free(now)]
+            free = [c for c in candidates if self._replicas[c].free(now)]
             if free and request in self._wanting:
                 return self._spared(request, free, now)
             doubted = [self._doubts(replica, begun, now) for replica, begun in open.items()]
             if not all(doubted):  # somebody works on it: only a free one may help, and few times
-                due = max(self._of(r).overdue_at(request, begun) for r, begun in open.items())
+                due = max(self._replicas[r].overdue_at(request, begun) for r, begun in open.items())
                 if now < due:
                     self._look(due)
                     return ()
@@ -179,7 +179,7 @@ class Auto(Learning):
                     return ()
                 candidates = free
                 self.hedges += 1
-            elif all(self._of(c).doubted for c in candidates):
+            elif all(self._replicas[c].doubted for c in candidates):
                 return ()
         best = self._best(request, candidates, now)
         known = self._replicas[best]
@@ -190,8 +190,8 @@ class Auto(Learning):
     def _best(self, request: bytes, able: Sequence[int], now: float) -> int:
         """Return who is expected to answer first; among equals any, by the request's random id."""
         chance = request[-1] if request else 0
-        known = [self._of(replica) for replica in able]
-        times_s = sorted(one.service_s() for one in known)
+        known = [self._replicas[replica] for replica in able]
+        times_s = sorted(one.service_s for one in known)
         typical_s = times_s[len(times_s) // 2]
         return min(
             (one.avoided(now), one.expected_s(now, typical_s), (i * 167 ^ chance) & 0xFF, replica)
@@ -210,13 +210,13 @@ class Auto(Learning):
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
         """It was not asked. With a full window it is left alone, so that others are tried."""
         self._spares.open.pop((request, replica), None)
-        known = self._of(replica)
+        known = self._replicas[replica]
         known.dropped(request)
         known.doubted = known.doubted or full
 
     def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
         """Take a replica's word."""
-        self._of(replica).heard(request, load, now)
+        self._replicas[replica].heard(request, load, now)
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
@@ -236,9 +236,9 @@ class Auto(Learning):
         self._wanting.pop(request, None)
         self._spares.open.pop((request, replica), None)
         if fault:
-            self._of(replica).failed(request, now)
+            self._replicas[replica].failed(request, now)
         else:
-            self._of(replica).dropped(request)
+            self._replicas[replica].dropped(request)
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
         """Learn from a copy that was not the first."""
@@ -246,14 +246,14 @@ class Auto(Learning):
         beaten = self._beaten.pop((request, replica), now)
         if answered:
             self._spares.saved(now - beaten)
-            self._of(replica).answered(request, None, now)
+            self._replicas[replica].answered(request, None, now)
         else:
-            self._of(replica).dropped(request)
+            self._replicas[replica].dropped(request)
         self._released(replica, now)
 
     def _released(self, replica: int, now: float) -> None:
         """Have a replica that has become free work on what waits for one."""
-        if self._wanting and self._of(replica).free(now):
+        if self._wanting and self._replicas[replica].free(now):
             self.news = True
 
     def stopped(
@@ -262,7 +262,7 @@ class Auto(Learning):
         """Learn that these would have taken longer than until now."""
         self._wanting.pop(request, None)
         for replica, begun in open.items():
-            known = self._of(replica)
+            known = self._replicas[replica]
             known.overtaken(begun, now)
             if expired:
                 known.doubt(begun, now)
@@ -276,7 +276,7 @@ class Auto(Learning):
 
     def needed(self, able: int, now: float) -> int:
         """Return how many replicas would do, where those able are too few; else 0."""
-        times_s = sorted(known.service_s() for known in self._replicas.values())
+        times_s = sorted(known.service_s for known in self._replicas.values())
         return self._demand.replicas(able, times_s[len(times_s) // 2], now) if times_s else 0
 
     def report(self) -> dict[str, Any]:
@@ -287,7 +287,7 @@ class Auto(Learning):
             "tokens": self._budget.tokens,
             "replicas": {
                 f"{replica >> 32}.{replica & 0xFFFFFFFF}": {
-                    "service_s": known.service_s(),
+                    "service_s": known.service_s,
                     "delay_s": known.delay_s(),
                     "doubted": known.doubted,
                 }

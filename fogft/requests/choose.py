@@ -11,6 +11,7 @@ Not here: `auto`, and which policy a service has (`fogft.requests.auto`), which 
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -104,24 +105,18 @@ class Learning(Choose):
     """A policy that learns how busy each replica is, by what it answers."""
 
     def __init__(self) -> None:
-        self._replicas: dict[int, ReplicaLoad] = {}
-
-    def _of(self, replica: int) -> ReplicaLoad:
-        known = self._replicas.get(replica)
-        if known is None:
-            known = self._replicas[replica] = ReplicaLoad()
-        return known
+        self._replicas: defaultdict[int, ReplicaLoad] = defaultdict(ReplicaLoad)
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
         """Learn from the winner; the others stop, and are learned from when they end."""
-        self._of(replica).answered(request, load, now)
+        self._replicas[replica].answered(request, load, now)
         return super().answered(request, open, replica, load, now)
 
     def _doubts(self, replica: int, begun: float, now: float) -> bool:
         """Whether a replica is doubted, by an attempt that began then."""
-        known = self._of(replica)
+        known = self._replicas[replica]
         was = known.doubted
         if known.doubt(begun, now) and not was:
             self.news = True  # what else it has goes to another, too
@@ -129,11 +124,11 @@ class Learning(Choose):
 
     def hangs(self, replica: int) -> None:
         """Doubt it: what it has goes to others at once."""
-        self._of(replica).doubted = self.news = True
+        self._replicas[replica].doubted = self.news = True
 
     def forget(self, replica: int) -> None:
         """Forget what was on the way there."""
-        self._of(replica).forget()
+        self._replicas[replica].forget()
 
 
 class Failover(Learning):
@@ -164,7 +159,7 @@ class Failover(Learning):
             return ()
         for replica, begun in open.items():
             if not self._doubts(replica, begun, now):
-                overdue_at = self._of(replica).doubtful_at(begun)
+                overdue_at = self._replicas[replica].doubtful_at(begun)
                 if now < overdue_at:
                     self.look_at = min(self.look_at, overdue_at)
                 return ()
@@ -174,7 +169,7 @@ class Failover(Learning):
 
     def _asked(self, request: bytes, chosen: Sequence[int], now: float) -> Sequence[int]:
         for replica in chosen:
-            known = self._of(replica)
+            known = self._replicas[replica]
             known.asked(request, now)
             self.look_at = min(self.look_at, known.doubtful_at(now))
         return chosen
@@ -194,20 +189,20 @@ class Failover(Learning):
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
         """Stay: a full window is no failure."""
-        self._of(replica).dropped(request)
+        self._replicas[replica].dropped(request)
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Move on from a replica that failed."""
-        self._of(replica).dropped(request)
+        self._replicas[replica].dropped(request)
         if replica == self._current:
             self._failed = True
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
         """Learn that it works again."""
         if answered:
-            self._of(replica).answered(request, None, now)
+            self._replicas[replica].answered(request, None, now)
         else:
-            self._of(replica).dropped(request)
+            self._replicas[replica].dropped(request)
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False

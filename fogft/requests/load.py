@@ -85,19 +85,20 @@ class ReplicaLoad:
     """What one robot knows of how busy a replica is. Not thread-safe: its owner holds a lock.
 
     Attributes:
+        service_s: How long it works on a request, as far as is known.
         doubted: An attempt is overdue, and it has ended none since that one began.
         ended_at: When it last ended an attempt, with an answer or too late for one.
     """
 
     def __init__(self) -> None:
         self.latencies = Latencies()
+        self.service_s = 0.0
         self.doubted = False
         self.ended_at = -NEVER
         self.asked_at = -NEVER
         # Our attempts that it has not ended, oldest first: when each began, and is overdue.
         self._at_work: dict[bytes, tuple[float, float]] = {}
         self._slots = 0
-        self._service_s = 0.0
         self._rtt_s: float | None = None
         self._others = 0  # requests of other robots
         self._others_until = -NEVER
@@ -122,12 +123,14 @@ class ReplicaLoad:
         if not ahead == len(self._at_work) == 1:
             return False
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
-        return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s())
+        return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s)
 
     @property
     def oldest_begun(self) -> float:
         """When the oldest of ours began that it has not ended; infinite for none."""
-        return next((begun for begun, _ in self._at_work.values()), NEVER)
+        for begun, _ in self._at_work.values():
+            return begun
+        return NEVER
 
     def _spent_s(self, now: float) -> float:
         """Return for how long it has been at the oldest of ours; 0 for none."""
@@ -148,7 +151,7 @@ class ReplicaLoad:
             typical_s: The service time of most replicas. One that is not four times as slow or
                 as quick is taken for equal: where times vary, a few answers say no more.
         """
-        service_s = self.service_s()
+        service_s = self.service_s
         if typical_s / _ALIKE < service_s < typical_s * _ALIKE:
             service_s = typical_s
         rtt_s = self._rtt_s or 0.0
@@ -158,12 +161,6 @@ class ReplicaLoad:
         elif spent_s > _STALLS * (rtt_s + service_s):
             left_s += spent_s
         return rtt_s + left_s
-
-    def service_s(self) -> float:
-        """Return how long it works on a request, as far as is known."""
-        if self._rtt_s is None:
-            return self.latencies.mean_below_s(LATE_SHARE) or 0.0
-        return self._service_s
 
     def delay_s(self) -> float:
         """Return after how long an attempt takes unusually long."""
@@ -193,7 +190,7 @@ class ReplicaLoad:
 
     def asked(self, request: bytes, now: float) -> None:
         """Note an attempt that is about to be sent."""
-        expected_s = (self._rtt_s or 0.0) + self.service_s() * (1 + self.ahead(now))
+        expected_s = (self._rtt_s or 0.0) + self.service_s * (1 + self.ahead(now))
         self._at_work[request] = now, now + _LATE * max(self.delay_s(), expected_s)
         self.asked_at = now
 
@@ -207,7 +204,7 @@ class ReplicaLoad:
         there = load.waiting + load.running
         self._others, self._others_until = max(0, there - len(seen)), now + _WORD_HOLDS_S
         self._slots = load.slots
-        self._service_s = load.service_s
+        self.service_s = load.service_s
         for lost in seen[: max(0, len(seen) - there)]:  # their ends were
             del self._at_work[lost]
 
@@ -220,7 +217,6 @@ class ReplicaLoad:
         if sent is None:
             return
         took_s = now - sent[0]
-        self.latencies.add(took_s, now)
         if load is not None:
             rtt_s = max(0.0, took_s - load.spent_s)
             known = self._rtt_s
@@ -228,6 +224,7 @@ class ReplicaLoad:
                 self._rtt_s = rtt_s
             else:
                 self._rtt_s = known + _RTT_GAIN * (rtt_s - known)
+        self._took(took_s, now)
 
     def dropped(self, request: bytes) -> None:
         """Note that an attempt has ended, and that it never worked on it."""
@@ -245,7 +242,12 @@ class ReplicaLoad:
         Only if that is unusually long already; else it says nothing.
         """
         if now - begun >= self.delay_s():
-            self.latencies.add(now - begun, now)
+            self._took(now - begun, now)
+
+    def _took(self, seconds: float, now: float) -> None:
+        self.latencies.add(seconds, now)
+        if self._rtt_s is None:  # it never told its load
+            self.service_s = self.latencies.mean_below_s(LATE_SHARE) or 0.0
 
     def doubt(self, begun: float, now: float) -> bool:
         """Doubt it where an attempt is long overdue and it has ended none since; whether it is."""

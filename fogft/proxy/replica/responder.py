@@ -196,7 +196,7 @@ class Responder:
         if incoming.handling is Handling.DROP_IF_BUSY and not queue.has_free_slot(now):
             return Refusal.BUSY, None
         deadline = now + remaining_s
-        hopeless = not queue.open and queue.hopeless(incoming.robot, deadline, remaining_s)
+        hopeless = queue.hopeless(incoming.robot, deadline, remaining_s)
         held_bytes = self._known.held_bytes + len(incoming.payload)
         if hopeless or (held_bytes > self._held_bytes_limit and self._known.held):
             return Refusal.OVERLOADED, None

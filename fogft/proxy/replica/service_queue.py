@@ -90,11 +90,6 @@ class ServiceQueue:
         self._waiting.put(job.id, job.robot, deadline, job)
 
     @property
-    def open(self) -> bool:
-        """Whether a job that comes now is passed on at once: nothing waits, and there is room."""
-        return self._has_room and not len(self._waiting)
-
-    @property
     def _has_room(self) -> bool:
         return self.at_work < self.limit.limit and not self._alone
 
@@ -107,7 +102,7 @@ class ServiceQueue:
 
     def takes(self, job: Job) -> bool:
         """Whether a job that comes now is passed on at once."""
-        return self.open and not (job.alone and self.at_work)
+        return self._has_room and not len(self._waiting) and not (job.alone and self.at_work)
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
         """Return what there is to do; None while it is not known how long the service takes.
@@ -145,7 +140,7 @@ class ServiceQueue:
         return job
 
     def begin(self, job: Job, now: float) -> None:
-        """Job is passed on. Job that comes while the line is `open` need not wait before."""
+        """Job is passed on."""
         self.at_work += 1
         self._alone = job.alone
         self._unanswered += 1

@@ -169,8 +169,8 @@ class ZenohListener:
             )
 
     def _declare(self, session: zenoh.Session, key: str, asked: Callable[[QueryEnd], None]) -> None:
-        def heard(query: zenoh.Query, turn: int) -> None:
-            asked(QueryEnd(query, turn))
+        def heard(query: zenoh.Query) -> None:
+            asked(QueryEnd(query, self._turns.last))
 
         callback = handlers.Callback(self._taken(f"query at {key}", heard), indirect=False)
         self._declared.append(session.declare_queryable(key, callback, complete=True))
@@ -178,20 +178,17 @@ class ZenohListener:
     def _hear(
         self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Sample], None]
     ) -> None:
-        def told(sample: zenoh.Sample, turn: int) -> None:
-            heard(sample)
-
-        callback = handlers.Callback(self._taken(f"message at {key}", told), indirect=False)
+        callback = handlers.Callback(self._taken(f"message at {key}", heard), indirect=False)
         self._declared.append(session.declare_subscriber(key, callback))
 
-    def _taken(self, what: str, heard: Callable[[Heard, int], None]) -> Callable[[Heard], None]:
+    def _taken(self, what: str, heard: Callable[[Heard], None]) -> Callable[[Heard], None]:
         """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
 
         def guarded(one: Heard) -> None:
-            turn = self._turns.came()
+            self._turns.came()
             threads.note()
             try:
-                heard(one, turn)
+                heard(one)
             except Exception:
                 self._counters.add("failed")
                 log.exception("not_taken what=%r", what)

@@ -26,16 +26,16 @@ class QueryTurns:
     """Which query Zenoh's one thread has in its hands: the last that came."""
 
     def __init__(self) -> None:
-        self._last = 0
+        self.last = 0
 
     def came(self) -> int:
         """Count a query. Called by Zenoh's thread, first of all."""
-        self._last += 1
-        return self._last
+        self.last += 1
+        return self.last
 
     def over(self, turn: int) -> bool:
         """Whether Zenoh's thread has let go of a query."""
-        return turn < self._last
+        return turn < self.last
 
 
 class QueryEnd:
