@@ -50,11 +50,7 @@ def encode_requests(
 
 
 def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
-    """Return the requests of a batch, each with a header of its own.
-
-    Raises:
-        FrameError: It is not one: then none of it is to be believed.
-    """
+    """Return the requests of a batch, each with a header. Raises FrameError: none is believed."""
     if not is_batch(header):
         raise FrameError("no batch of requests")
     seen = header[1:_STAMPED]
@@ -68,10 +64,7 @@ def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, 
 
 
 def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
-    """Return header and payload for answers: id, load, payload and refusal of each.
-
-    A refusal takes the place of the payload where it is not empty.
-    """
+    """Return header and payload for answers: id, load, payload or refusal of each."""
     parts = []
     for id, load, payload, reason in answers:
         said = reason.encode("ascii") if reason else payload

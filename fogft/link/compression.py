@@ -27,11 +27,7 @@ _SHARE_OF_NEW = 0.3
 
 
 class Compression:
-    """Compresses the payloads of one service on one connection. Used by one thread.
-
-    Attributes:
-        ratio: Compressed against plain size, as last seen; None before the first trial.
-    """
+    """Compresses the payloads of one service on one connection, by its last `ratio`. One thread."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
@@ -41,11 +37,7 @@ class Compression:
         self._pause = _FIRST_PAUSE
 
     def pack(self, payload: bytes, bytes_per_s: float | None) -> bytes | None:
-        """Return the payload compressed, or None where it is to be sent as it is.
-
-        Args:
-            bytes_per_s: What the link was seen to drain; None for not known, which is fast.
-        """
+        """Return the payload compressed; None where it is to be sent as it is."""
         if bytes_per_s is None or bytes_per_s > FASTEST_BYTES_PER_S:
             return None
         if not LEAST_BYTES <= len(payload) <= LIMIT_BYTES:
@@ -83,11 +75,7 @@ class Compression:
 
 
 def unpack(packed: bytes, limit: int = LIMIT_BYTES) -> bytes:
-    """Return what was compressed.
-
-    Raises:
-        ValueError: It is not whole, or would be larger than `limit` bytes.
-    """
+    """Return what was compressed. Raises ValueError: it is not whole, or above `limit` bytes."""
     reader = zlib.decompressobj()
     try:
         payload = reader.decompress(packed, limit)

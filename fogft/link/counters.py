@@ -27,11 +27,7 @@ class Counters:
             return self._counts[event]
 
     def warn(self, log: logging.Logger, event: str, message: str, *values: object) -> None:
-        """Count an event and log it, the more often it happens the more seldom.
-
-        Args:
-            message: The line, with a place for each of `values`; the count is added to it.
-        """
+        """Count an event and log it with its count, the more often it happens the more seldom."""
         count = self.add(event)
         if worth_logging(count):
             log.warning(f"{message} count=%d", *values, count)

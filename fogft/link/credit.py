@@ -41,10 +41,7 @@ class Credit:
             return mark
 
     def queue(self, size: int) -> int:
-        """Count a send of any size for the thread that may block; return its mark.
-
-        Until `dequeued` nothing is taken: that thread may be in the midst of it.
-        """
+        """Count a send that may block; return its mark. Until `dequeued` nothing is taken."""
         with self._lock:
             self._queued += 1
             self._sent += size + _FRAME_BYTES

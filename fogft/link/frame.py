@@ -77,11 +77,7 @@ class Greeting:
 
 
 def origin(robot: str, token: bytes) -> bytes:
-    """Return the part of a request's header that is the same for a whole connection.
-
-    Raises:
-        ValueError: The token is not 8 bytes, or the name not 1 to 64 printable bytes.
-    """
+    """Return what all headers of a connection begin with. Raises ValueError: a bad name."""
     name = robot.encode()
     if len(token) != TOKEN_BYTES:
         raise ValueError(f"a token has {TOKEN_BYTES} bytes")
@@ -229,11 +225,7 @@ def greeted_bytes(token: bytes, replica: str) -> bytes:
 
 
 def encode_greeting(greeting: Greeting) -> bytes:
-    """Return a greeting, or the bare token where it has no certificate.
-
-    Raises:
-        ValueError: It would be too long.
-    """
+    """Return a greeting; without a certificate the token. Raises ValueError: too long."""
     if not greeting.certificate:
         return _TOKEN.pack(VERSION, greeting.token)
     frame = (

@@ -142,11 +142,7 @@ class ProbeAnswer(ReplicaWord):
 
 
 class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
-    """The end of one attempt: `payload` if the service answered, else a `refusal`.
-
-    Attributes:
-        load: What the replica has to do, if it says so.
-    """
+    """The end of one attempt: `payload` if the service answered, else a `refusal`."""
 
     request_id: bytes
     payload: bytes | None = None
@@ -167,10 +163,7 @@ class LinkEvents(Protocol):
         """
 
     def late(self, link: Link, answer: Answer) -> None:
-        """An attempt has ended that was forgotten: its bytes are for nobody.
-
-        Of a connection that was given up it may not be told.
-        """
+        """A forgotten attempt has ended; not told of every connection that was given up."""
 
     def changed(self, link: Link) -> None:
         """The link's `state`, `probe_answer` or room in its window has changed."""
@@ -178,11 +171,7 @@ class LinkEvents(Protocol):
 
 @dataclass(frozen=True)
 class Peer:
-    """A replica to dial: its endpoint (``host:port``) and the name its certificate must have.
-
-    Attributes:
-        interface: Through which of our network interfaces; empty for whatever the routes say.
-    """
+    """A replica to dial, the name its certificate must have, and our interface; empty for any."""
 
     id: ReplicaId
     endpoint: str
@@ -192,11 +181,7 @@ class Peer:
 
 @dataclass(frozen=True)
 class LinkStatus:
-    """A snapshot of a link. Durations in seconds.
-
-    Attributes:
-        ignores: It takes requests and never ends them, though others answer them.
-    """
+    """A snapshot of a link. Durations in seconds. `ignores`: requests go in and never end."""
 
     state: LinkState
     probe_answer: ProbeAnswer | None
@@ -253,10 +238,7 @@ class Link(Protocol):
         """Send what was offered with `more`. Cheap; never blocks."""
 
     def forget(self, request_id: bytes) -> None:
-        """Free the window of a request whose answer is no longer wanted. Unknown ids are fine.
-
-        The replica is told: at once if the request has been out for a while, else by `flush`.
-        """
+        """Free the window of a request that is not wanted; at `flush` the replica knows."""
 
     def flush(self) -> None:
         """Tell the replica of all that was forgotten and not answered. Cheap; never blocks."""
@@ -287,21 +269,14 @@ class Dialer(Protocol):
         """Return what replicas said last in place of what they were told; nothing is verified."""
 
     def certificate(self) -> str:
-        """Return the common name of the certificate that every link uses.
-
-        Empty while some still use another one, and where there are no certificates.
-        """
+        """Return the common name that every link uses; empty for none, or several."""
 
     def close(self) -> None:
         """Close every link."""
 
 
 class Incoming(Protocol):
-    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing.
-
-    Attributes:
-        robot: Who asks; replies to one robot never wait for another.
-    """
+    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing."""
 
     service: str
     request_id: bytes

@@ -266,10 +266,7 @@ class UplinkDialer:
         return changed
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
-        """Start a link; return at once, in state CONNECTING.
-
-        What is reached on this machine, such as a door for replicas that dial in, takes no uplink.
-        """
+        """Start a link; return at once. What is on this machine takes no uplink."""
         if not self.interfaces or peer.endpoint.startswith(("127.", "[::1]")):
             return self.inner.dial(peer, services, events)
         return UplinksLink(self, peer, services, events)

@@ -122,10 +122,7 @@ class CatchingUp:
             self._out.append(Order(replica, Op.RECALL, index))
 
     def _make_room(self, log: OrderedLog, size: int) -> bool:
-        """No checkpoint came in time: drop what every member has applied, and no more.
-
-        Each of them alone can then go on; only if all are lost at once, the state is.
-        """
+        """No checkpoint came in time: drop what every member has applied, and no more."""
         members = [peer.acked for peer in self.peers.values() if peer.member]
         if members:
             log.drop(min(members))

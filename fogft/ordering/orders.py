@@ -43,10 +43,7 @@ OrderId = tuple[Op, int, int]  # operation, term, index
 
 @dataclass(frozen=True, order=True)
 class Position:
-    """A state: all requests up to `index`, in the order of the term `epoch`.
-
-    The default is the state in which a service starts.
-    """
+    """A state: all requests up to `index` of the term `epoch`; by default, as a service starts."""
 
     epoch: int = 0
     index: int = 0
@@ -57,22 +54,14 @@ START = Position()
 
 @dataclass(frozen=True)
 class Promise:
-    """What a replica says of itself when it is claimed.
-
-    Attributes:
-        sound: Whether its state is that of `position`; a restore that failed leaves it unsound.
-    """
+    """What a replica says of itself when it is claimed; unsound after a restore that failed."""
 
     position: Position
     sound: bool
 
 
 def next_epoch(after: int, nonce: int) -> int:
-    """Return an epoch above another one, made unique by 32 random bits.
-
-    Raises:
-        ValueError: The nonce is out of range, or there are no epochs left.
-    """
+    """Return an epoch above another, unique by 32 random bits. Raises ValueError: there is none."""
     epoch = ((after >> 32) + 1) << 32 | nonce
     if not 0 <= nonce < 1 << 32 or epoch >= _EPOCH_LIMIT:
         raise ValueError("no such epoch")
@@ -85,11 +74,7 @@ def encode(op: Op, epoch: int, index: int) -> bytes:
 
 
 def decode(id: bytes) -> OrderId:
-    """Return operation, epoch and index of an order.
-
-    Raises:
-        OrderError: It is not one.
-    """
+    """Return operation, epoch and index of an order. Raises OrderError."""
     try:
         epoch, rest = _ID.unpack(id)
         return Op(rest >> 56), epoch, rest & (INDEX_LIMIT - 1)

@@ -40,11 +40,7 @@ class Refuse(Generic[T]):
 
 @dataclass(frozen=True)
 class Begin:
-    """Let the service do something; report its end under the same serial.
-
-    Attributes:
-        op: `APPLY`: call the service. `SNAPSHOT`, `RESTORE`: call those of the pool file.
-    """
+    """Let the service, or that of its state, do something; report its end by the serial."""
 
     op: Op
     serial: int
@@ -268,10 +264,7 @@ class OrderedReplica(Generic[T]):
         return Begin(op, self._serial, payload)
 
     def done(self, serial: int, answer: bytes | None) -> list[Effect[T]]:
-        """The service has ended what began under this serial; None if it failed.
-
-        A request that it could not read counts as applied: it is the same on every replica.
-        """
+        """The service has ended what began under this serial; None if it failed."""
         work = self._work
         if work is None or work.serial != serial:
             return []

@@ -30,11 +30,7 @@ CHECK_EVERY_S = 1.0
 
 @dataclass(frozen=True)
 class Handover:
-    """From what a term begins in which another version becomes active.
-
-    Attributes:
-        at: The state that it takes over: every number given before has been applied there.
-    """
+    """From what a term begins in which another version is active: all before has been applied."""
 
     version: str
     at: Position
@@ -45,12 +41,11 @@ class Sequencer:
     """One term of a sequencer.
 
     Args:
-        epoch: This term, above every earlier one.
+        mark: The position of the last answer that was returned, in whatever term.
         holder: The version that returned it; None where nobody knows.
         begin: What the term begins from, where a version takes over from another.
 
     Attributes:
-        active: Whose answers count.
         deposed_by: A later term that replicas obey.
         held_by: Another robot whose order they obey.
         handover: This term's end: the next begins from it.

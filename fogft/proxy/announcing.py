@@ -24,12 +24,7 @@ _NOTHING = Known()
 
 
 class Announcer:
-    """Keeps one replica's record true.
-
-    Args:
-        endpoint: ``host:port`` as it was told; empty if it was not.
-        dials_out: It cannot be reached.
-    """
+    """Keeps one replica's record true: where it is reached, or that it dials out."""
 
     def __init__(
         self,
@@ -66,11 +61,7 @@ class Announcer:
 
 
 class Presence:
-    """A replica at the rendezvous and at the doors of those it has to dial.
-
-    Raises:
-        CredentialError: The credentials cannot be used.
-    """
+    """A replica at the rendezvous and at the doors that it dials. Raises CredentialError."""
 
     def __init__(self, config: ServerProxyConfig, listening: str) -> None:
         ours = config.credentials

@@ -58,11 +58,7 @@ def prepare(speaks: Speaks) -> None:
 
 
 def join_early(speaks: Speaks, name: str, domain_id: int | None) -> EarlyJoin | None:
-    """Have this process known in its ROS domain before it offers anything, where that takes time.
-
-    Raises:
-        RosError: ROS is not usable here.
-    """
+    """Have this process known in its ROS domain before it offers anything. Raises RosError."""
     if speaks is not Speaks.RCLPY:
         return None
     from fogft.ros.participant.joining import EarlyJoin
@@ -137,21 +133,14 @@ def join(
 
 
 def fault_of(type_name: str, part: str) -> Callable[[bytes], str]:
-    """Return what says why bytes are no request, or response, of a type; empty for nothing.
-
-    Where the type is not installed only the header can be judged.
-    """
+    """Return what says why bytes are no request, or response; without the type, its header only."""
     from fogft.ros.types import definition
 
     return Shape(part, definition(type_name).fields).fault
 
 
 def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | None:
-    """Return the serialised default response of a type; None where it is not known, nor needed.
-
-    Raises:
-        RosError: It is needed, or rclpy is, and it cannot be had.
-    """
+    """Return a type's default response; None where it is not needed. Raises RosError."""
     try:
         from fogft.ros import messages
 

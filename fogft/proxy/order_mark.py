@@ -25,11 +25,7 @@ _VERSION = re.compile(r"[0-9a-f]{16}")
 
 
 class OrderMark:
-    """The mark of one stateful service on one robot.
-
-    Raises:
-        StateError: It cannot be used, or belongs to another pool.
-    """
+    """The mark of one stateful service on one robot. Raises StateError: it cannot be used."""
 
     def __init__(self, path: Path, pool_uid: str) -> None:
         uid = int(pool_uid, 16)

@@ -19,10 +19,7 @@ _THREADS = "OPENBLAS_NUM_THREADS"
 
 
 def load_numpy(environ: MutableMapping[str, str] = os.environ) -> None:
-    """Load numpy, where there is one, without threads, unless the user has said how many.
-
-    Nothing of it is left in the environment: the user's command may want BLAS.
-    """
+    """Load numpy without threads, unless the user has said how many."""
     if _THREADS in environ:
         return
     environ[_THREADS] = "1"  # OpenBLAS reads it as it is loaded

@@ -38,11 +38,7 @@ Judgement = Means | Refusal  # a refusal: as if the replica had refused the requ
 
 
 class Send(NamedTuple):
-    """Something to be sent to a replica.
-
-    Attributes:
-        is_copy: It is a copy of a caller's request, and counted as one.
-    """
+    """Something to be sent to a replica; a copy of a caller's request counts as one."""
 
     replica: int
     id: bytes
@@ -85,11 +81,7 @@ class Decide:
         """Note a new request, and which replicas are able to answer it."""
 
     def read(self, payload: bytes) -> Any:
-        """Look into an answer; here, whether it is ok.
-
-        Raises:
-            RosError: It is no response of this type.
-        """
+        """Look into an answer; here, whether it is ok. Raises RosError: it is none of this type."""
         return self.accepts is None or self.accepts(payload)
 
     def judge(

@@ -66,11 +66,7 @@ class Pending(Generic[T]):
 
 
 class FirstResponse(Generic[T]):
-    """The requests of one service that await an answer, oldest first.
-
-    Attributes:
-        soonest_deadline: Of the requests, or sooner.
-    """
+    """The requests of one service that await an answer, oldest first."""
 
     def __init__(self, *, attempts: int = 3) -> None:
         self._attempts = attempts
@@ -196,11 +192,7 @@ class FirstResponse(Generic[T]):
         return [request for request in self._short if not self._pending[request].open]
 
     def short(self, now: float) -> tuple[list[tuple[bytes, Pending[T]]], float]:
-        """Return the requests for which a further replica may have to be asked now.
-
-        Returns:
-            They, and when the next one must be looked at; infinite for no other.
-        """
+        """Return the requests that may need another replica, and when the next one may."""
         due, later = [], float("inf")
         for request, at in self._short.items():
             if at <= now:
@@ -216,10 +208,7 @@ class FirstResponse(Generic[T]):
 
     @staticmethod
     def candidates(pending: Pending[T], able: Sequence[int], now: float) -> tuple[list[int], float]:
-        """Return who may be asked for a request now, and when the first may be of those left alone.
-
-        Who works on it, or is barred from it, may not.
-        """
+        """Return who may be asked now, and when the first of those left alone may be."""
         until = {
             replica: pending.waits.get(replica, _NO_WAIT)[0]
             for replica in able

@@ -195,10 +195,7 @@ class ReplicaLoad:
         self.asked_at = now
 
     def heard(self, request: bytes, load: Load, now: float) -> None:
-        """Take its word, said with the end of an attempt, which it does not count any more.
-
-        What was sent within the last round trip it had not seen then.
-        """
+        """Take its word; what was sent within the last round trip it had not seen then."""
         since = now - (self._rtt_s or 0.0)
         seen = [id for id, (begun, _) in self._at_work.items() if begun <= since and id != request]
         there = load.waiting + load.running
@@ -237,10 +234,7 @@ class ReplicaLoad:
         self._avoided_until = now + self._avoided_s
 
     def overtaken(self, begun: float, now: float) -> None:
-        """Learn from an attempt that was stopped: it would have taken longer than this.
-
-        Only if that is unusually long already; else it says nothing.
-        """
+        """Learn from an attempt that was stopped, if it took unusually long already."""
         if now - begun >= self.delay_s():
             self._took(now - begun, now)
 

@@ -282,10 +282,7 @@ class PendingRequests(Generic[T]):
     def fallback_answered(
         self, request: bytes, now: float, *, ok: bool
     ) -> tuple[Pending[T] | None, bool]:
-        """Take the fallback's answer; return the request that ends by it, and if that was overdue.
-
-        One that is overdue ends in any case, with the rejection that was kept, or with silence.
-        """
+        """Take the fallback's answer; return the request that ends, and if it was overdue."""
         assert self.fallback is not None
         overdue = self.fallback.answered(request)
         if overdue is not None or not ok:

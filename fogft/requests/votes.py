@@ -79,10 +79,7 @@ class Quorum(Decide):
         return Means.SUCCESS if self.vote(id, Ballot(replica, reading)) else Means.UNDECIDED
 
     def vote(self, request: bytes, ballot: Ballot) -> bool:
-        """Take an answer. Return whether it is the final one: then this ballot decided it.
-
-        A flagged replica's ballot does not count; it is judged all the same.
-        """
+        """Take an answer; whether its ballot decides. One of a flagged replica is only judged."""
         if request in self._final:
             self._judge(ballot, self._final[request])
             return False

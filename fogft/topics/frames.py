@@ -38,10 +38,7 @@ def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
 
 
 def encode_pull(session: bytes, after: int) -> bytes:
-    """Ask for what a replica's session published after a number.
-
-    `NO_SESSION` asks where to begin.
-    """
+    """Ask for what a replica's session published after a number; `NO_SESSION`: where to begin."""
     return _PULL.pack(session, after)
 
 

@@ -55,11 +55,7 @@ class _Waiting:
 
 
 class DialIn:
-    """The dial-in port of one robot or gateway.
-
-    Raises:
-        WireError: The port cannot be had.
-    """
+    """The dial-in port of one robot or gateway. Raises WireError: the port cannot be had."""
 
     def __init__(
         self,

@@ -35,11 +35,7 @@ _ALERTS = {
 
 
 def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
-    """Return in words why `peer` cannot be reached, as far as TCP and TLS can tell.
-
-    Args:
-        timeout_s: The most that each of its steps may take.
-    """
+    """Return in words why `peer` cannot be reached; each step takes `timeout_s` at most."""
     try:
         context = _context(credentials)
     except CredentialError as error:

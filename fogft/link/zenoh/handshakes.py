@@ -30,11 +30,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class HandshakeLog:
-    """Zenoh's log of this process. Make one, before the first session opens.
-
-    Attributes:
-        stdout: Descriptor of what standard output was before: for children.
-    """
+    """Zenoh's log, made before the first session. `stdout`: the descriptor it had."""
 
     def __init__(self) -> None:
         import zenoh

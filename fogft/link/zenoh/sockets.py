@@ -44,11 +44,7 @@ _OTHERS_LIMIT = 1024
 
 
 def address(endpoint: str) -> Address:
-    """Return host and port of a Zenoh endpoint such as ``tls/[::1]:7447``.
-
-    Raises:
-        ValueError: It is none.
-    """
+    """Return host and port of a Zenoh endpoint such as ``tls/[::1]:7447``. Raises ValueError."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     return _plain(host.strip("[]")), int(port.partition("?")[0].partition("#")[0])
 
@@ -99,10 +95,7 @@ class OwnSocket:
         self._number = -1
 
     def borrow(self) -> socket.socket | None:
-        """Return a socket to it, to be closed at once by the caller; None where there is none.
-
-        Kept open, it would keep the connection from ending.
-        """
+        """Return a socket to it, to be closed at once: open, it holds the connection."""
         for number in chain((self._number,), _numbers()):
             connection = _duplicate(number)
             if connection is None:
@@ -210,10 +203,7 @@ def end_sending(connection: socket.socket) -> None:
 
 
 def abort(connection: socket.socket) -> None:
-    """Abort a connection: nothing more is taken, and its peer fails to send.
-
-    Not where something is sent: see `end_sending`.
-    """
+    """Abort a connection at both ends; where something is sent, see `end_sending`."""
     _drop_when_closed(connection)
     _libc.connect(connection.fileno(), _NOWHERE, len(_NOWHERE))
 

@@ -21,11 +21,7 @@ LIMIT = 1024  # probes, records and cancellations that wait; a robot has a few o
 
 
 class WorkQueue:
-    """A thread that does what it is given, in order. Only `join` blocks.
-
-    Args:
-        counters: Count ``control_queries_dropped`` and ``failed``.
-    """
+    """A thread that does what it is given, in order. Only `join` blocks."""
 
     def __init__(self, name: str, counters: Counters) -> None:
         self._counters = counters

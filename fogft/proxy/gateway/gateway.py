@@ -35,11 +35,7 @@ _COPIES_LIMIT = 8  # of one request that wait for its answer: links that were op
 
 
 class Forwarder:
-    """Passes requests on, and each answer back to all that await it.
-
-    Args:
-        of_one: The same for one robot: nobody takes all the room.
-    """
+    """Passes requests on, and each answer back to all that await it, at most `of_one` a robot."""
 
     def __init__(
         self,

@@ -75,11 +75,7 @@ class _ActionServer:
 
 
 class GoalsOnce:
-    """Passes on the goals that are new.
-
-    Args:
-        accepted_kept: Accepted goals that are known at once, for each; the oldest go first.
-    """
+    """Passes on the goals that are new; remembers the last `accepted_kept` of each action."""
 
     def __init__(
         self,
@@ -258,11 +254,7 @@ class GoalsOnce:
                 self._refuse(name, ended.values(), Refusal.CRASHED)
 
     def left_ros(self) -> None:
-        """We have lost our own node: answers that are under way never come.
-
-        What the action servers were given they have, as far as is known: they are not given it
-        again.
-        """
+        """We have lost our own node: answers under way never come, and are not asked again."""
         for name, server in self._servers.items():
             with self._lock:
                 unbegun = [server.open.pop(goal) for goal in server.queue]

@@ -17,11 +17,7 @@ _DEADLINES_KEPT = 1024  # of jobs that were forgotten
 
 
 class KnownRequests:
-    """The jobs that are held, and those that were answered not long ago.
-
-    Args:
-        kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
-    """
+    """The jobs that are held, and at most `kept_ids` that were answered not long ago."""
 
     def __init__(self, kept_bytes: int, kept_ids: int) -> None:
         self._kept_bytes_limit = kept_bytes

@@ -105,11 +105,7 @@ class Responder:
         }
 
     def hanging(self, *, stuck: bool = False) -> dict[str, float]:
-        """Return the services that have ended none of their work for unusually long.
-
-        Returns:
-            For how many seconds, by service.
-        """
+        """Return which services have ended nothing for unusually long, and for how long."""
         now = self._clock()
         with self._lock:
             return {
@@ -206,10 +202,7 @@ class Responder:
         return (Refusal.OVERLOADED if displaced is None else None), displaced
 
     def cancel(self, ids: Iterable[bytes]) -> None:
-        """Drop requests that are no longer wanted; those at work are told to stop, if they can.
-
-        Not for a thread that must not block: a cancel service is called.
-        """
+        """Drop requests that are no longer wanted, or tell them to stop. May block."""
         dropped, at_work = [], []
         with self._lock:
             for id in ids:

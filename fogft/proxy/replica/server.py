@@ -233,10 +233,7 @@ class ServerProxy:
         return {name: seconds for name, seconds in hanging.items() if name in plain}
 
     def _replaced(self) -> set[str]:
-        """Return the services that have one more server than before.
-
-        It took the place of one that died: discovery lists the dead one beside it for long.
-        """
+        """Return the services with one more server than before: the dead one is listed for long."""
         before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
         return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
 

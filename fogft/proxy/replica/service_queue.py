@@ -105,12 +105,7 @@ class ServiceQueue:
         return self._has_room and not len(self._waiting) and not (job.alone and self.at_work)
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
-        """Return what there is to do; None while it is not known how long the service takes.
-
-        Args:
-            spent_s: How long the request was here that is answered with it.
-            ended: How many of those at work have just ended.
-        """
+        """Return what there is to do when `ended` have just ended; None until the pace is known."""
         if not self.limit.service_s:
             return None
         waiting, running = len(self._waiting), self.at_work - ended

@@ -51,11 +51,7 @@ class _ToCancel:
 
 
 class _Action:
-    """What the three services of one action share, under a lock that is taken last.
-
-    Attributes:
-        began: Called, without the lock, with a goal and a replica that has taken it.
-    """
+    """What the three services of one action share, under a lock that is taken last."""
 
     def __init__(self, clock: Callable[[], float], wake: Callable[[], None]) -> None:
         self.lock = threading.Lock()
@@ -74,10 +70,7 @@ class _Action:
 
 
 class _CancelPart(Decide):
-    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile.
-
-    What a replica cancels is begun on none that comes later.
-    """
+    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile."""
 
     replicates = True
 

@@ -45,11 +45,7 @@ MakeDispatcher = Callable[
 
 
 class ClientProxy:
-    """Sends each request to all replicas and returns the first success.
-
-    Args:
-        define: Returns the definition of a service type here; None to compare none.
-    """
+    """Sends each request to all replicas and returns the first success."""
 
     def __init__(
         self,
@@ -83,11 +79,7 @@ class ClientProxy:
     # -- configuration --------------------------------------------------------------------
 
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
-        """Proxy these services and no others. Unchanged ones go on undisturbed.
-
-        A service whose policy changed keeps its ROS server and the requests under way, with
-        their deadlines.
-        """
+        """Proxy these services and no others. What is under way goes on."""
         with self._lock:
             wanted = {spec.name: spec for spec in specs}
             for name in [n for n in self._services if n not in wanted]:
@@ -223,12 +215,10 @@ class ClientProxy:
     # -- the proxy's own thread -----------------------------------------------------------
 
     def run_once(self, timeout_s: float = _IDLE_TICK_S) -> bool:
-        """Wait for a change or a moment, then route, advertise and tick.
+        """Wait for a change or a moment, then route, advertise and tick; whether something changed.
 
-        The moment is at most `timeout_s`, and less where a dispatcher wants its tick earlier.
-
-        Returns:
-            Whether something had changed.
+        Raises:
+            RosError: The node's thread has ended: nothing would be taken any more.
         """
         if self._node is not None and not self._node.alive:
             raise RosError("ROS has stopped; the log says why", "start the proxy again")

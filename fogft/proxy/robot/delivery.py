@@ -47,10 +47,7 @@ class Delivery:
         self.adopt(ledger.spec, None)
 
     def adopt(self, spec: ServiceSpec, client: RosClient | None) -> None:
-        """Follow what a spec says of the fallback, with its client. Under the lock.
-
-        Without a fallback nothing more is asked before the deadline.
-        """
+        """Follow what a spec says of the fallback, with its client. Under the lock."""
         self._client, requests = client, self._ledger.requests
         if requests.fallback is None and spec.fallback is not None:
             requests.fallback = FallbackTimer(spec.fallback)
@@ -115,11 +112,7 @@ class Delivery:
     # -- the fallback ---------------------------------------------------------------------
 
     def tick(self, now: float, *, able: bool) -> float:
-        """Ask the fallback for what is due, and give up what it has not answered in time.
-
-        Returns:
-            When to call again.
-        """
+        """Ask the fallback for what is due, give up the rest; return when to look again."""
         timer, requests = self._ledger.requests.fallback, self._ledger.requests
         if timer is None:
             return NEVER

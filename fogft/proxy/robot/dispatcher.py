@@ -135,11 +135,7 @@ class Dispatcher:
         self.forward(request, payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
-        """Do the same for a request that has its id, and so much time left; whether it was taken.
-
-        Raises:
-            ValueError: A request with this id is under way.
-        """
+        """Do so for one with an id; whether it was taken. Raises ValueError: it is known."""
         now, requests, outcomes = self._clock(), self._requests, self.outcomes
         with self._lock:
             outcomes.received(len(payload))
@@ -256,10 +252,7 @@ class Dispatcher:
                       self.spec.name, id.short, count, fault)  # fmt: skip
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Learn from the end of an attempt that its link was told to forget; its bytes stay unread.
-
-        The replica has worked on it for nothing, or has dropped it.
-        """
+        """Learn from the end of an attempt that was forgotten; its bytes stay unread."""
         worked = answer.payload is not None or answer.refusal is Refusal.LATE
         now, replica, choose = self._clock(), key_of(link), self._requests.choose
         with self._lock:
@@ -327,11 +320,7 @@ class Dispatcher:
     # -- policy, links and time -----------------------------------------------------------
 
     def adopt(self, spec: ServiceSpec, fallback: RosClient | None = None) -> None:
-        """Follow another policy from now on; requests under way keep their deadlines.
-
-        Raises:
-            RosError: The response has no such `ok_field`; nothing was changed.
-        """
+        """Follow another policy from now on. Raises RosError: there is no such `ok_field`."""
         accepts = self._decide.accepts
         if spec.ok_field != self.spec.ok_field and self._ok_of is not None:
             accepts = self._ok_of(spec.ok_field) if spec.ok_field else None
@@ -352,11 +341,7 @@ class Dispatcher:
         self._wake()
 
     def tick(self) -> float:
-        """Let requests expire, and offer them to whom the policy chooses.
-
-        Returns:
-            When to call again at the latest, on the clock; infinite for no matter when.
-        """
+        """Let requests expire, offer the others; return when to call again at the latest."""
         now = self._clock()
         with self._lock:
             expired = self._requests.expire(now)

@@ -33,12 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class Following:
-    """The membership of one pool as a client proxy sees it.
-
-    Raises:
-        WireError: The door's port cannot be had.
-        CredentialError: The credentials cannot be used.
-    """
+    """A pool's membership as a client proxy sees it. Raises WireError, CredentialError."""
 
     def __init__(self, config: ClientProxyConfig) -> None:
         self._config = config
@@ -52,11 +47,7 @@ class Following:
         self._call()
 
     def apply(self, config: ClientProxyConfig) -> None:
-        """Take a changed configuration into use; what did not change goes on undisturbed.
-
-        Raises:
-            WireError: The new door's port cannot be had; there is none then.
-        """
+        """Take a changed configuration into use. Raises WireError: a port cannot be had."""
         old, self._config = self._config, config
         if (old.dial_in, old.dial_in_listen) != (config.dial_in, config.dial_in_listen):
             if self.door is not None:
@@ -106,11 +97,7 @@ class Following:
             self._announce(self._client)
 
     def look(self) -> Membership | None:
-        """Return the membership to follow if it may have changed, else None.
-
-        Raises:
-            StateError: The file is damaged.
-        """
+        """Return the membership if it may have changed. Raises StateError: a damaged file."""
         changed = self._changed.is_set()
         self._changed.clear()
         if self._file.changed():

@@ -134,10 +134,7 @@ class TypeCheck:
         self._found: dict[tuple[ReplicaId, str], tuple[Definition, str]] = {}
 
     def differences(self, link: Link, services: Iterable[ServiceSpec]) -> Mapping[str, str]:
-        """Return which services a replica cannot answer for us, and why, in words.
-
-        An older replica tells nothing of its types: then nothing is said against it.
-        """
+        """Return which services a replica cannot answer for us, and why, as far as it tells."""
         answer = link.status().probe_answer
         if self._define is None or answer is None or not answer.types:
             return {}

@@ -24,11 +24,7 @@ STEADY_S = 60.0
 
 
 class ManagerRestart:
-    """Looks now and then whether the manager of this machine was killed.
-
-    Args:
-        environ: The environment for it: what our own was before ROS was prepared in it.
-    """
+    """Looks whether the manager was killed. `environ`: ours before ROS was prepared."""
 
     def __init__(
         self,

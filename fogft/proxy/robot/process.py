@@ -133,11 +133,7 @@ def make_dispatcher(
     id_of: Callable[[str, Any], bytes] | None = None,
     held: Callable[[], bool] = lambda: False,
 ) -> Dispatcher:
-    """Make the dispatcher of a service, with what its policy needs of its ROS type.
-
-    Raises:
-        RosError: The type is needed and cannot be loaded.
-    """
+    """Make a service's dispatcher, with what it needs of its ROS type. Raises RosError."""
     fault_of = middleware.fault_of(spec.type, RESPONSE)
     shared: dict[str, Any] = {"fault_of": fault_of, **({"id_of": id_of} if id_of else {})}
     if spec.part is not Part.NONE:

@@ -49,12 +49,7 @@ class Advertising:
 
 
 class ProxiedService:
-    """A service of the robot's.
-
-    Attributes:
-        trouble: Why it cannot be offered, or its clients get no answers, or others'; empty if
-            nothing.
-    """
+    """A service of the robot's. `trouble`: why it is not offered, or clients get no answers."""
 
     def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher) -> None:
         self.spec = spec

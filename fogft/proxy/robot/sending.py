@@ -21,11 +21,7 @@ from fogft.requests.load import NEVER, Handling
 
 
 class Sender:
-    """Sends one service's requests.
-
-    Attributes:
-        next_look: When the policy wants to be asked, as `offer_more` found it.
-    """
+    """Sends one service's requests. `next_look`: when the policy wants to be asked."""
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
@@ -73,12 +69,7 @@ class Sender:
         leaving: Collection[ReplicaId] = (),
         hanging: Collection[ReplicaId] = (),
     ) -> None:
-        """Set the links that may be asked now, and offer them what they lack.
-
-        Args:
-            links: Those whose replica is ready; where replicas are brought to readiness, all.
-            hanging: Those that say that the service answers nothing of what it has.
-        """
+        """Set the links that may be asked now, `hanging` ones too; offer what they lack."""
         routed = {key_of(link): link for link in links}
         replication, now = self._replication, self._ledger.clock()
         hang = {key for key, link in routed.items() if link.peer.id in hanging}

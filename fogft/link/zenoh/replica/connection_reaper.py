@@ -146,10 +146,7 @@ class ConnectionReaper:
     def _watch(
         self, links: Mapping[Address, str], found: Mapping[Address, socket.socket], now: float
     ) -> None:
-        """See how links drain: find the thin ones, and end those that stand still.
-
-        A peer that has acknowledged nothing for long is frozen, or out of reach.
-        """
+        """See how links drain: find the thin ones, and end those that stand still."""
         thin = set()
         progress = {
             peer: self._progress.get(peer) or SocketProgress() for peer in links if peer in found

@@ -141,11 +141,7 @@ class ControlQueries:
             self._queues.end(greeting.token, "probe", asked)
 
     def take(self, offered: Sequence[SignedRecord]) -> list[SignedRecord]:
-        """Judge records by their own signatures, and do what those that are good say.
-
-        Returns:
-            What stands in place of those that are out of date.
-        """
+        """Do what good records say; return what stands in place of those that are out of date."""
         newer: list[SignedRecord] = []
         for one in offered:
             verdict = self._records.offer(one)

@@ -39,11 +39,7 @@ class QueryTurns:
 
 
 class QueryEnd:
-    """A query that is to be ended, after a refusal if there is one.
-
-    Attributes:
-        refusal: What is said before; empty for nothing.
-    """
+    """A query that is to be ended, after a refusal if there is one."""
 
     def __init__(self, query: zenoh.Query, turn: int) -> None:
         self.query = query
@@ -52,11 +48,7 @@ class QueryEnd:
         self._ended = False
 
     def say(self) -> None:
-        """Send the refusal. May block for as long as its robot takes nothing.
-
-        Raises:
-            zenoh.ZError: The session is closed.
-        """
+        """Send the refusal. May block while its robot takes nothing. Raises zenoh.ZError."""
         if self.refusal:
             self.query.reply_err(frame.encode_refusal(frame.NO_STAMP, _NO_REQUEST, self.refusal))
 

@@ -132,12 +132,7 @@ class ReplyQueue:
 
 
 class ReplyQueues:
-    """All reply queues of a listener.
-
-    Args:
-        counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
-        idle_s: A thread that had nothing to send for so long ends.
-    """
+    """All reply queues of a listener."""
 
     def __init__(
         self,

@@ -47,11 +47,7 @@ class AuthenticatedSessions:
         self.revoked: frozenset[str] = frozenset()  # common names that are let in no more
 
     def greet(self, greeting: Greeting) -> None:
-        """Let a connection in, or find that it was let in before.
-
-        Raises:
-            NotAdmittedError: Its holder may not ask here.
-        """
+        """Let a connection in. Raises NotAdmittedError: its holder may not ask here."""
         if not greeting.certificate:
             if greeting.token not in self._tokens:
                 raise NotAdmittedError(Refusal.NOT_ADMITTED, "a connection that did not greet")

@@ -128,10 +128,7 @@ class Connection:
         return FlowWatch(address(links[0].src), address(links[0].dst))
 
     def begin(self) -> bool:
-        """Ask for the answers to come, once the replica has let us in; return whether it hears.
-
-        What is published before Zenoh knows that it is heard there would be lost.
-        """
+        """Ask for answers once the replica hears us; before, what is published would be lost."""
         if self._begun:
             return True
         for publisher in self._publishers.values():
@@ -226,10 +223,7 @@ class Connection:
         self.lose(words)
 
     def tell_records(self, key: str, records: bytes, newer: Callable[[bytes], object]) -> None:
-        """Send signed records; `told` is them once the replica has taken them.
-
-        `newer` is given what it says in place of those that are out of date, from any thread.
-        """
+        """Send signed records: `told` once taken; `newer` is given what replaces them."""
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -265,11 +259,7 @@ class Connection:
 
 
 def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer], bool]:
-    """Return a reply's stamp, what it answers to each request, and whether the payload is packed.
-
-    Raises:
-        FrameError: It does not say to which.
-    """
+    """Return a reply's stamp, answers, and whether they are packed. Raises FrameError."""
     ok = reply.ok
     if ok is None:
         err = reply.err

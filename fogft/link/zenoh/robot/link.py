@@ -166,10 +166,7 @@ class ZenohLink:
         self._on_close(self)
 
     def renew(self) -> None:
-        """Take new credentials into use: open a connection beside this one, then close this one.
-
-        Returns at once; no request is lost by it.
-        """
+        """Take new credentials into use, by another connection; at once, and no request is lost."""
         self._renew.set()
         self._wake.set()
 
@@ -313,11 +310,7 @@ class ZenohLink:
         return not connection.lost_because
 
     def _doubt(self, now: float) -> float:
-        """Tell the owner, once a silence, that a probe's answer is late; it stays UP.
-
-        Returns:
-            In how many seconds to look again.
-        """
+        """Tell the owner once that a probe's answer is late; return when to look, in s."""
         late, left_s = self._probing.late(now)
         if late and self._live is not None:
             silent_s = self._probing.silent_s(now)

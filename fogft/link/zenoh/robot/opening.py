@@ -30,10 +30,7 @@ class Opening:
 
     @property
     def timeout_s(self) -> float:
-        """How long the next try may take.
-
-        Every third time-out in a row is a long one: the replica may be there, and slow.
-        """
+        """How long the next try may take: after two time-outs longer, the replica may be slow."""
         patient = self._timed_out % 3 == 2
         return self._settings.long_open_timeout_s if patient else self._settings.open_timeout_s
 

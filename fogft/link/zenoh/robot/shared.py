@@ -13,11 +13,7 @@ from fogft.records.signing import Signer
 
 @dataclass
 class Shared:
-    """What all links of one robot share. Written by the dialer, read by its links.
-
-    Attributes:
-        newer: Slot -> what its replica said last in place of records that are out of date.
-    """
+    """What all links of one robot share. `newer`: by slot, what a replica said of old records."""
 
     credentials: CredentialPaths
     robot: str
