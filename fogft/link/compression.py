@@ -1,18 +1,28 @@
-"""Compress what a thin uplink carries, where it pays. No clock of its own, no Zenoh.
+"""Compress what a thin uplink carries, where it pays, and decompress it. No Zenoh.
 
 zlib at its lowest level: it is in every Python, and on the links where compression can pay at
 all it is not what limits. What pays is measured for each service: how far its bytes shrink and
 how long that takes, against how long they would take to leave at the rate that was seen. What
 does not shrink is left alone, and tried again rarely.
 
+A few kilobytes may become 64 MiB. Zenoh's thread, which brings the bytes of all links, must not
+spend that time; and nobody waits behind what another peer sent. So a thread of each peer's own
+decompresses, from its first payload to its last.
+
 Owns: when and how. Not here: rates (`socket_progress`), headers (`frame`).
 """
 
 from __future__ import annotations
 
+import contextlib
+import logging
+import threading
 import time
 import zlib
+from collections import deque
 from collections.abc import Callable
+
+log = logging.getLogger(__name__)
 
 # What a replica reads, and finds out by itself for answers: robots of 0.2.0 ask for these words.
 ACCEPTED = frozenset({"zlib", "zlib-answers"})
@@ -84,3 +94,49 @@ def unpack(packed: bytes, limit: int = LIMIT_BYTES) -> bytes:
     if not reader.eof or reader.unused_data or reader.unconsumed_tail:
         raise ValueError(f"a compressed payload that is cut short, or above {limit} bytes")
     return payload
+
+
+WAITING_LIMIT = 64  # payloads of one peer
+WAITING_BYTES_LIMIT = 64 << 20  # of them together, packed
+
+Done = Callable[[bytes | None], None]  # takes the payload; None where it cannot be decompressed
+
+
+class Unpacker:
+    """Decompresses the payloads of several peers. Any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._waiting: dict[str, deque[tuple[bytes, Done]]] = {}
+
+    def put(self, peer: str, packed: bytes, done: Done) -> bool:
+        """Decompress a payload, then call `done`; False where too much of this peer waits."""
+        with self._lock:
+            waiting = self._waiting.get(peer)
+            if waiting is not None:
+                held = sum(len(one) for one, _ in waiting)
+                if len(waiting) >= WAITING_LIMIT or held + len(packed) > WAITING_BYTES_LIMIT:
+                    return False
+                waiting.append((packed, done))
+                return True
+            self._waiting[peer] = deque(((packed, done),))
+        threading.Thread(
+            target=self._run, args=(peer,), name=f"fogft-unpack-{peer}", daemon=True
+        ).start()
+        return True
+
+    def _run(self, peer: str) -> None:
+        while True:
+            with self._lock:
+                if not self._waiting[peer]:
+                    del self._waiting[peer]
+                    return
+                packed, done = self._waiting[peer].popleft()
+            payload: bytes | None = None
+            with contextlib.suppress(ValueError):  # whose payload it was counts it, and logs some
+                payload = unpack(packed)
+            try:
+                done(payload)
+            except Exception:  # the next ones go on
+                log.exception("payload_not_taken peer=%s", peer)
+            del packed, payload, done  # while this thread waits for the lock, and after

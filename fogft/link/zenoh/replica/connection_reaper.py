@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import socket
 import threading
 import time
@@ -25,7 +26,6 @@ from fogft.link.counters import Counters
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
-from fogft.link.zenoh.replica.descriptor_reserve import DescriptorReserve
 from fogft.link.zenoh.replica.door import Door
 from fogft.link.zenoh.replica.listen_filter import ListenFilter
 from fogft.link.zenoh.sockets import Address
@@ -37,6 +37,40 @@ _LOOK_AGAIN_S = 0.01  # while somebody comes, or is kept out
 RUSH_LIMIT = 2  # so many new ones since the last look
 # A robot that is out of reach has long opened another link by then.
 STUCK_AFTER_S = 15.0
+
+
+_RESERVE = 32  # descriptors
+
+
+class DescriptorReserve:
+    """Descriptors that are kept for when strangers hold all others. For one thread.
+
+    Without one, nothing tells whose the connections at the port are, no preemption notice is read
+    and no state is written. Zenoh takes of what is given back no more than wait at the port.
+    """
+
+    def __init__(self) -> None:
+        self._kept: list[int] = []
+        self.fill()
+
+    def fill(self) -> bool:
+        """Keep as many as there should be; False where no more can be had beside them."""
+        try:
+            while len(self._kept) < _RESERVE:
+                self._kept.append(_open())
+            os.close(_open())
+        except OSError:
+            return False
+        return True
+
+    def release(self) -> None:
+        """Let the process use them."""
+        while self._kept:
+            os.close(self._kept.pop())
+
+
+def _open() -> int:
+    return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
 
 
 class ConnectionReaper:

@@ -24,6 +24,7 @@ from zenoh import handlers
 
 from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
+from fogft.link.compression import Unpacker
 from fogft.link.counters import Counters
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import sockets, threads
@@ -36,7 +37,6 @@ from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
-from fogft.link.zenoh.unpacking import Unpacker
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths

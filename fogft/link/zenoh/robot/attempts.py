@@ -18,7 +18,7 @@ from typing import Protocol
 
 from fogft.link import batch_frames, frame
 from fogft.link.cancellations import Cancellations
-from fogft.link.compression import Compression
+from fogft.link.compression import Compression, Unpacker
 from fogft.link.credit import Credit
 from fogft.link.deadline_filter import DeadlineFilter
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
@@ -33,7 +33,6 @@ from fogft.link.window import (
 from fogft.link.zenoh.flow_watch import FlowWatch
 from fogft.link.zenoh.robot.send_queue import SendQueue
 from fogft.link.zenoh.threads import join_at_exit
-from fogft.link.zenoh.unpacking import Unpacker
 from fogft.model.refusal import Refusal
 from fogft.requests.load import Handling
 

@@ -11,12 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link import batch_frames, frame
+from fogft.link import batch_frames, compression, frame
 from fogft.link.cancellations import Cancellations
 from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
 from fogft.link.port import DEFAULT_OPTIONS, Answer, SendOptions
 from fogft.link.socket_progress import SocketProgress
-from fogft.link.zenoh import unpacking
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.model.refusal import Refusal
 from tests.link.wire_pool import request_id, wait_for
@@ -198,7 +197,7 @@ def test_a_packed_answer_is_unpacked_where_it_was_asked_for() -> None:
 
 def test_nothing_is_unpacked_that_was_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither for an unknown id, nor for one that is not wanted, nor where no request allows it."""
-    monkeypatch.setattr(unpacking, "unpack", lambda packed: pytest.fail("it was unpacked"))
+    monkeypatch.setattr(compression, "unpack", lambda packed: pytest.fail("it was unpacked"))
     scene = Scene(SendOptions(plain=frozenset({SERVICE})))
     bomb = zlib.compress(bytes(1 << 20))
     for number in (1, 2):

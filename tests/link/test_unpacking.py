@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import zlib
 
-from fogft.link.zenoh.unpacking import WAITING_BYTES_LIMIT, WAITING_LIMIT, Unpacker
+from fogft.link.compression import WAITING_BYTES_LIMIT, WAITING_LIMIT, Unpacker
 from tests.link.wire_pool import wait_for
 
 
