@@ -80,7 +80,12 @@ class ControlQueries:
         except FrameError as error:
             self._malformed(error, asked)
             return
-        self.later(partial(self._answer_probe, on_probe, probe, greeting, asked), asked)
+
+        def answer() -> bytes:
+            said = replace(on_probe(probe), accepts=ACCEPTED)
+            return probe_frames.encode_probe_answer(said)
+
+        self.later(partial(self._answer, greeting, asked, answer), asked)
 
     def records(self, asked: QueryEnd) -> None:
         """Somebody brings what the pool has signed."""
@@ -91,7 +96,12 @@ class ControlQueries:
         except (FrameError, RecordError) as error:
             self._malformed(error, asked)
             return
-        self.later(partial(self._take_records, greeting, offered, asked), asked)
+
+        def answer() -> bytes:
+            newer = self.take(offered)
+            return frames.pack(newer) if newer else b""
+
+        self.later(partial(self._answer, greeting, asked, answer), asked)
 
     def later(self, job: Callable[[], None], asked: QueryEnd) -> None:
         """Have the other thread do something; where too much waits for it, the query just ends."""
@@ -112,32 +122,19 @@ class ControlQueries:
 
     # -- the worker thread -----------------------------------------------------------
 
-    def _answer_probe(
-        self,
-        on_probe: Callable[[Probe], ProbeAnswer],
-        probe: Probe,
-        greeting: frame.Greeting,
-        asked: QueryEnd,
+    def _answer(
+        self, greeting: frame.Greeting, asked: QueryEnd, answer: Callable[[], bytes]
     ) -> None:
-        if not self._greeted(greeting, asked):
+        """Let in who asks and answer, or tell why not."""
+        try:
+            self._sessions.greet(greeting)
+        except NotAdmittedError as error:
+            self._turn_away(asked, error.refusal, str(error))
             return
         try:
-            answer = replace(on_probe(probe), accepts=ACCEPTED)
-            content = probe_frames.encode_probe_answer(answer)
-            asked.query.reply(asked.query.key_expr, content, express=True)
+            asked.query.reply(asked.query.key_expr, answer(), express=True)
         finally:
             # In its robot's own thread: unlike the answer, the end queues behind replies.
-            self._queues.end(greeting.token, "probe", asked)
-
-    def _take_records(
-        self, greeting: frame.Greeting, offered: list[SignedRecord], asked: QueryEnd
-    ) -> None:
-        if not self._greeted(greeting, asked):
-            return
-        try:
-            newer = self.take(offered)
-            asked.query.reply(asked.query.key_expr, frames.pack(newer) if newer else b"")
-        finally:
             self._queues.end(greeting.token, "probe", asked)
 
     def take(self, offered: Sequence[SignedRecord]) -> list[SignedRecord]:
@@ -154,15 +151,6 @@ class ControlQueries:
                 newer += filter(None, [self._records.signed(record.kind, record.subject)])
         self._sessions.revoke(self._records.revoked)
         return newer
-
-    def _greeted(self, greeting: frame.Greeting, asked: QueryEnd) -> bool:
-        """Whether this is somebody who is let in; else it is told why not."""
-        try:
-            self._sessions.greet(greeting)
-        except NotAdmittedError as error:
-            self._turn_away(asked, error.refusal, str(error))
-            return False
-        return True
 
 
 def _greeting(query: zenoh.Query) -> frame.Greeting:
