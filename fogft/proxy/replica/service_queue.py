@@ -30,6 +30,9 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
+# A service that takes less has nothing to do for a good part of its time if it is given the next
+# request only when it has ended the present one. So one that waits is given to it before.
+_AHEAD_BELOW_S = 0.05
 
 
 class Job:
@@ -74,6 +77,7 @@ class ServiceQueue:
         self.at_work = 0
         self._begun_last = 0.0
         self._alone = False  # the job at work is to have no other beside it
+        self._ahead: Job | None = None  # passed on beyond the limit: it begins when another ends
         self._longest_s = 0.0  # that it lately took; 0 before its first answer
         self._quiet_since: float | None = None  # it has work, and has ended none since
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
@@ -124,15 +128,25 @@ class ServiceQueue:
         What it returns may be past its deadline, or about to be while others wait that are not:
         then it was not begun and takes no room.
         """
-        if not self._has_room:
+        beyond = not self._has_room
+        if beyond and not self._may_go_ahead:
             return None
         job = self._waiting.take()
-        if job is not None and job.alone and self.at_work:
+        if job is not None and ((job.alone and self.at_work) or (job.spare and beyond)):
             self.put(job)  # when the service has nothing else
             return None
-        if job is not None and job.deadline > now + (self.limit.takes_s if self._waiting else 0.0):
+        takes_s = self.limit.takes_s
+        needs_s = takes_s if self._waiting else 0.0
+        if beyond:  # and what is at work is to end before
+            needs_s += max(0.0, takes_s - (now - self._begun_last))
+        if job is not None and job.deadline > now + needs_s:
             self.begin(job, now)
         return job
+
+    @property
+    def _may_go_ahead(self) -> bool:
+        quick = self.limit.learned and self.limit.takes_s < _AHEAD_BELOW_S
+        return quick and self.at_work == self.limit.limit and not self._alone
 
     def begin(self, job: Job, now: float) -> None:
         """Job is passed on."""
@@ -144,6 +158,8 @@ class ServiceQueue:
             self._quiet_since = now
         self._begun_last = now
         job.passed_on, job.begun, job.level = True, now, self.at_work
+        if self.at_work > self.limit.limit:
+            self._ahead = job
 
     def remove(self, job: Job) -> bool:
         """Take a job out that waits; whether it did."""
@@ -156,6 +172,9 @@ class ServiceQueue:
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
         self.free(job)
+        if (ahead := self._ahead) is not None:
+            self._ahead, self._begun_last = None, now
+            ahead.begun, ahead.level = now, self.at_work
         self._unanswered = self.at_work
         self._quiet_since = now if self.at_work else None
 
@@ -165,6 +184,8 @@ class ServiceQueue:
             job.passed_on = False
             self.at_work -= 1
             self._alone = False
+            if self._ahead is job:
+                self._ahead = None
             self._unanswered -= 1
             if not self._unanswered:
                 self._quiet_since = None
