@@ -39,6 +39,11 @@ class SpecError(FogftError):
         self.what = what
         self.line = line
 
+    @classmethod
+    def of_key(cls, key: str, what: str, hint: str = "") -> SpecError:
+        """Return the error of a key, for whoever knows the file and its lines to place."""
+        return cls(f"{key}: {what}", hint, key=key, what=what)
+
 
 class StateError(FogftError):
     """What is stored on disk for a pool cannot be used."""

@@ -9,7 +9,7 @@ import pytest
 PRODUCT = Path(__file__).parent.parent / "fogft"
 ROOMS = ("cli", "cloud", "doctor", "model", "planning", "pool", "simulation")
 SENTENCES = {"detail", "details", "failure", "fault", "note", "notes", "reason", "reasons"} | {
-    "told", "trouble", "why", "why_not", "words",
+    "message", "told", "trouble", "why", "why_not", "words",
 }  # fmt: skip
 READS = {"endswith", "find", "index", "partition", "removeprefix", "rpartition", "split"} | {
     "startswith"

@@ -15,11 +15,12 @@ from fogft.poolfile.tree import below, nearest
 
 def located(error: SpecError, source: str, file: Path) -> SpecError:
     """Return a cloud's complaint about a key with the file and the line that it is about."""
-    key, colon, _ = error.message.partition(": ")
-    path = re.findall(r"[^.\[\]]+", key) if colon else ()
+    path = re.findall(r"[^.\[\]]+", error.key)
     root = yaml_tree.tree(source, str(file))
     node = below(root, [int(part) if part.isdigit() else part for part in path])
-    return SpecError(f"{file}:{node.key_line}: {error.message}", error.hint)
+    line = node.key_line
+    message = f"{file}:{line}: {error.message}"
+    return SpecError(message, error.hint, key=error.key, what=error.what, line=line)
 
 
 def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) -> str | None:
@@ -32,13 +33,15 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
     named = dict(_named_in(spec))
     for cloud, key in named.items():
         if cloud not in names:
-            problem = SpecError(f"{key}: there is no cloud `{cloud}`", nearest(cloud, names))
+            what = f"there is no cloud `{cloud}`"
+            problem = SpecError.of_key(key, what, nearest(cloud, names))
             raise located(problem, source, file)
     by_adapter = {names[cloud]: cloud for cloud in sorted(named)}
     if len(by_adapter) > 1:
         listed = " and ".join(f"`{cloud}`" for cloud in sorted(by_adapter.values()))
-        problem = SpecError(
-            f"resources: {listed} cannot be in one pool",
+        problem = SpecError.of_key(
+            "resources",
+            f"{listed} cannot be in one pool",
             "name real clouds only; `--cloud local` tries their regions on this machine",
         )
         raise located(problem, source, file)

@@ -17,40 +17,52 @@ from fogft.model.state import StateSpec
 from fogft.model.topology import Gateway, RobotRoute, Topology
 
 TASK_PLACES = ("run", "setup", "resources", "workdir", "envs")
+Hint = tuple[str, str]  # what is to be said of a key, and what to do
+
 _AUTOSCALE = {
-    "autoscale": "is not supported yet; remove it: `fogft scale` or `schedule` say how many "
-    "replicas there are"
+    "autoscale": (
+        "is not supported yet",
+        "remove it: `fogft scale` or `schedule` say how many replicas there are",
+    )
 }
-_DEFAULT_IS_RIGHT = "is no key any more; remove it: the default is right"
-_OWN_POOL = "is no key of a service; put this service into a pool of its own, with as many"
-_HINTS: dict[type, dict[str, str]] = {
+_DEFAULT_IS_RIGHT = "is no key any more", "remove it: the default is right"
+_OWN_POOL = "is no key of a service", "put this service into a pool of its own, with as many"
+
+
+def _renamed(name: str, instead: str = "") -> Hint:
+    return f"is called `{name}` now", f"write {instead or 'that'}"
+
+
+_HINTS: dict[type, dict[str, Hint]] = {
     PoolSpec: {
         **_AUTOSCALE,
-        "orphan_after_s": "is called `unmanaged_max_hours` now, in hours; write that",
+        "orphan_after_s": _renamed("unmanaged_max_hours", "that, in hours"),
     },
     ServiceSpec: {
         **_AUTOSCALE,
         "hedging_budget": _DEFAULT_IS_RIGHT,
         "replicas": _OWN_POOL,
         "min_replicas": _OWN_POOL,
-        "uplinks": "is called `uplink_policy` now; write `advanced: {uplink_policy: ...}`",
-        "fallback": "is called `fallback_service` now; write `fallback_service: {name: ...}`",
+        "uplinks": _renamed("uplink_policy", "`advanced: {uplink_policy: ...}`"),
+        "fallback": _renamed("fallback_service", "`fallback_service: {name: ...}`"),
     },
     FallbackSpec: {
-        "service": "is called `name` now; write `fallback_service: {name: ...}`",
+        "service": _renamed("name", "`fallback_service: {name: ...}`"),
         "limit_s": _DEFAULT_IS_RIGHT,
     },
     AvailabilitySpec: {"correlation": _DEFAULT_IS_RIGHT},
-    PlacementSpec: {"price_weight": "is no key any more; set `latency_weight` in proportion"},
+    PlacementSpec: {"price_weight": ("is no key any more", "set `latency_weight` in proportion")},
     ScheduleSpec: {"prelaunch_s": _DEFAULT_IS_RIGHT},
     StateSpec: {
-        "shared": "is no key any more: a service with `state` is for one robot; for several "
-        "robots remove `state` and let the service keep its state in a replicated store, such as "
-        "etcd; docs/how-to/state.md shows how"
+        "shared": (
+            "is no key any more: a service with `state` is for one robot",
+            "for several robots remove `state` and let the service keep its state in a replicated "
+            "store, such as etcd; docs/how-to/state.md shows how",
+        )
     },
-    Topology: {"through": "is called `default_gateways` now; write that"},
-    Gateway: {"through": "is called `upstream` now; write that"},
-    RobotRoute: {"through": "is called `gateways` now; write that"},
+    Topology: {"through": _renamed("default_gateways")},
+    Gateway: {"through": _renamed("upstream")},
+    RobotRoute: {"through": _renamed("gateways")},
 }
 
 
@@ -64,7 +76,7 @@ def value_hint(kind: type, text: str) -> str:
     return _VALUES.get((kind, text), "")
 
 
-def hints(cls: type) -> Mapping[str, str]:
+def hints(cls: type) -> Mapping[str, Hint]:
     """Return what is to be said of keys that a map does not have any more, or not yet."""
     return _HINTS.get(cls, {})
 

@@ -16,7 +16,7 @@ from enum import Enum
 from typing import Any, TypeVar
 
 from fogft.errors import SpecError
-from fogft.poolfile.removed import value_hint
+from fogft.poolfile.removed import Hint, value_hint
 
 SMALLEST = 1e-12  # of a number above 0: a smaller one is a slip of the pen
 Choice = TypeVar("Choice", bound=Enum)
@@ -117,7 +117,7 @@ class Section:
         self,
         known: Iterable[str],
         *,
-        hints: Mapping[str, str] | None = None,
+        hints: Mapping[str, Hint] | None = None,
         elsewhere: Mapping[str, str] | None = None,
     ) -> Iterator[SpecError]:
         """Yield an error for each key that is not known.
@@ -128,8 +128,7 @@ class Section:
         allowed = set(known)
         for key in [key for key in self.children if key not in allowed]:
             if hints and key in hints:
-                what, _, todo = hints[key].partition("; ")
-                yield self.error(key, what, todo, at_key=True)
+                yield self.error(key, *hints[key], at_key=True)
                 continue
             if elsewhere and key in elsewhere:
                 hint = f"`{key}` belongs {elsewhere[key]}"

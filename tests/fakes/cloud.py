@@ -125,7 +125,7 @@ class MockCloud:
             if region in (None, zone.placement.region)
         ]
         if not found:
-            raise SpecError(f"resources.region: `{region}` does not exist")
+            raise SpecError.of_key("resources.region", f"`{region}` does not exist")
         return found
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:

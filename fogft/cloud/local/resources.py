@@ -54,16 +54,18 @@ def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[st
     _check_keys("resources", resources, ("any_of", "ordered"))
     lists = [key for key in ("any_of", "ordered") if resources.get(key) is not None]
     if len(lists) == 2:
-        raise SpecError("resources.ordered: cannot stand beside `any_of`", "keep one of them")
+        raise SpecError.of_key(
+            "resources.ordered", "cannot stand beside `any_of`", "keep one of them"
+        )
     entries = resources[lists[0]] if lists else [{}]
     path = f"resources.{lists[0]}" if lists else "resources"
     if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
-        raise SpecError(f"{path}: must be a list", "write `[{infra: local/us-west-1}]`")
+        raise SpecError.of_key(path, "must be a list", "write `[{infra: local/us-west-1}]`")
     for index, entry in enumerate(entries):
         where = f"{path}[{index}]"
         if not isinstance(entry, Mapping):
-            what = f"{where}: must be a map, not {shown(entry)}"
-            raise SpecError(what, "write `{infra: local/us-west-1}`")
+            what = f"must be a map, not {shown(entry)}"
+            raise SpecError.of_key(where, what, "write `{infra: local/us-west-1}`")
         _check_keys(where, entry, ())
     yield from each(resources)
 
@@ -72,7 +74,7 @@ def _check_keys(where: str, entry: Mapping[str, Any], more: Sequence[str]) -> No
     for key in entry:
         if key not in _KNOWN and key not in more and not str(key).startswith("_"):
             hint = nearest(str(key), (*_KNOWN, *more))
-            raise SpecError(f"{where}.{shown(key)[1:-1]}: unknown key", hint)
+            raise SpecError.of_key(f"{where}.{shown(key)[1:-1]}", "unknown key", hint)
 
 
 def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Zone]:
@@ -80,12 +82,14 @@ def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Z
     if infra is not None:
         parts = [part.strip() for part in str(infra).split("/")]
         if len(parts) > 3 or not all(parts):
-            what = f"{where}.infra: {shown(infra)} is not `cloud/region/zone`"
-            raise SpecError(what, "write a place such as `local/us-west-1`")
+            what = f"{shown(infra)} is not `cloud/region/zone`"
+            raise SpecError.of_key(
+                f"{where}.infra", what, "write a place such as `local/us-west-1`"
+            )
 
     def wrong(key: str, what: str, name: str, known: Iterable[str]) -> SpecError:
         key = key if infra is None else "infra"
-        return SpecError(f"{where}.{key}: {what} {shown(name)}", nearest(name, known))
+        return SpecError.of_key(f"{where}.{key}", f"{what} {shown(name)}", nearest(name, known))
 
     cloud, region, name = place(entry)
     if cloud not in ("", *CLOUDS):
@@ -105,8 +109,8 @@ def use_spot(where: str, entry: Mapping[str, Any]) -> bool:
     """Return whether an alternative asks for spot. Raises `SpecError` for what is neither."""
     spot = entry.get("use_spot")
     if spot is not None and not isinstance(spot, bool):
-        what = f"{where}.use_spot: must be true or false, not {shown(spot)}"
-        raise SpecError(what, "write `use_spot: true`")
+        what = f"must be true or false, not {shown(spot)}"
+        raise SpecError.of_key(f"{where}.use_spot", what, "write `use_spot: true`")
     return bool(spot)
 
 
@@ -115,9 +119,9 @@ def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: 
     named = entry.get("instance_type")
     names = [instance.name for instance in catalogue.instances]
     if named is not None and named not in names:
-        what = f"{where}.instance_type: the local cloud has no {shown(named)}"
-        hint = nearest(str(named), names)
-        raise SpecError(what, f"{hint}; or ask with `cpus: 4+` instead")
+        what = f"the local cloud has no {shown(named)}"
+        hint = f"{nearest(str(named), names)}; or ask with `cpus: 4+` instead"
+        raise SpecError.of_key(f"{where}.instance_type", what, hint)
     fitting = [i for i in catalogue.instances if named in (None, i.name)]
     for key in ("accelerators", "cpus", "memory"):
         if entry.get(key) is None:
@@ -125,8 +129,9 @@ def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: 
         kept = [i for i in fitting if suffices(where, key, entry[key], i)]
         if not kept:
             have = ", ".join(f"`{_amount_of(i, key)}`" for i in fitting)
-            raise SpecError(
-                f"{where}.{key}: the local cloud has no machine with {shown(entry[key])}",
+            raise SpecError.of_key(
+                f"{where}.{key}",
+                f"the local cloud has no machine with {shown(entry[key])}",
                 f"there are: {have}; `regions.yaml` can add others" if have else "",
             )
         fitting = kept
@@ -146,8 +151,10 @@ def suffices(where: str, key: str, wanted: Any, instance: Instance) -> bool:
         return has >= float(per_cpu[1]) * instance.cpus
     match = _AMOUNT.fullmatch(text)
     if isinstance(wanted, bool) or match is None or float(match[1]) <= 0:
-        what = f"{where}.{key}: {shown(wanted)} is not an amount"
-        raise SpecError(what, f"write `{key}: 8`, or `{key}: 8+` for at least 8")
+        what = f"{shown(wanted)} is not an amount"
+        raise SpecError.of_key(
+            f"{where}.{key}", what, f"write `{key}: 8`, or `{key}: 8+` for at least 8"
+        )
     return has >= float(match[1]) if match[2] else has == float(match[1])
 
 
@@ -160,8 +167,8 @@ def _devices(where: str, wanted: Any) -> Iterator[tuple[str, float]]:
     for item in items:
         match = _ACCELERATOR.fullmatch(str(item).strip())
         if match is None:
-            what = f"{where}.accelerators: {shown(item)} is not an accelerator"
-            raise SpecError(what, "write `accelerators: L4:1`")
+            what = f"{shown(item)} is not an accelerator"
+            raise SpecError.of_key(f"{where}.accelerators", what, "write `accelerators: L4:1`")
         yield match[1], float(match[2] or 1)
 
 

@@ -48,8 +48,9 @@ def write(
     """
     for key in ("secrets", "file_mounts"):
         if asked.get(key):
-            raise SpecError(
-                f"{key}: an image cannot be baked with it",
+            raise SpecError.of_key(
+                key,
+                "an image cannot be baked with it",
                 "put what `setup` needs of it into your own image, and bake on that: `--from`",
             )
     task.refuse_what_cannot_be_honoured(asked)

@@ -123,14 +123,15 @@ class Prices:
         try:
             sale = self.sky.offers(as_launched(resources))
         except RefusedError as error:
-            what = f"resources: SkyPilot refuses this section: {error.reason.words}"
-            raise SpecError(what) from error
+            what = f"SkyPilot refuses this section: {error.reason.words}"
+            raise SpecError.of_key("resources", what) from error
         left_out = {f"`{name}` is left out: {why}": None for name, why in sale.left_out.items()}
         within = self._within_quotas(sale, left_out)
         if not within:
             told = f" ({'; '.join(left_out)})" if left_out else ""
-            raise SpecError(
-                f"resources: no cloud you can use offers this{told}",
+            raise SpecError.of_key(
+                "resources",
+                f"no cloud you can use offers this{told}",
                 "relax the resources or name more clouds and regions; `sky check` lists the clouds "
                 "you can use",
             )

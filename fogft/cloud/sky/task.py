@@ -44,21 +44,22 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
     """Raise `SpecError` for a field of a pool file's task that a pool decides itself."""
     for key, reason in _REFUSED_TASK.items():
         if key in task and not (key == "num_nodes" and task[key] == 1):
-            raise SpecError(f"{key}: is not supported in a pool", reason)
+            raise SpecError.of_key(key, "is not supported in a pool", reason)
     for target in task.get("file_mounts") or {}:
         if os.path.normpath(str(target)).startswith(OURS):
-            raise SpecError(f"file_mounts.{target}: `{OURS}` is fogft's own folder")
+            raise SpecError.of_key(f"file_mounts.{target}", f"`{OURS}` is fogft's own folder")
     for where, entry in alternatives(task.get("resources") or {}):
         for key, reason in _REFUSED_RESOURCES.items():
             if entry.get(key, []) != []:
-                raise SpecError(f"{where}.{key}: is not supported in a pool", reason)
+                raise SpecError.of_key(f"{where}.{key}", "is not supported in a pool", reason)
         for label in entry.get("labels") or {}:
             if str(label).startswith(naming.PREFIX):
-                raise SpecError(f"{where}.labels.{label}: this prefix is fogft's own")
+                raise SpecError.of_key(f"{where}.labels.{label}", "this prefix is fogft's own")
         cloud = place(entry)[0]
         if cloud in NO_VM_CLOUDS:
-            raise SpecError(
-                f"{where}: `{cloud}` offers no VMs",
+            raise SpecError.of_key(
+                where,
+                f"`{cloud}` offers no VMs",
                 "name clouds that sell VMs, such as `infra: aws/us-west-2`",
             )
 

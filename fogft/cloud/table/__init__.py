@@ -67,8 +67,9 @@ class PriceTable:
                 )
                 best[place, spot] = min(known or offer, offer, key=_order)
         if not best:
-            raise SpecError(
-                f"resources: nothing in `{self._file}` matches them",
+            raise SpecError.of_key(
+                "resources",
+                f"nothing in `{self._file}` matches them",
                 "relax the resources, or name places in the table",
             )
         return sorted(best.values(), key=_order)

@@ -27,7 +27,6 @@ from fogft.pool.commands.sweep import left_of
 from fogft.pool.folder.store import PoolStore, digest
 from fogft.pool.manager import offers
 from fogft.poolfile import file as pool_file
-from fogft.poolfile import named_clouds
 from fogft.poolfile.changes import changes, replaces_replicas
 from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import clouds_named, located
@@ -202,6 +201,5 @@ def mistakes(file: Path) -> list[SpecError]:
         if cloud_named_by(spec, source, file) == LOCAL:
             make_cloud(LOCAL, file.resolve().parent).offers(spec.task.get("resources") or {})
     except SpecError as error:
-        is_located = error.message.startswith(f"{file}:")
-        return [error if is_located else named_clouds.located(error, source, file)]
+        return [error if error.line else located(error, source, file)]
     return []

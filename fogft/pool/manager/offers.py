@@ -32,7 +32,8 @@ def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
         try:
             sold = cloud.offers({**resources, "ports": []} if spec.dial_in else resources)
         except SpecError as error:
-            raise SpecError(places.get(name, "") + error.message, error.hint) from error
+            key = places.get(name, "") + error.key
+            raise SpecError.of_key(key, error.what, error.hint) from error
         found += [
             _priced(offer if offer.group == name else replace(offer, group=name), spec)
             for offer in sold
