@@ -1,17 +1,25 @@
-"""The commands of docs/tutorial/first-pool.md, typed one after the other as the page has them."""
+"""A pool from `init` to `down`: docs/tutorial/first-pool.md as typed, and what comes later."""
 
 from __future__ import annotations
 
+import json
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fogft.cloud.local import processes
 from tests.docs.documents import ROOT, console_commands
 from tests.e2e.pool import Pool
 
-pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(500)]
+
+Run = Callable[[str], subprocess.CompletedProcess[str]]
 
 
 def commands_by_hand() -> list[str]:
@@ -19,35 +27,100 @@ def commands_by_hand() -> list[str]:
     return console_commands(page.partition("\n## Start the pool\n")[2])
 
 
-def test_the_quick_start_works_as_it_is_written(tmp_path, ros_domain):
-    """Each command ends well, and the last one leaves no process."""
-    pool = Pool(tmp_path, ros_domain)
-    programs = tmp_path / "bin"
+@pytest.fixture
+def pool(tmp_path: Path, ros_domain: int):
+    made = Pool(tmp_path, ros_domain)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def run(pool: Pool) -> Run:
+    """Return a function that runs a line as a shell does in which fogft is installed."""
+    programs = pool.folder / "bin"
     programs.mkdir()
     for name, words in (("fogft", "-m fogft"), ("python", ""), ("python3", "")):
         (programs / name).write_text(f'#!/bin/sh\nexec {sys.executable} {words} "$@"\n')
         (programs / name).chmod(0o755)
-    environ = {
-        **pool.environ,
+    pool.environ |= {
         "PATH": f"{programs}:{os.environ['PATH']}",
         "PYTHONPATH": str(ROOT),
-        "ROS_LOG_DIR": str(tmp_path / "ros-log"),
+        "ROS_LOG_DIR": str(pool.folder / "ros-log"),
     }
-    commands = commands_by_hand()
-    assert commands[0].startswith("fogft init")
-    assert commands[-1] == "fogft down"
-    try:
-        for command in commands:
-            done = subprocess.run(
-                ["bash", "-c", command],
-                env=environ,
-                cwd=tmp_path,
-                capture_output=True,
-                text=True,
-                timeout=120,
-                check=False,
-            )
-            assert done.returncode == 0, f"$ {command}\n{done.stdout}\n{done.stderr}"
-        assert pool.left() == {}
-    finally:
-        pool.close()
+
+    def line(command: str) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run(
+            ["bash", "-c", command], env=pool.environ, cwd=pool.folder, capture_output=True,
+            text=True, timeout=120, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, f"$ {command}\n{done.stdout}\n{done.stderr}"
+        return done
+
+    return line
+
+
+def ready(status: dict[str, Any]) -> dict[int, int]:
+    return {r["slot"]: r["generation"] for r in status["replicas"] if r["phase"] == "ready"}
+
+
+def test_the_quick_start_works_as_it_is_written(pool: Pool, run: Run):
+    """Each command ends well, and the last one leaves no process.
+
+    Before the last, the pool is left without a manager, and is asked about, and gets one again.
+    """
+    init, up, *commands, down = commands_by_hand()
+    assert (init.split()[:2], up.split()[:2]) == (["fogft", "init"], ["fogft", "up"])
+    assert down == "fogft down"
+    file = run(init).stdout.splitlines()[0]
+    assert up.endswith(file)
+    said = run(up)
+    assert said.stdout == ""
+    assert said.stderr.splitlines()[-1].startswith("done: `planner` answers, with ")
+    assert Path(pool.environ["FOGFT_HOME"]).stat().st_mode & 0o077 == 0
+
+    def seen(good: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Return the first status that is good."""
+        return pool.wait(lambda: (status := pool.status()) and good(status) and status, 200)
+
+    for command in commands:
+        run(command)
+        if command == "fogft chaos kill 0":
+            seen(lambda s: ready(s).get(0, 0) > 1)  # as the page says, soon
+    status = seen(lambda s: len(s["replicas"]) == len(ready(s)) == 2)
+    assert status["manager_alive"]
+    seen(lambda s: s["services"][0]["ready_replicas"] == 2)
+    uid = status["uid"]
+    assert json.loads(run("fogft status --json").stdout)["uid"] == uid
+    slot = min(ready(status))
+    run(f"fogft chaos freeze {slot}")
+    seen(lambda s: any(r["link"] == "suspect" for r in s["replicas"]))
+    run(f"fogft chaos thaw {slot}")
+    run("fogft scale down 1")
+    seen(lambda s: len(s["replicas"]) == 1 and s["target"] == 1)
+
+    os.kill(status["manager_pid"], signal.SIGKILL)
+    again = seen(lambda s: s["manager_alive"] and s["epoch"] > status["epoch"])
+    os.kill(again["manager_pid"], signal.SIGTERM)
+    seen(lambda s: not s["manager_alive"])
+    asked = run("fogft status --refresh")
+    assert "no manager is running" in asked.stderr
+    assert "1 of 1 ready" in asked.stdout
+    assert "the pool had no manager" in run(up).stderr
+    renewed = json.loads(run("fogft status --refresh --json").stdout)
+    assert renewed["manager_alive"]
+    assert renewed["epoch"] > again["epoch"]
+
+    logs = run("fogft logs -n 1000").stdout
+    assert {line.split()[0] for line in logs.splitlines()} >= {"manager", "proxy", "0.1", "0.2"}
+    assert "replica_ready" in logs
+    doctor = json.loads(run(f"fogft doctor {file} --json").stdout)
+    assert not [finding for finding in doctor if finding["verdict"] == "fail"]
+
+    ended = run(down).stderr
+    assert "ended manager (pid " in ended
+    assert "ended client proxy (pid " in ended
+    assert ended.splitlines()[-1] == "done: `planner` is shut down; nothing is left"
+    assert processes.find(pool_uid=uid) == []
+    assert pool.left() == {}
+    assert list(Path(pool.environ["FOGFT_HOME"], "pools").iterdir()) == []
+    assert run(down).stderr == "no pools on this machine\n"
