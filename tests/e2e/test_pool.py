@@ -9,9 +9,12 @@ import time
 
 import pytest
 
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager.process_control import lock_holder
+from tests.e2e.pool import Pool
 from tests.nightly import by_day
 
-pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
 
 
 def flawless(result: dict) -> bool:
@@ -53,7 +56,7 @@ def test_a_slow_service_is_never_taken_for_a_dead_one_and_replicas_without_a_man
     Whatever became of the manager, nothing runs and costs for ever.
     """
     pool.write(
-        replicas=2,
+        replicas=1,
         work_s=3.0,
         more="  health: {suspect_after_s: 0.5, replace_after_s: 1.0}\n"
         "  unmanaged_max_hours: 0.006\n",
@@ -72,6 +75,8 @@ def test_a_slow_service_is_never_taken_for_a_dead_one_and_replicas_without_a_man
 
 def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     """Scaled up; one gets a notice; its manager dies and the next one adopts it; scaled down.
+
+    Then all of the robot's side hangs, and dies; `status` and `doctor` say what is so.
 
     A command that waits returns when what it asked for is done.
     At a notice the successor is launched and serves long before the machine's 60 s are over.
@@ -107,9 +112,52 @@ def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     assert [r["phase"] for r in pool.status()["replicas"]] == ["ready"]
     assert flawless(client.finish())
 
-    status = pool.status()
-    for pid in (status["manager_pid"], status["proxy_pid"]):
+    status_says_what_is_true_now(pool)
+    manager, proxy, _ = robot_side(pool)  # the next one is in line
+    for pid in (manager, proxy):
         os.kill(pid, signal.SIGKILL)
     pool.fogft("down")
     assert pool.left() == {}
     pool.fogft("down", ok=False)
+
+
+def status_says_what_is_true_now(pool: Pool) -> None:
+    """Of a robot's side that hangs nothing is claimed; of a dead one, that nothing is answered."""
+    assert answers(pool)
+    all_of_it = robot_side(pool)
+    for pid in all_of_it:
+        os.kill(pid, signal.SIGSTOP)
+    pool.wait(lambda: pool.status()["answers"] is None)
+    assert pool.status()["ready"] == 0
+    assert not answers(pool)
+    assert "answering?" in pool.fogft("status")
+    for pid in all_of_it:
+        os.kill(pid, signal.SIGCONT)
+    pool.wait(lambda: answers(pool))
+
+    all_of_it = robot_side(pool)
+    for number in (signal.SIGSTOP, signal.SIGKILL):  # none of them has the time to start another
+        for pid in all_of_it:
+            os.kill(pid, number)
+    assert not answers(pool)
+    seen = pool.status()
+    assert (seen["answers"], seen["ready"], seen["proxy_alive"]) == (False, 0, False)
+    assert not any(one["link"] for one in seen["replicas"])
+    assert "no request is answered" in pool.fogft("doctor", ok=False)
+    pool.fogft("up", str(pool.file), "--yes")  # what doctor says to do
+    pool.wait(lambda: answers(pool))
+
+
+def robot_side(pool: Pool) -> list[int]:
+    """Return the processes of the robot's side: the manager, the client proxy, and its standby."""
+    [folder] = (pool.folder / "home" / "pools").iterdir()
+    paths = PoolPaths(folder)
+    standby = pool.wait(lambda: lock_holder(paths.standby_lock))
+    manager, proxy = lock_holder(paths.manager_lock), pool.status()["proxy_pid"]
+    assert manager is not None
+    return [manager, proxy, standby]
+
+
+def answers(pool: Pool) -> bool:
+    """Return what `fogft status --check` exits by."""
+    return pool.start("status", "--check").wait(120) == 0
