@@ -54,7 +54,7 @@ def test_a_version_that_crashes_is_rolled_back_and_the_next_one_taken_with_an_up
     assert "`run` exited " in said
     status = pool.wait(lambda: rolled_back(pool))
     assert "`run` exited " in status["update"]["fault"]
-    assert pool.ready() == 2
+    pool.wait(lambda: pool.ready() == 2)
     assert replicas(pool) == old, "the good ones were never touched"
     log = (pool.folder / "home" / "pools" / "e2e" / "manager.log").read_text()
     assert "update_stopped" in log
