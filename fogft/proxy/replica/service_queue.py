@@ -128,25 +128,23 @@ class ServiceQueue:
         What it returns may be past its deadline, or about to be while others wait that are not:
         then it was not begun and takes no room.
         """
-        beyond = not self._has_room
-        if beyond and not self._may_go_ahead:
+        job = self._waiting.next
+        if job is None or (job.alone and self.at_work):  # when the service has nothing else
             return None
-        job = self._waiting.take()
-        if job is not None and ((job.alone and self.at_work) or (job.spare and beyond)):
-            self.put(job)  # when the service has nothing else
+        if not self._has_room and not self._may_go_ahead(job, now):
             return None
-        takes_s = self.limit.takes_s
-        needs_s = takes_s if self._waiting else 0.0
-        if beyond:  # and what is at work is to end before
-            needs_s += max(0.0, takes_s - (now - self._begun_last))
-        if job is not None and job.deadline > now + needs_s:
+        self._waiting.take()
+        if job.deadline > now + (self.limit.takes_s if self._waiting else 0.0):
             self.begin(job, now)
         return job
 
-    @property
-    def _may_go_ahead(self) -> bool:
-        quick = self.limit.learned and self.limit.takes_s < _AHEAD_BELOW_S
-        return quick and self.at_work == self.limit.limit and not self._alone
+    def _may_go_ahead(self, job: Job, now: float) -> bool:
+        """Whether one is passed on beyond the limit: in time for it, too, to be done."""
+        takes_s = self.limit.takes_s
+        quick = self.limit.learned and takes_s < _AHEAD_BELOW_S
+        if not quick or self._alone or self.at_work != self.limit.limit:
+            return False
+        return not job.spare and job.deadline > now + 2 * takes_s
 
     def begin(self, job: Job, now: float) -> None:
         """Job is passed on."""
