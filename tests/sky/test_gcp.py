@@ -99,7 +99,7 @@ def compute(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Compute, Gcp]]:
         do_DELETE = do_GET  # noqa: N815
 
     session = importlib.import_module("requests").Session()  # as google-auth's is one
-    monkeypatch.setattr(gcp, "_signed_in", lambda: (session, PROJECT))
+    monkeypatch.setattr(gcp, "signed_in", lambda: (session, PROJECT))
     with ThreadingHTTPServer(("127.0.0.1", 0), Answers) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield project, Gcp(f"http://127.0.0.1:{server.server_port}/compute/v1/projects")

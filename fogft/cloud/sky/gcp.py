@@ -86,11 +86,11 @@ class Gcp(Provider):
     def _session(self) -> tuple[Any, str]:
         with self._lock:
             if self._known is None:
-                self._known = _signed_in()
+                self._known = signed_in()
             return self._known
 
 
-def _signed_in() -> tuple[Any, str]:
+def signed_in() -> tuple[Any, str]:
     """Return a session with this computer's credentials, and the project that SkyPilot uses."""
     try:
         auth = importlib.import_module("google.auth")
