@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from fogft.cloud.sky import naming
-from fogft.cloud.sky.failures import classify
+from fogft.cloud.sky.failures import classify, plain
 from fogft.cloud.sky.provider import Instance, NotAllowedError
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.reason import Cause
@@ -222,8 +222,7 @@ class Aws:
             told = getattr(error, "response", None) or {}
             code = str(told.get("Error", {}).get("Code", "")) or type(error).__name__
             if code in _FORBIDDEN or code == "NoCredentialsError":
-                words = str(error).partition(" Encoded authorization failure message:")[0]
-                raise NotAllowedError(f"{code}: {words}") from error
+                raise NotAllowedError(f"{code}: {plain(str(error))}") from error
             hint = ""
             if classify(code, [str(error)]).cause is Cause.CREDENTIALS:
                 with self._lock:  # renewed ones are read by a new session only

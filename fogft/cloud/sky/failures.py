@@ -66,14 +66,15 @@ def told_last(log: str) -> Reason | None:
 
 
 _NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # who asked may have a long name
+_FOR_AWS = "Encoded authorization failure message"  # a thousand characters
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")
 _DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # what SkyPilot says of its own doing
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
 def plain(text: str) -> str:
-    """Return a text of SkyPilot's without colours and line breaks."""
-    return " ".join(_COLOUR.sub("", text).split())
+    """Return a text of SkyPilot's without colours, line breaks and what only AWS can read."""
+    return " ".join(_COLOUR.sub("", text).partition(_FOR_AWS)[0].split())
 
 
 def tail(log: str, lines: int = 20, width: int = 200) -> str:
@@ -85,7 +86,6 @@ def tail(log: str, lines: int = 20, width: int = 200) -> str:
 
 def _short(text: str, pattern: str, room: int = 300) -> str:
     """Return the part of a text around what matched, and of a refusal what was not allowed."""
-    text = text.partition(" Encoded authorization failure message")[0]  # only AWS can read it
     found = _NOT_ALLOWED.search(text) or re.search(pattern, text) if pattern else None
     start = max(0, found.start() - 80) if found and len(text) > room else 0
     return ("... " if start else "") + text[start : start + room]
