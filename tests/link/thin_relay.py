@@ -59,19 +59,23 @@ class ThinRelay:
                 near, _ = self._server.accept()
             except OSError:
                 return  # closed
-            far = socket.socket()
-            far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-            try:
-                far.connect(self._target)
-            except OSError:  # nobody listens there, now
-                near.close()
-                far.close()
-                continue
-            for end in (near, far):
-                end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
-            self._ends += [near, far]
-            for source, sink, way in ((near, far, "up"), (far, near, "down")):
-                threading.Thread(target=self._pass, args=(source, sink, way), daemon=True).start()
+            # Nobody waits behind one whose packets the target drops.
+            threading.Thread(target=self._join, args=(near,), daemon=True).start()
+
+    def _join(self, near: socket.socket) -> None:
+        far = socket.socket()
+        far.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        try:
+            far.connect(self._target)
+        except OSError:  # nobody listens there, now
+            near.close()
+            far.close()
+            return
+        for end in (near, far):
+            end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER_BYTES)
+        self._ends += [near, far]
+        for source, sink, way in ((near, far, "up"), (far, near, "down")):
+            threading.Thread(target=self._pass, args=(source, sink, way), daemon=True).start()
 
     def _pass(self, source: socket.socket, sink: socket.socket, way: str) -> None:
         with contextlib.suppress(OSError):
