@@ -190,7 +190,6 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.OTHER_KIND: "no machine of this kind is needed",
     Cause.OTHER_MARKET: _other_market,
     Cause.WORSE_SCORE: _worse_score,
-    Cause.LOST_THERE: ("avoided for {minutes:.0f} min more after a replica was lost there"),
     Cause.CROWDED: ("spread: `{r.location}` already has {r.count} when slot {r.slot} is placed"),
     Cause.NEVER_READY: _never_ready,
     Cause.LAUNCH_LIMIT: (
@@ -200,6 +199,10 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.TARGET_UNMET: (
         "`availability: {r.target:g}` cannot be met: {r.count} replicas are expected "
         "to reach {r.share:.6g}, and {main}"
+    ),
+    Cause.FULL_TOGETHER: (
+        "no location has room for spot machines in {r.share:.2%} of the time: on-demand "
+        "machines in their place (`fallback: true`) bridge that"
     ),
     Cause.MOST_REPLICAS: "{r.count} is the maximum",
     Cause.OVER_CAP: _over_cap,

@@ -47,10 +47,6 @@ def test_every_cause_has_words(cause: Cause) -> None:
             ),
             "every location is backing off after failures (`aws/us-west-2/a`: quota)",
         ),
-        (
-            Reason(Cause.LOST_THERE, seconds=240.0),
-            "avoided for 4 min more after a replica was lost there",
-        ),
         (Reason(Cause.RUN_ENDS, count=4, words="exit 1"), "`run` exited 4 times (exit 1)"),
         (Reason(Cause.ENDS_SOON, seconds=300.0), "the pool shuts down in 5 min (`max_hours`)"),
         (

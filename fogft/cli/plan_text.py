@@ -188,6 +188,10 @@ def _verdict(shown: PlanShown) -> list[str]:
         return []
     target = plan.expected.correlated if plan.target is None else plan.target
     asked = f"for {100 * target:.6g} %"
+    reached, usd = plan.with_fallback or (0.0, 0.0)
+    single = plan.single[1].usd_per_hour
+    if not plan.is_cheapest and reached >= target and usd < single:
+        return [f"cheapest      {asked}: with `fogft.on_demand.fallback: true`, some ${usd:.3f}/h"]
     if plan.is_cheapest is None:
         return [f"cheapest      {asked}: neither this pool nor one on-demand machine is enough"]
     if plan.is_cheapest:
@@ -203,7 +207,8 @@ def _availability(shown: PlanShown) -> list[str]:
         f"availability  {least.correlated:.6f} expected{target} "
         f"({least.independent:.6f} if replicas failed independently)",
         f"  assuming spot up {assumed.spot_uptime_s / 3600:.3g} h, on demand "
-        f"{assumed.on_demand_uptime_s / 3600:.4g} h, away {assumed.recovery_s / 60:.3g} min; "
+        f"{assumed.on_demand_uptime_s / 3600:.4g} h, away {assumed.recovery_s / 60:.3g} min, "
+        f"a location full {100 * assumed.no_room:.3g} % of the time; "
         f"correlation {levels.zone:g} in a zone, {levels.region:g} in a region, "
         f"{levels.cloud:g} in a cloud",
     ]

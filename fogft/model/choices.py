@@ -122,6 +122,12 @@ class Assumption:
         "Time from gone to ready elsewhere; FogROS2-FT's 20 min.",
         default=1200.0,
     )
+    no_room: float = key(
+        Number(1.0, "one", from_zero=True),
+        "Fraction of time that a location has no room for a spot machine; while none has, spot "
+        "replicas that were lost stay away.",
+        default=0.0625,
+    )
     correlation: Correlation = field(default_factory=Correlation)
 
 

@@ -75,7 +75,6 @@ class Cause(str, Enum):
     OLD_BEFORE_NEW = "old_before_new"
     OTHER_KIND = "other_kind"
     OTHER_MARKET = "other_market"
-    LOST_THERE = "lost_there"
     CROWDED = "crowded"
     WORSE_SCORE = "worse_score"
     CHOSEN = "chosen"  # of a worse score: what was chosen in its place
@@ -86,6 +85,7 @@ class Cause(str, Enum):
     # How many are wanted.
     SCHEDULED_AHEAD = "scheduled_ahead"
     TARGET_UNMET = "target_unmet"
+    FULL_TOGETHER = "full_together"
     MOST_REPLICAS = "most_replicas"
     OVER_CAP = "over_cap"
 

@@ -13,6 +13,9 @@ So each replica is down exactly as often as alone, and two equal ones of one zon
 together with correlation `Correlation.zone`, two of one region `region`, two of one cloud
 `cloud`. Different clouds are independent.
 
+A replica that was lost comes back elsewhere, while some location has room. None has for as long as
+all are full together, by the same model of locations. In that time spot machines are down.
+
 Owns: the arithmetic for unequal and correlated replicas.
 Not here: one replica's figure and the plain product (`reliability`), how many are
 launched (`sizing`).
@@ -23,7 +26,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 from fogft.model.choices import Assumption, Correlation
@@ -50,11 +53,44 @@ class Expected:
     independent: float
 
 
-def expected(placements: Sequence[Placement], assumed: Assumption) -> Expected:
-    """Return how available a pool with replicas in these places is. Of none: never."""
+def expected(
+    placements: Sequence[Placement], assumed: Assumption, sold: Collection[Placement] = ()
+) -> Expected:
+    """Return how available a pool with replicas in these places is. Of none: never.
+
+    Args:
+        placements: A replica each.
+        assumed: Of machines and locations.
+        sold: The locations of spot machines, where nothing else replaces them; none: there is
+            always something that does.
+    """
     down = [unavailability_of(assumed, spot=place.spot) for place in placements]
-    together = joint_unavailability(zip(placements, down, strict=True), assumed.correlation)
+    each = list(zip(placements, down, strict=True))
+    together = joint_unavailability(each, assumed.correlation)
+    full = full_together(sold, assumed)
+    if full:
+        stay = [(place, share) for place, share in each if not place.spot]
+        without = joint_unavailability(stay, assumed.correlation)
+        together = full * without + (1 - full) * together
     return Expected(1.0 - together, 1.0 - system_unavailability(down))
+
+
+def full_together(sold: Collection[Placement], assumed: Assumption) -> float:
+    """Return the fraction of time in which no location has room, or had none a recovery ago.
+
+    Locations that are full together for a share f of the time are like log(f) / log(`no_room`)
+    that are full independently: so often does one of them end it.
+
+    Args:
+        sold: The locations; where there are none, 0.
+        assumed: Of locations, and of spot machines, which are up while theirs has room.
+    """
+    share = assumed.no_room
+    full = joint_unavailability([(place, share) for place in sold], assumed.correlation)
+    if not sold or not 0 < share < 1 or not full:
+        return full if sold else 0.0
+    lasts_s = assumed.spot_uptime_s * share / (1 - share) * math.log(share) / math.log(full)
+    return min(1.0, full * (1 + assumed.recovery_s / lasts_s))
 
 
 def joint_unavailability(

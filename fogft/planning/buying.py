@@ -29,9 +29,9 @@ from fogft.planning.needs import Need
 from fogft.planning.observed.backoff import (
     EVERYWHERE,
     Backoff,
-    avoided,
     backing_off,
     backing_off_longest,
+    lost_lately,
     recently_failed,
 )
 from fogft.planning.observed.hazard import UNKNOWN, hazards, penalty
@@ -96,9 +96,9 @@ class Buyer:
     def _backing_off(self) -> Mapping[str, Backoff]:
         return backing_off(self.history, self.observed.now)
 
-    @property
-    def _avoided(self) -> Mapping[str, float]:
-        return avoided(self.history, self.observed.now)
+    @cached_property
+    def _lost_lately(self) -> Collection[str]:
+        return lost_lately(self.history, self.observed.now)
 
     @property
     def budget(self) -> float | None:
@@ -168,7 +168,7 @@ class Buyer:
         return Market(
             self._listing(group, spot),
             backing_off=backing_off,
-            avoid=(*self._avoided, *(s.placement.location for s in self.machines.lost)),
+            avoid=[*self._lost_lately, *(s.placement.location for s in self.machines.lost)],
             full=full,
             hazards=self.hazards,
         )
@@ -204,7 +204,7 @@ class Buyer:
         return found
 
     def whole_market(self, group: Group, spot: bool | None) -> Market:
-        """Return what is sold to a group where nothing backs off or is avoided."""
+        """Return what is sold to a group where nothing backs off."""
         key = (group.name, spot)
         if key not in self._whole:
             self._whole[key] = Market(self._listing(group, spot), hazards=self.hazards)

@@ -21,18 +21,19 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
-from fogft.planning.availability import Expected, expected, unavailability_of
+from fogft.planning.availability import Expected, expected, full_together, unavailability_of
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
 from fogft.planning.listing import is_possible
-from fogft.planning.observed.backoff import AVOID_MEMORY_S, EVERYWHERE, avoided, backing_off
+from fogft.planning.observed.backoff import EVERYWHERE, backing_off
 from fogft.planning.observed.hazard import UNKNOWN, hazards
 from fogft.planning.observed.history import History
 from fogft.planning.placement import crowding
 from fogft.planning.planner import plan
-from fogft.planning.sizing import size
+from fogft.planning.sizing import size, spot_sold
 
 NO_POOL = "0" * 16
+LATELY_S = 4 * 3600.0
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,8 @@ class Explanation:
         single: The cheapest on-demand machine that would do alone, and its cost; None where
             no price is known.
         notes: What may surprise.
+        with_fallback: That a request can be answered, and US dollars per hour, did on-demand
+            machines stand in; None where they do, or cannot.
     """
 
     considered: tuple[Considered, ...]
@@ -92,6 +95,7 @@ class Explanation:
     cost: Cost
     single: tuple[Offer, Cost] | None
     notes: tuple[Reason, ...]
+    with_fallback: tuple[float, float] | None = None
 
     @property
     def is_cheapest(self) -> bool | None:
@@ -151,6 +155,9 @@ def explain(
     assumed: Assumption = spec.availability or Assumption()
     if recovery_s is not None and assumed.recovery_s == Assumption().recovery_s:
         assumed = replace(assumed, recovery_s=recovery_s)
+    places = [launch.offer.placement for launch in planned.launches]
+    sold = spot_sold(spec, intent, world)
+    full = full_together(sold, assumed)
     cheapest = min(
         (o for o in on_demand if is_possible(o)),
         key=lambda o: (o.usd_per_hour, o.placement),
@@ -170,12 +177,29 @@ def explain(
         wanted=planned.wanted,
         cap=sized.max_usd_per_hour,
         assumed=assumed,
-        expected=expected([launch.offer.placement for launch in planned.launches], assumed),
+        expected=expected(places, assumed, sold),
+        with_fallback=_with_fallback(planned.launches, assumed, full, cheapest) if full else None,
         target=spec.availability.target if spec.availability else None,
         cost=cost([launch.offer for launch in planned.launches], spec.services),
         single=None if cheapest is None else (cheapest, cost([cheapest], spec.services)),
         notes=planned.notes,
     )
+
+
+def _with_fallback(
+    launches: Sequence[PlannedLaunch], assumed: Assumption, full: float, on_demand: Offer | None
+) -> tuple[float, float] | None:
+    """Return what stand-ins would give and cost: each runs while its spot machine is away."""
+    if on_demand is None:
+        return None
+    away = 1.0 - (1.0 - full) * (1.0 - unavailability_of(assumed, spot=True))
+    usd = sum(
+        offer.usd_per_hour * (1.0 - away) + on_demand.usd_per_hour * away
+        if offer.placement.spot
+        else offer.usd_per_hour
+        for offer in (launch.offer for launch in launches)
+    )
+    return expected([launch.offer.placement for launch in launches], assumed).correlated, usd
 
 
 class _Reasons:
@@ -196,7 +220,6 @@ class _Reasons:
         self._intent = intent
         self._losses: Mapping[str, list[float]] = history.losses
         self._backing_off = backing_off(history, observed.now)
-        self._avoided = avoided(history, observed.now)
         self._hazards = hazards(history, observed.now)
         self._scale = scale
         self._picks: dict[str, list[_Pick]] = {}
@@ -215,7 +238,7 @@ class _Reasons:
         """Return an offer with what became of it."""
         slots = tuple(self._slots.get(offer, ()))
         location = offer.placement.location
-        recent = [t for t in self._losses.get(location, ()) if 0 <= self._now - t < AVOID_MEMORY_S]
+        recent = [t for t in self._losses.get(location, ()) if 0 <= self._now - t < LATELY_S]
         why = None if slots else self._why_not(offer)
         rtt_s = self._scale.latency(offer.placement)
         rate = self._hazards.get(location, UNKNOWN) if offer.placement.spot else None
@@ -248,14 +271,11 @@ class _Reasons:
             left = max(0.0, pick.budget)
             return 1, Reason(Cause.OVER_BUDGET, slot=slot, limit_usd_per_hour=left)
         ours, theirs = self._rank(offer, pick), self._rank(chosen, pick)
-        if ours[0] > theirs[0]:
-            left_s = self._avoided[offer.placement.location] - self._now
-            return 2, Reason(Cause.LOST_THERE, seconds=left_s)
-        for level, domain in enumerate(offer.placement.domains, 1):
+        for level, domain in enumerate(offer.placement.domains):
             if ours[level] > theirs[level]:
                 count = pick.count[domain]
                 crowded = Reason(Cause.CROWDED, slot=slot, location=domain, count=count)
-                return 2 + level, crowded
+                return 3 + level, crowded
         return 6, replace(
             self._score(Cause.WORSE_SCORE, offer),
             slot=slot,
@@ -263,11 +283,7 @@ class _Reasons:
         )
 
     def _rank(self, offer: Offer, pick: _Pick) -> tuple[int, ...]:
-        place = offer.placement
-        return (
-            int(place.location in self._avoided),
-            *(pick.count.get(domain, 0) for domain in place.domains),
-        )
+        return tuple(pick.count.get(domain, 0) for domain in offer.placement.domains)
 
     def _score(self, cause: Cause, offer: Offer) -> Reason:
         return Reason(

@@ -6,10 +6,10 @@ A replica moves when
 * it is on demand and should be spot, or the other way round; or
 * its new place would leave the pool better spread over clouds, regions or zones, where they are
   not lost `TOO_OFTEN`; or
-* the spread stays as it is, and its score falls by `gain`, or at all where far fewer are lost.
+* the spread stays as it is, and its score falls by `gain`.
 
-It has then been ready for `stay_s`, and the new place neither backs off nor is avoided, nor has it
-refused within an hour. To move back, they must swing by twice as much: so while prices
+It has then been ready for `stay_s`, and the new place neither backs off nor has it refused within
+an hour. To move back, they must swing by twice as much: so while prices
 waver within it nobody returns to where he was, and with steady offers every move lowers the
 crowding or the sum of the scores, so that moves come to an end.
 
@@ -31,8 +31,6 @@ from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment, Health
 from fogft.planning.placement import Choice, Crowd, crowding
 
-# Far fewer losses: this part of them.
-CALMER = 0.6
 # Losses an hour with which no better spread is worth a move: lower, and outages of a region count.
 TOO_OFTEN = 1.0
 
@@ -60,7 +58,7 @@ class Move:
 
 
 def restless(buyer: Buyer) -> frozenset[ReplicaId]:
-    """Return who would move if no location backed off or were avoided, and all had stayed.
+    """Return who would move if no location backed off, and all had stayed.
 
     Nobody else moves before something happens, however long that takes: what a location that
     backs off no longer sells has been in question already. Neither time nor events come into it, so
@@ -145,8 +143,7 @@ def _is_better(
         buyer.score(placement, buyer.price(replica)),
         buyer.score(offer.placement, offer.usd_per_hour),
     )
-    is_calmer = better > 0 and (at_most or losses_there <= CALMER * losses)
-    if there == here and (better >= rules.gain or is_calmer):
+    if there == here and better >= rules.gain:
         why = Reason(Cause.BETTER_SCORE, location=offer.placement.location, share=better)
         return Move(replica, why, (1.0, -better))
     return None

@@ -20,11 +20,11 @@ from fogft.model.choices import MAX_REPLICAS
 from fogft.model.groups import Group, groups_of, shares
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
-from fogft.model.replica import Observed, Offer
+from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.schedule import Wish, wish
 from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
-from fogft.planning.availability import expected, unavailability_of
+from fogft.planning.availability import expected, full_together, unavailability_of
 from fogft.planning.listing import catalogue
 from fogft.planning.placement import Market
 from fogft.planning.reliability import replicas_needed
@@ -80,6 +80,21 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
         total, unmet = _for_target(spec, intent, observed, now.max_usd_per_hour, running)
         notes += because(unmet)
     return Size(groups, shares(groups, total), now.max_usd_per_hour, tuple(notes))
+
+
+def spot_sold(spec: PoolSpec, intent: Intent, observed: Observed) -> list[Placement]:
+    """Return a placement of each location that sells spot machines, where nothing stands in."""
+    groups = groups_of(spec)
+    if any(group.on_demand.fallback for group in groups):
+        return []
+    scale = Scale(spec.placement.latency_weight, observed.rtt_s)
+    sold = catalogue(observed.offers)
+    rows = (
+        row
+        for group in groups
+        for row in sold.listing(group.name, True, intent.excluded, scale).rows
+    )
+    return list({row.location: row.offer.placement for row in rows}.values())
 
 
 def layout(
@@ -156,8 +171,9 @@ def _for_target(
     markets = Markets(observed.offers, scale, intent.excluded)
     laid = [o.placement for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
     down: list[float] = []
+    sold = spot_sold(spec, intent, observed)
     for count in range(1, len(laid) + 1):
-        down.append(1.0 - expected(laid[:count], asked).correlated)
+        down.append(1.0 - expected(laid[:count], asked, sold).correlated)
         if down[-1] <= 1.0 - asked.target + 1e-12 and count >= spec.replicas:
             return count, None
     enough = next((n for n, share in enumerate(down, 1) if share <= MUCH_THE_SAME * down[-1]), 0)
@@ -165,6 +181,9 @@ def _for_target(
     count = max(1, spec.replicas, enough, min(running, len(laid)))
     most = Reason(Cause.MOST_REPLICAS, count=MAX_REPLICAS)
     why = Reason(Cause.OVER_CAP) if len(laid) < MAX_REPLICAS else most
+    full = full_together(sold, asked)
+    if full > 1.0 - asked.target:
+        why = Reason(Cause.FULL_TOGETHER, share=full)
     note = Reason(
         Cause.TARGET_UNMET,
         count=enough,

@@ -76,6 +76,10 @@ def simulate(
         told_by_traces = sorted(set(values) & set(MARKET_KEYS))
         if fit:
             market = fitting.fit(lines)
+            notes.append(
+                f"under `availability` write `spot_uptime_s: {market.mttf_s:.0f}` and "
+                f"`no_room: {1 - market.availability:.3f}`: so the traces say"
+            )
             if not {"mttf_s", "mttr_s"}.intersection(values):
                 zones = fitting.of_zones(lines)
                 notes += [

@@ -2,7 +2,8 @@
 
 A trace is a JSON file: ``{"metadata": {"gap_seconds": 300}, "data": [1, 1, 0, ...]}``, each
 sample the number of machines that could be had then. Optional: ``times``, the seconds at
-which the samples were taken, by which holes and clock jumps are found.
+which the samples were taken, by which holes and clock jumps are found; ``prices``, one a sample:
+where a file of a folder has them, they are the prices, and files without have none.
 
 Its location is its path below the folder, ``aws/us-west-2/us-west-2b.json``, or the zone
 alone, ``us-west-2b_v100_1.json``: what follows the first underscore is only a remark.
@@ -65,18 +66,25 @@ def read(folder: Path, per_unit: int = 1) -> list[Trace]:
         raise FogftError(f"{folder}: cannot be read: {error.strerror}") from None
     if not files:
         raise FogftError(f"{folder}: there is no trace (`*.json`) in it", FORMAT)
-    return [_read_file(path, folder, per_unit) for path in files]
+    found = [(path, _loaded(path)) for path in files]
+    own = [(path, value) for path, value in found if isinstance(value, dict) and "prices" in value]
+    if own and per_unit > 1:
+        found = [(path, {**value, "data": value["prices"]}) for path, value in own]
+    return [_trace(value, path, folder, per_unit) for path, value in found]
 
 
-def _read_file(path: Path, folder: Path, per_unit: int) -> Trace:
+def _loaded(path: Path) -> Any:
     try:
         if path.stat().st_size > MAX_BYTES:
             raise FogftError(f"{path}: is larger than {MAX_BYTES >> 20} MiB", FORMAT)
-        value = json.loads(path.read_bytes())
+        return json.loads(path.read_bytes())
     except OSError as error:
         raise FogftError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
         raise FogftError(f"{path}: is not JSON: {error}", FORMAT) from None
+
+
+def _trace(value: Any, path: Path, folder: Path, per_unit: int) -> Trace:
     inner = path.relative_to(folder).with_suffix("").parts
     zone = inner[-1].split("_")[0]
     place = "/".join((*inner[:-1], zone)) if len(inner) == 3 else zone

@@ -72,7 +72,7 @@ def test_text_has_costs_availability_and_response(pool, capsys):
     assert "replicas      2 of 2 wanted" in out
     assert "a month" in out
     assert "one on-demand cpu8" in out
-    assert "0.996550 expected (0.999527 if replicas failed independently)" in out
+    assert "0.996346 expected (0.999527 if replicas failed independently)" in out
     assert "spot up 15 h" in out
     assert "response      11 ms and the service's own time; 23 ms while" in out
     assert "(pool file)" in out
@@ -155,7 +155,7 @@ def test_a_report_that_says_nothing_is_not_guessed_from(tmp_path, report):
 
 
 def test_losses_of_the_pool_are_shown(pool, capsys):
-    """History of a pool that exists counts: a place that lost a replica is avoided, and says so."""
+    """History of a pool that exists counts: a place that lost a replica shows it."""
     order = preview.order(pool)
     store = composition.make_store("planner")
     startup.write(store, order.spec, source=order.source, file=pool, cloud="local")
@@ -171,7 +171,7 @@ def test_losses_of_the_pool_are_shown(pool, capsys):
     shown = json.loads(capsys.readouterr().out)
     [lost] = [o for o in shown["offers"] if o["recent_losses"]]
     assert f"{lost['cloud']}/{lost['region']}/{lost['zone']}" == place
-    assert "avoided for 4 min more" in lost["why_not"]
+    assert lost["losses_per_hour"] > 0.25
 
 
 def test_how_long_launches_took_is_shown_and_taken_for_the_time_away(pool, capsys):
@@ -246,7 +246,7 @@ def test_a_target_out_of_reach_is_a_warning(pool, capsys):
     assert main.run(["plan", str(pool)]) == 0
     captured = capsys.readouterr()
     assert "0.99999 is asked for" in captured.out
-    assert "cannot be met: 2 replicas are expected to reach 0.99655" in captured.err
+    assert "cannot be met: 2 replicas are expected to reach 0.996346" in captured.err
 
 
 def test_regions_that_cannot_be_measured_are_told(pool, tmp_path, capsys):

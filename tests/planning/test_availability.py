@@ -14,6 +14,7 @@ from fogft.planning.availability import (
     Assumption,
     Correlation,
     expected,
+    full_together,
     joint_unavailability,
 )
 from fogft.planning.reliability import system_unavailability
@@ -114,6 +115,25 @@ def test_moving_to_another_cloud_never_hurts(pool, correlation):
     assert (
         joint_unavailability(apart, correlation) <= joint_unavailability(pool, correlation) + 1e-9
     )
+
+
+def test_while_no_location_has_room_no_spot_machine_is_up():
+    """Six replicas reach no more than the time in which one location has room; others do."""
+    assumed = Assumption(no_room=0.355)  # of the nine zones above
+    three = [replace(A, zone=zone) for zone in "abc"]
+    full = 1 - expected([A], assumed, three).correlated
+    at_once = replace(assumed, recovery_s=0.0)
+    assert full_together(three, at_once) == pytest.approx(0.17, abs=0.01)  # simulated: 0.172
+    assert 1 - expected(three * 2, assumed, three).correlated > 0.16
+    on_demand = [*three, replace(A, spot=False)]
+    assert 1 - expected(on_demand, assumed, three).correlated < 1e-3 < full
+    assert expected(three, assumed) == expected(three, replace(assumed, no_room=0.0), three)
+
+
+@given(places=st.lists(placements, min_size=1, max_size=6), another=placements, share=fractions)
+def test_another_location_never_hurts(places, another, share):
+    assumed = Assumption(no_room=share)
+    assert full_together([*places, another], assumed) <= full_together(places, assumed) + 1e-9
 
 
 def test_no_replica_never_answers():

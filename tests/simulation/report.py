@@ -15,8 +15,9 @@ from typing import Any
 from fogft.cli.simulate import duration, percent
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers_for
+from fogft.model.choices import Assumption, Correlation
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
-from fogft.planning.availability import Correlation, joint_unavailability
+from fogft.planning.availability import expected, joint_unavailability
 from fogft.planning.reliability import replicas_needed, system_unavailability
 from fogft.poolfile import file
 from fogft.simulation import plot
@@ -51,9 +52,16 @@ MARKETS = {
         mttf_s=54_000.0, mttr_s=3_600.0, correlation_region=0.6, correlation_cloud=0.6
     ),
 }
-CORRELATIONS = (0.0, 0.22, 0.5)
 WITHOUT_NOTICE = Timing(boot_s=1200.0, notice_s=0.0)  # the paper's recovery of 20 min
 PAPER = MarketModel(mttf_s=54_000.0, mttr_s=7_200.0, together=0.0)
+# Market -> how many replicas: what `availability` expects is held against what is simulated.
+GRID = {
+    **{
+        replace(PAPER, correlation_region=rho, correlation_cloud=rho): (1, 2, 3)
+        for rho in (0.0, 0.22, 0.5)
+    },
+    MarketModel(): (2, 6),
+}
 
 
 def scenarios(*, quick: bool = False) -> dict[str, Scenario]:
@@ -94,9 +102,10 @@ def arithmetic_errors(*, quick: bool = False) -> Iterator[dict[str, Any]]:
     days, seeds = (5.0, range(2)) if quick else (20.0, range(8))
     service = ServiceSpec("/plan", "nav_msgs/srv/GetPlan")
     task = {"run": "plan", "resources": {"use_spot": True}}
-    for rho in CORRELATIONS:
-        model = replace(PAPER, correlation_region=rho, correlation_cloud=rho)
-        for replicas in (1, 2, 3):
+    for model, counts in GRID.items():
+        rho = model.correlation_region
+        correlation = Correlation(1.0, rho, model.correlation_cloud)
+        for replicas in counts:
             spec = PoolSpec(
                 "sim",
                 (service,),
@@ -108,19 +117,26 @@ def arithmetic_errors(*, quick: bool = False) -> Iterator[dict[str, Any]]:
             scenario = Scenario(spec, FIND, WITHOUT_NOTICE, model, days=days, seeds=tuple(seeds))
             offers = FIND({"use_spot": True})
             places = [offer.placement for offer in static_places(offers, replicas)]
-            for policy, one in (
-                (f"static, any of {replicas}", staying(model, WITHOUT_NOTICE)),
-                ("fogft", moving(model, WITHOUT_NOTICE)),
+            assumed = Assumption(
+                spot_uptime_s=model.mttf_s,
+                recovery_s=WITHOUT_NOTICE.boot_s + WITHOUT_NOTICE.detect_s,
+                no_room=1 - model.availability,
+                correlation=correlation,
+            )
+            one = staying(model, WITHOUT_NOTICE)
+            static = joint_unavailability([(place, one) for place in places], correlation)
+            elsewhere = expected(places, assumed, [offer.placement for offer in offers])
+            for policy, alone, together in (
+                (f"static, any of {replicas}", system_unavailability([one] * replicas), static),
+                ("fogft", 1 - elsewhere.independent, 1 - elsewhere.correlated),
             ):
                 down = [1 - available(scenario, policy, seed) for seed in scenario.seeds]
                 yield {
                     "correlation": rho,
                     "replicas": replicas,
                     "policy": policy.split(",", maxsplit=1)[0],
-                    "independent": system_unavailability([one] * replicas),
-                    "expected": joint_unavailability(
-                        [(place, one) for place in places], Correlation(1.0, rho, rho)
-                    ),
+                    "independent": alone,
+                    "expected": together,
                     "simulated": asdict(estimate(down)),
                 }
         print(f"arithmetic checked: correlation {rho:g}", flush=True)

@@ -11,7 +11,7 @@ from fogft.model.replica import Placement
 from fogft.simulation import traces
 from fogft.simulation.market import Market, changes
 from fogft.simulation.model import Timing
-from fogft.simulation.timeline import of_samples
+from fogft.simulation.timeline import PER_USD, of_samples
 
 PLACES = [Placement("local", "us-west-2", zone, "cpu4") for zone in "ab"]
 
@@ -104,6 +104,15 @@ def test_a_folder_without_traces_and_no_folder_are_told(tmp_path):
         traces.read(tmp_path)
     with pytest.raises(FogftError, match="is not a folder"):
         traces.read(tmp_path / "none")
+
+
+def test_prices_are_those_beside_the_samples_where_a_file_has_them(tmp_path):
+    """As published: some files of a folder have them, others do not."""
+    write(tmp_path, "us-west-2a_v100_1.json", trace(prices=[0.9, 0.9, 1.2, 0.9]))
+    write(tmp_path, "us-west-2b_v100_1.json")
+    [priced] = traces.read(tmp_path, PER_USD)
+    assert priced.timeline.changes == ((0.0, 900_000), (600.0, 1_200_000), (900.0, 900_000))
+    assert len(traces.read(tmp_path)) == 2
 
 
 def test_a_file_that_is_not_json_is_told(tmp_path):

@@ -12,12 +12,6 @@ FORGIVE_S without a failure, ends it. A failed `setup`, or a service that is not
 the pool file's fault, not the location's: it counts against `EVERYWHERE`, so that a broken file is
 not tried in one location after the other.
 
-A location where a replica was lost is avoided: used only when no other is left, for
-
-    min(AVOID_S * 2 ** (n - 1), AVOID_LIMIT_S)
-
-seconds after the last of n losses within AVOID_MEMORY_S.
-
 While all supplies back off, the one whose last failure is oldest is tried, one try in EAGER_S. A
 replica that could move, but need not, asks no location that refused within FORGIVE_S and has had
 none ready since. Events from the future, left by a clock that was set back, count for nothing.
@@ -41,9 +35,6 @@ FORGIVE_S = 3600.0
 EVERYWHERE = "*"
 NEVER = float("inf")
 EAGER_S = 60.0
-AVOID_S = 300.0
-AVOID_LIMIT_S = 3600.0
-AVOID_MEMORY_S = 4 * 3600.0
 _AT = itemgetter(0)
 
 
@@ -197,43 +188,17 @@ def backoff_s(failures: int, cause: Cause | None = None) -> float:
     return min(base_s * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
 
 
-class _Avoidance(NamedTuple):
-    """Until when a location is avoided, and when that may change, at the latest then."""
+def lost_lately(history: History, now: float) -> Mapping[str, float]:
+    """Return where a replica was lost within NO_ROOM_S, and until when that counts.
 
-    until: float
-    changes: float
-
-
-class _Avoided(NamedTuple):
-    """All locations that are avoided."""
-
-    until: Mapping[str, float]
-    change: float
-
-
-def avoided(history: History, now: float) -> Mapping[str, float]:
-    """Return the locations to use only when no other is left, and until when."""
-    return history.of_places(history.losses, _avoidance, _all_avoided, now).until
-
-
-def _avoidance(history: History, location: str, now: float) -> Expiring[_Avoidance | None]:
-    losses = history.losses[location]
-    first = bisect_right(losses, now - AVOID_MEMORY_S)
-    end = bisect_right(losses, now, lo=first)
-    holds = losses[end] if end < len(losses) else NEVER
-    if first == end:
-        return Expiring(None, holds)
-    until = losses[end - 1] + min(AVOID_S * 2.0 ** min(end - first - 1, 16), AVOID_LIMIT_S)
-    forgotten = losses[first] + AVOID_MEMORY_S
-    holds = min(holds, forgotten)
-    if until <= now:
-        return Expiring(None, holds)
-    return Expiring(_Avoidance(until, min(until, forgotten)), min(holds, until))
-
-
-def _all_avoided(locations: Mapping[str, _Avoidance]) -> _Avoided:
-    change = min([one.changes for one in locations.values()], default=NEVER)
-    return _Avoided({location: one.until for location, one in locations.items()}, change)
+    Such a location is used only when no other is left: it has hardly room again.
+    """
+    found = {}
+    for location, losses in history.losses.items():
+        lately = losses[bisect_right(losses, now - NO_ROOM_S) : bisect_right(losses, now)]
+        if lately:
+            found[location] = lately[-1] + NO_ROOM_S
+    return found
 
 
 def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:
@@ -254,7 +219,7 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
     if restless:
         times += [pause.until for pause in supplies.recently_failed.values()]
     if waits or restless:  # a stand-in does not return to where one was just lost
-        times.append(history.of_places(history.losses, _avoidance, _all_avoided, now).change)
+        times += lost_lately(history, now).values()
     return min([at for at in times if at > now], default=NEVER)
 
 

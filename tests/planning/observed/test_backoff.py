@@ -7,16 +7,15 @@ from hypothesis import strategies as st
 
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.backoff import (
-    AVOID_S,
     BASE_S,
     EAGER_S,
     EVERYWHERE,
     FORGIVE_S,
     LIMIT_S,
     NO_ROOM_S,
-    avoided,
     backing_off,
     backoff,
+    lost_lately,
     next_change,
     recently_failed,
 )
@@ -127,11 +126,11 @@ def test_what_is_remembered_of_places_is_what_follows_from_all_events(happenings
         for event in happened:
             asked.add(event)
         anew = History(events)
-        for question in (backing_off, recently_failed, avoided):
+        for question in (backing_off, recently_failed):
             assert question(asked, now) == question(anew, now)
 
 
-def test_who_waits_looks_again_when_a_place_is_no_longer_avoided() -> None:
+def test_who_waits_looks_again_where_one_was_lost() -> None:
     """A stand-in returns there as soon as it may; who waits for nothing does not look at all."""
     lost = History(
         [
@@ -140,8 +139,10 @@ def test_who_waits_looks_again_when_a_place_is_no_longer_avoided() -> None:
             Event(1000, EventKind.GONE, 0, 1),
         ]
     )
-    assert next_change(lost, 1001, waits=True, restless=False) == 1000 + AVOID_S
-    assert next_change(lost, 1001, waits=False, restless=True) == 1000 + AVOID_S
+    assert [lost_lately(lost, at) for at in (999, 1120)] == [{}, {}]
+    assert lost_lately(lost, 1001) == {PLACE: 1000 + NO_ROOM_S}
+    assert next_change(lost, 1001, waits=True, restless=False) == 1000 + NO_ROOM_S
+    assert next_change(lost, 1001, waits=False, restless=True) == 1000 + NO_ROOM_S
     assert next_change(lost, 1001, waits=False, restless=False) == float("inf")
 
 

@@ -9,7 +9,7 @@ from fogft.model.choices import ScheduleSpec, WindowSpec
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed
-from fogft.planning.observed.backoff import avoided, backing_off, recently_failed
+from fogft.planning.observed.backoff import backing_off, recently_failed
 from fogft.planning.observed.clock_jumps import DOUBT_S, LEAST_S, Jump, Reading, Watch
 from fogft.planning.observed.history import Event, EventKind, History, compacted
 from fogft.planning.sizing import size
@@ -100,7 +100,7 @@ def _ages(history: History, now: float) -> object:
         for question in (backing_off, recently_failed)
         for place, rest in question(history, now).items()
     }
-    return records, rests, {place: now - until for place, until in avoided(history, now).items()}
+    return records, rests
 
 
 def test_a_schedule_waits_for_a_clock_that_was_just_set():
