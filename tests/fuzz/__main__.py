@@ -10,11 +10,15 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import math
+import os
 import random
+import re
 import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,27 +27,38 @@ if TYPE_CHECKING:
 
 STATE_FILES = "state files"
 A_STATE_FILE = 50  # takes so many times as long as a frame, for whole commands read it
+RAN = re.compile(r"executed_units: *(\d+)")  # libFuzzer's words
+STATE_FILES_SHARE = 18  # of the time, where a decoder has one: there are so many
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/fuzz", description=__doc__)
     parser.add_argument("--cases", type=int, default=1_000_000, help="of all decoders together")
+    parser.add_argument("--minutes", type=float, help="for all together, in place of cases")
     parser.add_argument("--only", action="append", help="a decoder's name; all unless told")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--plain", action="store_true", help="damaged seeds, without atheris")
     parser.add_argument("--one", help=argparse.SUPPRESS)
+    parser.add_argument("--seconds", type=float, default=math.inf, help=argparse.SUPPRESS)
     given = parser.parse_args()
     guided = not given.plain and importlib.util.find_spec("atheris") is not None
     if given.one:
         follows = guided and given.one != STATE_FILES  # what reads them is all of fogft
-        (_guided if follows else _plain)(given.one, given.cases, given.seed)
+        (_guided if follows else _plain)(given)
         return
     names = given.only or [*_targets(), STATE_FILES]
-    each = -(-given.cases // len(names))
-    print(f"{each} cases for each of {len(names)} decoders, seed {given.seed}, "
+    shares = {name: STATE_FILES_SHARE if name == STATE_FILES else 1 for name in names}
+    if given.minutes is None:
+        limits = dict.fromkeys(names, f"--cases={-(-given.cases // len(names))}")
+    else:
+        unit_s = given.minutes * 60 / sum(shares.values())
+        limits = {name: f"--seconds={unit_s * share:.0f}" for name, share in shares.items()}
+    print(f"{len(names)} decoders, seed {given.seed}, "
           f"{'guided by coverage (atheris)' if guided else 'damaged seeds'}")  # fmt: skip
-    failed = [name for name in names if not _in_a_process(name, each, given.seed, guided)]
-    print(f"{each * len(names)} cases, findings in: {', '.join(failed) or 'none'}")
+    options = [f"--seed={given.seed}", *(() if guided else ("--plain",))]
+    cases = {name: _in_a_process(name, limits[name], options) for name in names}
+    failed = [name for name, ran in cases.items() if ran is None]
+    print(f"{sum(ran or 0 for ran in cases.values())} cases, findings in: {', '.join(failed) or 'none'}")
     sys.exit(bool(failed))
 
 
@@ -53,67 +68,67 @@ def _targets() -> dict[str, Target]:
     return targets()
 
 
-def _in_a_process(name: str, cases: int, seed: int, guided: bool) -> bool:
-    words = [
-        sys.executable,
-        "-m",
-        "tests.fuzz",
-        "--one",
-        name,
-        f"--cases={cases}",
-        f"--seed={seed}",
-    ]
+def _in_a_process(name: str, limit: str, options: Sequence[str]) -> int | None:
+    """Return how many cases ran; None where there was a finding."""
+    words = [sys.executable, "-m", "tests.fuzz", "--one", name, limit, *options]
     began = time.monotonic()
-    done = subprocess.run(
-        words + ([] if guided else ["--plain"]), capture_output=True, text=True, check=False
-    )
-    took_s = time.monotonic() - began
-    print(
-        f"{name:20} {cases:9} cases {took_s:7.1f} s  {'ok' if not done.returncode else 'FINDING'}"
-    )
-    if done.returncode:
+    with tempfile.TemporaryDirectory(prefix="fogft-fuzz-") as folder:  # libFuzzer leaves all of it
+        environ = os.environ | {"TMPDIR": folder}
+        done = subprocess.run(words, capture_output=True, text=True, check=False, env=environ)
+    took_s, ran = time.monotonic() - began, re.search(RAN, done.stdout + done.stderr)
+    found = done.returncode != 0 or ran is None
+    cases = "?" if ran is None else ran[1]
+    print(f"{name:20} {cases:>9} cases {took_s:7.1f} s  {'FINDING' if found else 'ok'}", flush=True)
+    if ran is None or found:
         print(done.stdout[-4000:] + done.stderr[-4000:])
-    return not done.returncode
+        return None
+    return int(ran[1])
 
 
-def _plain(name: str, cases: int, seed: int) -> None:
+def _plain(given: argparse.Namespace) -> None:
     from tests.fuzz.mutation import damaged, damaged_text
 
-    dice = random.Random(f"{name} {seed}")
-    if name == STATE_FILES:
+    dice, end = random.Random(f"{given.one} {given.seed}"), time.monotonic() + given.seconds
+    files, cases = given.one == STATE_FILES, given.cases
+    if files:
         from tests.fuzz.state_files import state_files
 
         chosen = list(state_files().values())
         cases = -(-cases // A_STATE_FILE)
     else:
-        chosen = [_targets()[name]]
-    for number in range(cases):
-        target = chosen[number % len(chosen)]
-        one = name == STATE_FILES
-        data = damaged_text(target.seeds[0], dice) if one else damaged(target.seeds, dice)
+        chosen = [_targets()[given.one]]
+    ran = 0
+    while time.monotonic() < end if given.seconds < math.inf else ran < cases:
+        target = chosen[ran % len(chosen)]
+        data = damaged_text(target.seeds[0], dice) if files else damaged(target.seeds, dice)
         try:
             target.run(data)
         except BaseException:
             print(f"finding: {data.hex()}")
             raise
+        ran += 1
+    print(f"executed_units: {ran}")
 
 
-def _guided(name: str, cases: int, seed: int) -> None:
+def _guided(given: argparse.Namespace) -> None:
     import atheris
 
     with atheris.instrument_imports(include=["fogft"]):
         from tests.fuzz.targets import targets
 
-        target = targets()[name]
-    with tempfile.TemporaryDirectory(prefix="fogft-fuzz-") as folder:
-        for number, content in enumerate(target.seeds):
-            (Path(folder) / str(number)).write_bytes(content)
-        options = [f"-runs={cases}", f"-seed={seed}", "-max_len=8192", "-verbosity=0"]
-        atheris.Setup(
-            [sys.argv[0], *options, f"-artifact_prefix={folder}/", folder],
-            lambda data: target.run(data),
-        )
-        atheris.Fuzz()
+        target = targets()[given.one]
+    limit = f"-runs={given.cases}"
+    if given.seconds < math.inf:
+        limit = f"-max_total_time={given.seconds:.0f}"
+    folder = Path(tempfile.mkdtemp())
+    for number, content in enumerate(target.seeds):
+        (folder / str(number)).write_bytes(content)
+    options = [limit, f"-seed={given.seed}", "-max_len=8192", "-verbosity=0", "-print_final_stats=1"]
+    atheris.Setup(
+        [sys.argv[0], *options, f"-artifact_prefix={folder}/", str(folder)],
+        lambda data: target.run(data),
+    )
+    atheris.Fuzz()
 
 
 if __name__ == "__main__":
