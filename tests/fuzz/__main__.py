@@ -57,8 +57,9 @@ def main() -> None:
           f"{'guided by coverage (atheris)' if guided else 'damaged seeds'}")  # fmt: skip
     options = [f"--seed={given.seed}", *(() if guided else ("--plain",))]
     cases = {name: _in_a_process(name, limits[name], options) for name in names}
-    failed = [name for name, ran in cases.items() if ran is None]
-    print(f"{sum(ran or 0 for ran in cases.values())} cases, findings in: {', '.join(failed) or 'none'}")
+    failed = [name for name, count in cases.items() if count is None]
+    ran = sum(count or 0 for count in cases.values())
+    print(f"{ran} cases, findings in: {', '.join(failed) or 'none'}")
     sys.exit(bool(failed))
 
 
@@ -123,9 +124,9 @@ def _guided(given: argparse.Namespace) -> None:
     folder = Path(tempfile.mkdtemp())
     for number, content in enumerate(target.seeds):
         (folder / str(number)).write_bytes(content)
-    options = [limit, f"-seed={given.seed}", "-max_len=8192", "-verbosity=0", "-print_final_stats=1"]
+    options = ["-max_len=8192", "-verbosity=0", "-print_final_stats=1", f"-seed={given.seed}"]
     atheris.Setup(
-        [sys.argv[0], *options, f"-artifact_prefix={folder}/", str(folder)],
+        [sys.argv[0], limit, *options, f"-artifact_prefix={folder}/", str(folder)],
         lambda data: target.run(data),
     )
     atheris.Fuzz()
