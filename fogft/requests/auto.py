@@ -122,6 +122,8 @@ class Auto(Learning):
         self._demand.asked(now)
         if not able:
             return ()
+        for replica in able:  # what others answered first it may never end: `more` does not see it
+            self._doubts(replica, self._of(replica).oldest_begun, now)
         best = self._best(request, able, now)
         known = self._replicas[best]
         self._spares.request(known.service_s, now)
@@ -147,11 +149,7 @@ class Auto(Learning):
 
     def _takes_spare(self, replica: int, now: float) -> bool:
         known = self._replicas[replica]
-        if known.free(now):
-            return True
-        # What others answered first it may never end: that is not found out in `more`.
-        doubted = self._doubts(replica, known.oldest_begun, now)
-        return doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S
+        return known.free(now) or (known.doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S)
 
     def _stale(self, able: Sequence[int], now: float) -> list[int]:
         """Return those of which nothing was heard for long: one spare copy shows how they do."""

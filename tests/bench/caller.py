@@ -90,7 +90,12 @@ class Caller:
         answered = threading.Event()
         client = self._clients[service]
         began = time.perf_counter()
-        ticket = client.call(payload, lambda _: answered.set())
+
+        def came(response: bytes) -> None:
+            self._judge(service, response)
+            answered.set()
+
+        ticket = client.call(payload, came)
         if not answered.wait(CALL_LIMIT_S):
             client.forget(ticket)
             raise TimeoutError(f"{service} got no answer")
@@ -135,7 +140,7 @@ class Caller:
 
         def answered(sent: float, response: bytes) -> None:
             took.append(time.perf_counter() - sent)
-            self.wrong += service == FLAG[0] and not is_right_flag(response)
+            self._judge(service, response)
 
         began = time.perf_counter()
         at = began
@@ -148,6 +153,9 @@ class Caller:
         while len(took) < count and time.perf_counter() < end:
             time.sleep(0.02)
         return took
+
+    def _judge(self, service: str, response: bytes) -> None:
+        self.wrong += service == FLAG[0] and not is_right_flag(response)
 
     def close(self) -> None:
         """Leave ROS."""

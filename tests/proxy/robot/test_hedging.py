@@ -8,10 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fogft.model.refusal import Refusal
 from fogft.model.spec import HedgingMode
+from fogft.requests.load import Load
 from tests.estimates import percentile
 from tests.nightly import NIGHTLY, by_day
-from tests.proxy.robot.simulated import World, lognormal
+from tests.proxy.robot.simulated import SimulatedIncoming, SimulatedLink, World, lognormal
 
 AUTO, FAILOVER = HedgingMode.AUTO, HedgingMode.FAILOVER
 
@@ -149,6 +151,62 @@ def test_a_service_that_hangs_for_a_while_loses_nothing_and_gets_requests_again(
     if mode is AUTO:
         ran = [link.replica.service.ran for link in world.links]
         assert min(ran) > 0.1 * sum(ran)
+
+
+IDLE = Load(0, 0, 64, 0.0, 0.0)
+
+
+def lies(link: SimulatedLink, how: str) -> None:
+    """Have a replica answer nothing, whatever else it says. It always says that it is idle."""
+    kept = []
+
+    def request(incoming: SimulatedIncoming) -> None:
+        kept.append(incoming)
+        if how == "junk":
+            incoming.refuse(Refusal.LOST)  # what is made of an answer that cannot be decoded
+        elif how == "crashed":
+            incoming.refuse(Refusal.CRASHED, load=IDLE)
+        elif how == "boasting" and len(kept) % 10 == 0:
+            incoming.refuse(Refusal.OVERLOADED, load=IDLE)
+
+    link.replica.responder.request = request  # type: ignore[method-assign]
+
+
+def beside_liars(how: str, liars: int, *, replicas: int = 3) -> list[list[float]]:
+    """Return how long requests took: one after the other, and at random moments."""
+    found = []
+    for one_by_one in (True, False):
+        world = World(AUTO, timeout_s=2.0)
+        for _ in range(replicas):
+            world.replica(SERVICES["constant"], serial=True)
+        world.poisson(20.0, 10.0, random.Random(1))
+        world.run(1.0)
+        before = len(world.asked)
+        for link in world.links[:liars]:
+            lies(link, how)
+        if one_by_one:
+            world.calls(500)
+        else:
+            world.poisson(20.0, 30.0, random.Random(2))
+        world.run(2.5)
+        assert liars > 1 or lost([world]) == 0
+        found.append(world.latencies(before))
+    return found
+
+
+@pytest.mark.parametrize("liars", [1, 2])
+@pytest.mark.parametrize("how", ["junk", "crashed", "swallowed", "boasting"])
+def test_liars_cost_no_more_than_their_absence_would(how, liars):
+    """p50 and p99 are at most 1.2 of those of a calm pool of three, where no request waits.
+
+    At random moments requests wait for each other: there, of a pool in which only the others are.
+    """
+    one_by_one, at_random = beside_liars(how, liars)
+    calm, _ = beside_liars(how, 0)
+    _, fewer = beside_liars(how, 0, replicas=3 - liars)
+    for percent in (50, 99):
+        assert percentile(one_by_one, percent) <= 1.2 * percentile(calm, percent)
+        assert percentile(at_random, percent) <= 1.2 * percentile(fewer, percent)
 
 
 @pytest.mark.parametrize("fault", ["killed", "frozen", "hangs"])
