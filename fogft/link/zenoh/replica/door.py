@@ -61,11 +61,13 @@ def full(strangers: Collection[Address]) -> set[str]:
 
 def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
     """Return which strangers (when each was first seen) have to go, oldest first."""
-    by_age = sorted(strangers, key=lambda peer: strangers[peer])
-    surplus = set(by_age[: max(0, len(by_age) - STRANGERS_LIMIT)])
-    for host in full(strangers):  # who shares its address is to have a turn
+    by_age, crowded = sorted(strangers, key=lambda peer: strangers[peer]), full(strangers)
+    surplus = set[Address]()
+    for host in crowded:  # who shares its address is to have a turn
         of_host = [peer for peer in by_age if peer[0] == host]
         surplus.update(of_host[: len(of_host) - HOST_LIMIT // 2])
+    others = [peer for peer in by_age if peer[0] not in crowded]
+    surplus.update(others[: max(0, len(others) - STRANGERS_LIMIT)])
     return [
         peer
         for peer in by_age

@@ -54,6 +54,16 @@ def test_who_shares_a_full_hosts_address_has_a_turn_soon() -> None:
     assert first in strangers
 
 
+def test_who_comes_from_elsewhere_is_not_ended_for_a_crowd() -> None:
+    """However many are let in: on a busy machine his handshake may take as long as theirs."""
+    door, robot = Door(), ("10.0.0.2", 1)
+    strangers = {("10.0.0.1", port) for port in range(200)} | {robot}
+    assert door.look(strangers, (), 0.0) == []
+    gone = door.look(strangers, (), 0.6)
+    assert len(gone) > 190
+    assert robot not in gone
+
+
 @contextlib.contextmanager
 def listening(address: str) -> Iterator[tuple[str, int]]:
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
