@@ -123,7 +123,7 @@ class Auto(Learning):
         if not able:
             return ()
         for replica in able:  # what others answered first it may never end: `more` does not see it
-            self._doubts(replica, self._of(replica).oldest_begun, now)
+            self._doubts(replica, self._replicas[replica].oldest_begun, now)
         best = self._best(request, able, now)
         known = self._replicas[best]
         self._spares.request(known.service_s, now)
