@@ -12,7 +12,8 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
-from fogft.cli.simulate import duration, percent
+from fogft.cli.simulate import percent
+from fogft.cli.status_text import age
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers_for
 from fogft.model.choices import Assumption, Correlation
@@ -201,7 +202,7 @@ def cells(row: Row) -> Iterator[str]:
     yield percent(row.estimate("under_target").mean)
     yield f"{row.estimate('usd_per_hour').mean * HOURS_A_MONTH:.0f}"
     yield f"{row.estimate('launches_per_day').mean:.1f}"
-    yield duration(row.longest_outage_s)
+    yield age(row.longest_outage_s) if row.longest_outage_s else "none"
 
 
 def arithmetic_table(errors: list[dict[str, Any]]) -> Iterator[str]:
