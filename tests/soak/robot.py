@@ -340,7 +340,8 @@ def show(rows: Mapping[str, Row], seed: int) -> None:
         counts = (len(row.took) + len(row.lost), len(row.lost), soon, row.wrong)
         late = sum(s > LATE_S for s in row.took)
         cells = "".join(f"{n:>10}" for n in (*counts, late))
-        spans = "".join(f"{s:>8.2f} s" for s in (p99(sorted(row.took)), row.gap_s, row.whole_s))
+        slow_s = p99(sorted(row.took)) if row.took else float("inf")
+        spans = "".join(f"{s:>8.2f} s" for s in (slow_s, row.gap_s, row.whole_s))
         print(f"{kind:<22}{row.times or '':>6}{cells}{spans}")
 
 

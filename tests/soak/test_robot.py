@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.soak.robot import DAMAGES, MAY_LOSE_S, Time, faults_found, table
+from tests.soak.robot import DAMAGES, MAY_LOSE_S, Time, faults_found, show, table
 
 TIMES = [Time("kill proxy", 10.0, 14.0), Time("full disk", 20.0, 25.0)]
 GOOD = [[at / 2, at / 2 + 0.1, True] for at in range(60)]
@@ -41,6 +41,13 @@ def test_requests_are_counted_by_the_fault_that_there_was():
 def test_only_what_a_killed_proxy_costs_may_be_lost(end, why):
     kinds = ("kill proxy", "full disk")
     assert faults_found(table(TIMES, [*GOOD, end]), kinds, "") == why
+
+
+def test_a_fault_in_which_nothing_was_answered_has_its_line(capsys):
+    show(table(TIMES, [*GOOD[:20], lost(22.0)]), 7)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "robot's side, seed 7: 21 requests, 1 lost"
+    assert lines[-1].split()[:5] == ["full", "disk", "1", "1", "1"]
 
 
 def test_what_was_never_done_and_what_never_became_whole_fail_it():
