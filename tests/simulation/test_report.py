@@ -43,10 +43,9 @@ def test_the_report_says_what_its_figures_say():
 
 
 def test_what_availability_expects_is_about_what_is_simulated():
-    """Within a factor of 3, or of 4 where three that move share one fate half of the time."""
+    """Within a factor of 3, over the whole grid."""
     for row in FIGURES["arithmetic"]:
-        most = 4 if row["correlation"] == 0.5 and row["replicas"] == 3 else 3
-        assert 1 / most < row["simulated"]["mean"] / row["expected"] < most
+        assert 1 / 3 < row["simulated"]["mean"] / row["expected"] < 3
 
 
 def test_there_is_a_picture():
