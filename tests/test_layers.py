@@ -15,7 +15,7 @@ import pytest
 PRODUCT = Path(__file__).parent.parent / "fogft"
 MOST_MODULES = 22
 PURE = ("model", "ordering", "planning", "poolfile", "requests", "topics")
-OPENS_FILES = {"poolfile/config_file.py", "poolfile/file.py", "poolfile/workspace.py"}
+OPENS_FILES = {"poolfile/config_file.py", "poolfile/file.py"}
 LOADED_BY_NAME = {"sky": "cloud/sky", "boto3": "cloud/sky", "botocore": "cloud/sky"}
 
 

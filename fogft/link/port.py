@@ -112,6 +112,7 @@ class GatewayView(ReplicaWord):
         """Return one from what a client proxy reports of a link."""
         known = {field.name: report[field.name] for field in fields(cls) if field.name in report}
         known |= {"state": LinkState(report["state"]), "ready": frozenset(report["ready"])}
+        known["draining"] = report["leaving"]
         return cls(**known)
 
 

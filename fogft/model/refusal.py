@@ -1,6 +1,9 @@
 """Why a replica, or the link to it, did not answer a request, and what follows from each. Pure.
 
-A new kind of refusal is a row here, the code that raises it, and a test.
+A new kind of refusal is a row here, the code that raises it, and a test. The comment above a row
+is published: `scripts/docs` writes it into docs/reference/diagnostics.md. Requests are refused
+in `proxy/replica/responder` (services), `.goals_once`, `.topics`, `ordering/replica` (services
+with `state`), `proxy/gateway/gateway` and `link/zenoh/replica` (who may not ask).
 """
 
 from __future__ import annotations

@@ -133,7 +133,8 @@ class Machine:
 
     Attributes:
         endpoint: ``host:port`` where the server proxy listens, once known.
-        notice: A preemption notice was given: the machine ends soon.
+        notice: A preemption notice was given, where the cloud's own list tells: the machine ends
+            soon. Elsewhere its link tells (`LinkReport.leaving`).
         spec_hash: `PoolSpec.replica_hash` at its launch; another one means outdated.
         failure: Why the phase is FAILED, with the cloud's words (a log's last lines after a
             line break); None otherwise.
@@ -189,6 +190,9 @@ class LinkReport:
 
     Attributes:
         ready: Names of the services that this replica says it can answer now.
+        leaving: It asks to be left alone itself: its machine will be taken.
+        draining: Nothing new is sent to it while others can answer: it is leaving, or the
+            manager has marked it.
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
         disagrees: Its answers have differed from those of a quorum, repeatedly, or have been
             `misread` (they were no responses), or it `ignores` requests that others answer.
@@ -208,6 +212,7 @@ class LinkReport:
     id: ReplicaId
     state: LinkState
     ready: frozenset[str] = frozenset()
+    leaving: bool = False
     draining: bool = False
     at_risk: bool = False
     disagrees: bool = False

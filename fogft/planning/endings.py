@@ -5,7 +5,7 @@ never counts one that is itself to go, has a notice, or is silent. One whose lin
 first marked as draining, so that requests stop going there, and ends when it is idle.
 
 Owns: the order of endings and the two steps of draining.
-Not here: why a replica should go (`planner`, `health`).
+Not here: why a replica should go (`classification`, `health`).
 """
 
 from __future__ import annotations

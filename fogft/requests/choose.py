@@ -1,8 +1,8 @@
 """Choose which replicas a request goes to first, which next, and when. Pure: time comes in.
 
 A policy is asked when a request comes (`first`) and again while it is open (`more`), and is
-told how each attempt ended. It never sends anything; the dispatcher does as it says, and
-checks nothing but that a replica may be asked.
+told how each attempt ended. It never sends anything; the dispatcher does as it says, but for
+replicas that may not be asked, and requests that may have ended a service (`pending`).
 
 Owns: `all` and `failover`; the interface of every policy.
 Not here: `auto`, and which policy a service has (`fogft.requests.auto`), which answer wins

@@ -191,7 +191,7 @@ class Managed:
                     member.id,
                     LinkState.SUSPECT if silent else LinkState.UP,
                     ready=self._ready,
-                    draining=vm.noticed,
+                    leaving=vm.noticed,
                     silent_for_s=silent_s,
                 )
             reports.append(report)

@@ -364,14 +364,27 @@ def test_resting_location_is_skipped_and_reported() -> None:
 
 
 def test_mark_of_our_own_is_not_the_replicas_wish() -> None:
-    """The proxy's echo of our draining mark launches no replacement."""
+    """The proxy's echo of our draining mark launches no replacement, and hides no notice."""
     part = replica(1, drained_s=1.0)
     assert part.link is not None
     echo = replace(part, link=replace(part.link, draining=True))
     world = World(spec(1)).having(replica(0), echo)
     assert launches(world) == []
-    wish = replace(echo, events=echo.events[:2])
-    assert launches(World(spec(2)).having(replica(0), wish)) == ["1.2"]
+    wish = replace(part.link, leaving=True, draining=True)
+    assert launches(World(spec(2)).having(replica(0), replace(echo, link=wish))) == ["1.2"]
+    unmarked = replace(echo, events=echo.events[:2], link=wish)
+    assert launches(World(spec(2)).having(replica(0), unmarked)) == ["1.2"]
+
+
+def test_a_notice_stays_the_reason_while_the_replica_is_drained() -> None:
+    """Its successor is on the way and our mark is set: it still leaves for its notice."""
+    part = replica(1, drained_s=60.0)
+    assert part.link is not None
+    going = replace(part, link=replace(part.link, leaving=True, draining=True))
+    world = World(spec(2)).having(replica(0), going, replica(1, generation=2))
+    [ending] = world.plan().terminations
+    assert ending.id.short == "1.1"
+    assert ending.reason == Reason(Cause.DRAINS_ITSELF)
 
 
 def test_restarted_proxy_does_not_make_young_ones_of_old_ones() -> None:

@@ -29,6 +29,7 @@ def main(folder: str) -> None:
                 "generation": m.id.generation,
                 "state": "up",
                 "ready": ["/plan"],
+                "leaving": m.id.short in draining,
                 "draining": m.draining or m.id.short in draining,
             }
             for m in members

@@ -224,12 +224,13 @@ class World:
             else:
                 state = LinkState.UP
             serving = state is LinkState.UP and (not up or self.serves(member.id))
-            draining = member.draining and self.echo_draining
-            draining = draining or (up and member.id in self.told)
+            leaving = up and member.id in self.told
+            draining = leaving or (member.draining and self.echo_draining)
             self._reported[member.id] = LinkReport(
                 member.id,
                 state,
                 ready=frozenset({SERVICE.name}) if serving else frozenset(),
+                leaving=leaving,
                 draining=draining,
                 at_risk=up and member.id in self.at_risk,
                 silent_for_s=silent,
@@ -265,7 +266,7 @@ class World:
         record = self.store.history().record(machine.id.slot, machine.id.generation)
         late = late and (record is None or record.first_ready_at is None)
         report = self._reported.get(machine.id)
-        leaving = machine.notice or (report is not None and report.draining)
+        leaving = machine.notice or (report is not None and report.leaving)
         return leaving or machine.phase is MachinePhase.FAILED or silent or late
 
     def check_terminate(self, id: ReplicaId) -> None:

@@ -83,7 +83,7 @@ class PoolOnSky:
         if not runs or cluster is None or cluster.state is not ClusterState.UP:
             return LinkReport(id, LinkState.CONNECTING)
         ready = frozenset({SERVICE.name}) if self.serves(cluster.name) else frozenset[str]()
-        return LinkReport(id, LinkState.UP, ready, draining=id in self.draining)
+        return LinkReport(id, LinkState.UP, ready, leaving=id in self.draining)
 
     def tick(self, count: int = 1, seconds: float = 1.0) -> Tick:
         """Let the manager work, its threads too, and time pass; return the last tick."""

@@ -4,7 +4,7 @@
 refresh from the cloud, and the provider is asked itself where it can be. What SkyPilot has
 forgotten is ended through the provider, by its labels.
 
-Not here: which replicas shall end (`fogft.planning.planner`).
+Not here: which replicas shall end (`fogft.planning.endings`).
 """
 
 from __future__ import annotations

@@ -227,7 +227,7 @@ def _is_well(machine: Machine, link: LinkReport | None) -> bool:
     """Whether nobody says a word against one that serves."""
     if machine.notice or link is None:
         return False
-    return not (link.draining or link.disagrees or link.at_risk)
+    return not (link.leaving or link.disagrees or link.at_risk)
 
 
 def _phase(machine: Machine, verdict: Verdict, serving: bool) -> Phase:
@@ -260,8 +260,7 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
         if now - _accepted_at(machine, record, now) > health.start_limit_s:
             return Verdict.FAILED, _timeout(Cause.NOT_RUNNING, health.start_limit_s)
         return Verdict.GOOD, None
-    # A mark of our own comes back in the report: it is not the replica's wish.
-    if link is not None and link.draining and not (record and record.draining_since):
+    if link is not None and link.leaving:
         return Verdict.LEAVING, Reason(Cause.DRAINS_ITSELF)
     silent = link is not None and was_heard(link, record) and link.state is not LinkState.UP
     if link is not None and silent and context.may_doubt and link.silent_for_s > context.patience_s:

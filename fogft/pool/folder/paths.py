@@ -63,7 +63,7 @@ class PoolPaths:
     trial = _File("trial.json")
     """``{file, began_at, fault}``: what became of the file applied last."""
     intent = _File("intent.json")
-    """What the user asked for besides the file (`fogft.pool.intent`)."""
+    """What the user asked for besides the file (`fogft.model.intent`)."""
     intent_lock = _File("intent.lock")
     """Held while `identity`, `spec` or `intent` is changed."""
     manager_lock = _File("manager.lock")

@@ -111,7 +111,7 @@ class ProxyReport:
     def digest(self) -> object:
         """Return what a manager should react to at once; counters and ages are left out."""
         return frozenset(
-            (k.id, k.state, k.doubted, k.ready, k.draining, k.at_risk, k.disagrees, k.offered)
+            (k.id, k.state, k.doubted, k.ready, k.leaving, k.at_risk, k.disagrees, k.offered)
             for k in self.links
         )
 

@@ -45,7 +45,7 @@ MakeDispatcher = Callable[
 
 
 class ClientProxy:
-    """Sends each request to all replicas and returns the first success."""
+    """Sends each request to the replicas that its policy chooses; returns the first success."""
 
     def __init__(
         self,

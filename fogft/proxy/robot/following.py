@@ -5,7 +5,7 @@ later one counts. Where replicas are is corrected by what they say of themselves
 that dial in are reached through the door.
 
 Owns: the record client and the door of a client proxy.
-Not here: links (`client`), files and signals (`process`).
+Not here: links (`links`), files and signals (`process`).
 """
 
 from __future__ import annotations

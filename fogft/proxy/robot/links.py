@@ -50,6 +50,7 @@ def link_report(
         "differs": bool(ours),
         "differing": sorted(differ) if ours else [],
         "offered": dict(answer.offered) if answer and link.usable else {},
+        "leaving": link.draining,
         "draining": draining,
         "at_risk": bool(answer and answer.at_risk),
         "disagrees": status.ignores or any(dispatcher.disagrees(key) for dispatcher in dispatchers),
@@ -88,6 +89,7 @@ def _report(status: LinkStatus, gateway: str, one: GatewayView) -> dict[str, Any
     heard = status.heard_age_s
     return {
         **asdict(one),
+        "leaving": one.draining,
         "state": state.value,
         "ready": sorted(one.ready) if up else [],
         "disagrees": False,
