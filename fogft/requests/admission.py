@@ -76,13 +76,6 @@ class AdmissionQueue(Generic[T]):
         queue.waiting += 1
         self._entries[id] = entry
 
-    @property
-    def next(self) -> T | None:
-        """What is next; None when nothing waits."""
-        if not self._robots:
-            return None
-        return min(self._robots.values(), key=_standing).first().item
-
     def take(self) -> T | None:
         """Return what is next, and take it out; None when nothing waits."""
         if not self._robots:

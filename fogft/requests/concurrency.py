@@ -54,11 +54,6 @@ class ConcurrencyLimit:
         """How many may be at work, where that was given or found out; 0 where it was not."""
         return self.limit if self._given is not None or self._tried else 0
 
-    @property
-    def learned(self) -> bool:
-        """Whether it was found out how many may be at work, and no other limit is on trial."""
-        return self._given is None and bool(self._tried) and self._kept is None
-
     def finished(self, level: int, took_s: float, now: float) -> None:
         """Learn from an answer; at its beginning `level` were at work, itself included."""
         weight = 1.0 if self._mean_s is None else _WEIGHT

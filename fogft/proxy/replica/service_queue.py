@@ -30,9 +30,6 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
-# A service that takes less has nothing to do for a good part of its time if it is given the next
-# request only when it has ended the present one. So one that waits is given to it before.
-_AHEAD_BELOW_S = 0.05
 
 
 class Job:
@@ -77,7 +74,6 @@ class ServiceQueue:
         self.at_work = 0
         self._begun_last = 0.0
         self._alone = False  # the job at work is to have no other beside it
-        self._ahead: Job | None = None  # passed on beyond the limit: it begins when another ends
         self._longest_s = 0.0  # that it lately took; 0 before its first answer
         self._quiet_since: float | None = None  # it has work, and has ended none since
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
@@ -128,23 +124,15 @@ class ServiceQueue:
         What it returns may be past its deadline, or about to be while others wait that are not:
         then it was not begun and takes no room.
         """
-        job = self._waiting.next
-        if job is None or (job.alone and self.at_work):  # when the service has nothing else
+        if not self._has_room:
             return None
-        if not self._has_room and not self._may_go_ahead(job, now):
+        job = self._waiting.take()
+        if job is not None and job.alone and self.at_work:
+            self.put(job)  # when the service has nothing else
             return None
-        self._waiting.take()
-        if job.deadline > now + (self.limit.takes_s if self._waiting else 0.0):
+        if job is not None and job.deadline > now + (self.limit.takes_s if self._waiting else 0.0):
             self.begin(job, now)
         return job
-
-    def _may_go_ahead(self, job: Job, now: float) -> bool:
-        """Whether one is passed on beyond the limit: in time for it, too, to be done."""
-        takes_s = self.limit.takes_s
-        quick = self.limit.learned and takes_s < _AHEAD_BELOW_S
-        if not quick or self._alone or self.at_work != self.limit.limit:
-            return False
-        return not job.spare and job.deadline > now + 2 * takes_s
 
     def begin(self, job: Job, now: float) -> None:
         """Job is passed on."""
@@ -156,8 +144,6 @@ class ServiceQueue:
             self._quiet_since = now
         self._begun_last = now
         job.passed_on, job.begun, job.level = True, now, self.at_work
-        if self.at_work > self.limit.limit:
-            self._ahead = job
 
     def remove(self, job: Job) -> bool:
         """Take a job out that waits; whether it did."""
@@ -170,9 +156,6 @@ class ServiceQueue:
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
         self.free(job)
-        if (ahead := self._ahead) is not None:
-            self._ahead, self._begun_last = None, now
-            ahead.begun, ahead.level = now, self.at_work
         self._unanswered = self.at_work
         self._quiet_since = now if self.at_work else None
 
@@ -182,8 +165,6 @@ class ServiceQueue:
             job.passed_on = False
             self.at_work -= 1
             self._alone = False
-            if self._ahead is job:
-                self._ahead = None
             self._unanswered -= 1
             if not self._unanswered:
                 self._quiet_since = None
