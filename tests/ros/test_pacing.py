@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 import threading
 import time
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import RosError
+from fogft.ros.pacing import pace as pacing
 from fogft.ros.pacing.pace import (
     EVERY_S,
     PROBED_WINDOW,
@@ -266,7 +268,8 @@ def handle(client: int, number: int) -> bytes:
     return bytes([client]) * 16 + number.to_bytes(8, "little")
 
 
-def test_every_response_is_sent_once_and_in_order():
+def test_every_response_is_sent_once_and_in_order(monkeypatch):
+    monkeypatch.setattr(pacing, "BEHIND_S", math.inf)  # however slow this machine is
     sent = Sent()
     sent.expected = 99
     pacer = Pacer(sent, UNKNOWN, "/s")
@@ -277,6 +280,28 @@ def test_every_response_is_sent_once_and_in_order():
     assert sent.all.wait(30)
     assert sent.responses == [(handle(1, n), b"%d" % n) for n in range(100) if n != 50]
     pacer.close()
+
+
+def test_who_takes_more_slowly_than_it_asks_gets_the_newest_first():
+    """In turn, each would come long after its caller has given up: none would be of use."""
+    pace, ages = Pace(), []
+    client = pace.client(b"a", 0.0)
+    client.probing = Probing.YES
+    for step in range(3000):  # it asks ten times a second and takes four
+        now = step * 0.05
+        if step % 2 == 0:
+            client.requested(now)
+        answered = step % 2 == 0 and step >= 6  # the service takes 0.3 s
+        if answered and (client.waiting or not pace.take(client, now)):
+            assert client.hold(now - 0.3, b"", now)
+        if step % 5 == 0:
+            client.probes_due(now, pace.sent)
+            client.answered_probe(now)
+            while client.waiting and pace.take(client, now):
+                ages.append(now - client.next(now)[0])
+    late = ages[len(ages) // 2 :]
+    assert len(late) > 200
+    assert max(late) < 2.0
 
 
 @pytest.mark.parametrize(("size", "most"), [(0, WAITING_LIMIT), (1 << 20, 64)])

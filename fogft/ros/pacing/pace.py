@@ -36,6 +36,9 @@ _CLIENTS_KEPT = 64
 _PROBE_AGAIN_S = 1.0  # one was lost
 _SILENT_S = 0.2  # who answers no probe for so long holds up none but itself
 _GIVEN_UP_S = 30.0  # who answers none for so long gets its responses by time
+# Who takes more slowly than it asks is behind for good. Once the oldest response has waited for so
+# long, the newest goes first: in turn, each would come when its caller has given up.
+BEHIND_S = 1.0
 
 
 class Probing(Enum):
@@ -51,7 +54,7 @@ class ClientPace:
     """One client.
 
     Attributes:
-        waiting: Responses that may not be sent yet: handle and bytes.
+        waiting: Responses that may not be sent yet: handle, bytes, since when.
         untaken: Numbers of its responses that it may not have taken, oldest first.
         probed_at: When the oldest probe was sent that is not answered; None for none.
         finding_until: Until when discovery is given to find it; None where it has.
@@ -60,7 +63,7 @@ class ClientPace:
     """
 
     def __init__(self, now: float, sent: int) -> None:
-        self.waiting: deque[tuple[Any, bytes]] = deque()
+        self.waiting: deque[tuple[Any, bytes, float]] = deque()
         self.untaken: deque[int] = deque()
         self.probing = Probing.UNASKED
         self.probed_at: float | None = None
@@ -104,24 +107,25 @@ class ClientPace:
             if self._proofs >= 4 * self._window:
                 self._window, self._proofs = min(2 * self._window, WINDOW_LIMIT), 0
 
-    def hold(self, handle: Any, payload: bytes) -> bool:
+    def hold(self, handle: Any, payload: bytes, now: float) -> bool:
         """Have a response wait; False where too much waits already."""
         whole = self._waiting_bytes + len(payload)
         if self.waiting and (len(self.waiting) >= WAITING_LIMIT or whole > WAITING_BYTES_LIMIT):
             return False
         self._waiting_bytes = whole
-        self.waiting.append((handle, payload))
+        self.waiting.append((handle, payload, now))
         return True
 
-    def next(self) -> tuple[Any, bytes]:
-        """Return the response that waited for longest."""
-        handle, payload = self.waiting.popleft()
+    def next(self, now: float) -> tuple[Any, bytes]:
+        """Return the response that waited for longest; of a client that is behind, the newest."""
+        behind = self.finding_until is None and now - self.waiting[0][2] > BEHIND_S
+        handle, payload, _ = self.waiting.pop() if behind else self.waiting.popleft()
         self._waiting_bytes -= len(payload)
         return handle, payload
 
     def not_found(self, handle: Any, payload: bytes, now: float) -> None:
         """Have a response wait that was sent before discovery had found the client."""
-        self.waiting.appendleft((handle, payload))
+        self.waiting.appendleft((handle, payload, now))
         self._waiting_bytes += len(payload)
         self.finding_until = self.finding_until or now + FIND_LIMIT_S
         self.find_again_at = now + EVERY_S

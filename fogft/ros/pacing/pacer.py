@@ -94,7 +94,7 @@ class Pacer:
         with self._wake:
             client = self._pace.client(id, now)
             if client.waiting or client.finding_until or not self._pace.take(client, now):
-                if client.hold(handle, payload):
+                if client.hold(handle, payload, now):
                     self._held[id] = client
                     self._begin()
                     return
@@ -154,7 +154,7 @@ class Pacer:
             if finding and now < client.find_again_at:
                 continue
             while client.waiting and self._pace.take(client, now):
-                due.append((id, client, *client.next()))
+                due.append((id, client, *client.next(now)))
                 if finding:
                     break
             if client.waiting:
