@@ -134,13 +134,13 @@ def explain(
         spec: The pool file.
         intent: The user's wishes; exclusions count.
         observed: Offers, distances and the time; machines and links are not looked at.
-        history: What happened to the pool before: losses and failures count.
+        history: What happened to the pool before: losses and failures of places count.
         on_demand: What one on-demand machine of this kind costs, for comparison.
         recovery_s: How long launches have taken, in place of what is assumed where nobody said.
     """
     world = replace(observed, machines=(), links=None, ending=frozenset())
     intent = replace(intent, stopping=False)
-    planned = plan(NO_POOL, spec, intent, world, history)
+    planned = plan(NO_POOL, spec, intent, world, history.places_alone())
     sized = size(spec, intent, world)
     scale = Scale(spec.placement.latency_weight, observed.rtt_s)
     reasons = _Reasons(

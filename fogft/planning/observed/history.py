@@ -293,6 +293,13 @@ class History:
         """Return the launches that have not ended, as far as was seen."""
         return list(self._open.values())
 
+    def places_alone(self) -> History:
+        """Return what is known of places alone, with which a pool begins anew."""
+        anew = History()
+        anew._failures, anew._proven_at = self._failures, self._proven_at
+        anew._lives, anew._losses = self._lives, self._losses
+        return anew
+
     @property
     def locations(self) -> frozenset[str]:
         """Every location that anything was launched in."""
