@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 MESSAGE_BYTES_LIMIT = 256 << 20
 _SESSIONS_LIMIT = 128  # robots, and gateways, at one replica
 _HANDSHAKES_LIMIT = 32
-# Of this machine alone, and nobody else's: from there their sockets are moved (`accept_loops`).
-SPARE_HOST = "127.70.79.71"
-_SPARES = 7
 _SIGN_OF_LIFE_EVERY_S = 2.0
 
 
@@ -104,13 +101,12 @@ def replica_settings(
 ) -> dict[str, Any]:
     """Return the settings of a replica's session, which listens at ``host:port``."""
     keys = f"{names.slot_prefix(id.pool_uid, id.slot)}/**"
-    spare = f"[::ffff:{SPARE_HOST}]" if listen.startswith("[") else SPARE_HOST
     return {
         **_common(settings),
         # Not `router`: that would carry robots' messages to each other.
         "mode": "peer",
         "connect/endpoints": [],
-        "listen/endpoints": [f"tls/{listen}", *[f"tls/{spare}:0#exit_on_failure=false"] * _SPARES],
+        "listen/endpoints": [f"tls/{listen}"],
         "listen/exit_on_failure": True,
         "transport/unicast/max_sessions": _SESSIONS_LIMIT,
         "transport/unicast/accept_pending": _HANDSHAKES_LIMIT,

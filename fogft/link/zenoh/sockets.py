@@ -13,17 +13,14 @@ import contextlib
 import ctypes
 import fcntl
 import os
-import platform
-import re
 import select
 import socket
 import stat
 import struct
 import termios
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import chain
-from pathlib import Path
 
 from fogft.link.socket_progress import Flow
 
@@ -39,9 +36,6 @@ _COUNT = struct.Struct("@i")
 _TCP_NOTSENT_LOWAT = 25
 _UNSENT_BYTES = 16 << 10
 _AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing waits for nothing, and resets
-# struct epoll_event, which is packed on this platform alone.
-_EPOLL_EVENT = struct.Struct("=IQ" if platform.machine() == "x86_64" else "@IQ")
-_EPOLL_ADD, _EPOLL_REMOVE = 1, 2
 _NOWHERE = bytes(16)  # struct sockaddr of AF_UNSPEC: to connect there resets a connection
 _libc = ctypes.CDLL(None)
 _LOOK_AGAIN_S = 0.01
@@ -72,51 +66,24 @@ def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
             yield ends[1], connection
 
 
-def listening(wanted: Callable[[Address], bool]) -> Iterator[tuple[int, socket.socket]]:
-    """Yield each descriptor that listens at a wanted address, and a socket of ours to the same."""
-    seen = set[int]()  # a socket of ours may have taken a number that is still to come
+def listening(port: int) -> socket.socket | None:
+    """Return a socket of ours to the one that listens at a port; None where there is none."""
     for number in _numbers():
         connection = _duplicate(number)
         if connection is None:
             continue
-        inode = os.fstat(connection.fileno()).st_ino
+        if _listens(connection, port):
+            return connection
+        connection.close()
+    return None
+
+
+def _listens(connection: socket.socket, port: int) -> bool:
+    try:
         listens = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-        host, port = connection.getsockname()[:2]
-        if listens and inode not in seen and wanted((_plain(host), port)):
-            seen.add(inode)
-            yield number, connection
-        else:
-            connection.close()
-
-
-@contextlib.contextmanager
-def unwatched(number: int) -> Iterator[bool]:
-    """Have Zenoh hear nothing of a socket while the body runs, nor of what was in between.
-
-    Yields:
-        Whether that can be: false where it is not this process's one ``epoll`` that watches it.
-    """
-    found = {  # the same ``epoll`` may have several descriptors
-        said: watch for watch in _numbers() for said in _watched(watch, number)
-    }
-    if len(found) != 1:
-        yield False
-        return
-    (((events, data), watch),) = found.items()
-    _libc.epoll_ctl(watch, _EPOLL_REMOVE, number, None)
-    try:
-        yield True
-    finally:
-        event = _EPOLL_EVENT.pack(int(events, 16), int(data, 16))
-        _libc.epoll_ctl(watch, _EPOLL_ADD, number, event)
-
-
-def _watched(watch: int, number: int) -> list[tuple[str, str]]:
-    try:
-        text = Path(f"/proc/self/fdinfo/{watch}").read_text(encoding="ascii")
+        return bool(listens) and connection.getsockname()[1] == port
     except OSError:
-        return []  # closed in between
-    return re.findall(rf"^tfd: +{number} events: +(\w+) data: +(\w+)", text, re.MULTILINE)
+        return False
 
 
 class OwnSocket:

@@ -26,7 +26,6 @@ from fogft.link.counters import Counters
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
-from fogft.link.zenoh.replica.accept_loops import AcceptLoops
 from fogft.link.zenoh.replica.door import Door
 from fogft.link.zenoh.replica.listen_filter import ListenFilter
 from fogft.link.zenoh.sockets import Address
@@ -105,8 +104,7 @@ class ConnectionReaper:
         self._stuck_after_s = stuck_after_s
         self.thin: frozenset[str] = frozenset()
         self._progress: dict[Address, SocketProgress] = {}
-        self._loops = AcceptLoops(port)
-        self._filter = ListenFilter(self._loops)
+        self._filter = ListenFilter(port)
         self._door = Door()
         self._reserve = DescriptorReserve()
         self._shut = False
@@ -129,24 +127,22 @@ class ConnectionReaper:
             except Exception:
                 log.exception("doorkeeper_failed port=%d", self._port)
                 self._filter.drop(frozenset())
-        self._loops.close()
+        self._filter.close()
         self._reserve.release()
 
     def _await_look(self) -> None:
         """Wait until it is time to look: soon after somebody came, at once where many do."""
         began = time.monotonic()
         until = began + (_LOOK_AGAIN_S if self._shut else LOOK_EVERY_S)
-        while (left_s := until - time.monotonic()) > 0 and self._loops.wait(left_s):
+        while (left_s := until - time.monotonic()) > 0 and self._filter.wait(left_s):
             if sockets.count() >= self._descriptors + RUSH_LIMIT:
                 self._filter.drop(None)  # until it is known whose they are
                 return
             until = min(until, began + _LOOK_AGAIN_S)
             time.sleep(_LOOK_AGAIN_S / 50)
-            self._loops.look(time.monotonic())
 
     def look(self, now: float) -> None:
         """Look once, and end what has to go."""
-        self._loops.look(now)
         short = not self._reserve.fill()
         if short:
             self._filter.drop(None)  # first: what is given back is not for strangers
@@ -161,14 +157,12 @@ class ConnectionReaper:
             revoked = self._revoked()
             for peer, name in links.items():
                 if name in revoked and peer in found:
-                    sockets.end(found[peer])
-                    self._ended(peer, "revoked_links", name)
+                    self._end(found[peer], peer, "revoked_links", name)
             self._watch(links, found, now)
             strangers = found.keys() - links.keys()
             gone = self._door.look(strangers, links.keys(), now)
-            for stranger in strangers if short else gone:
-                sockets.abort(found[stranger])  # and it is not found again, ended by Zenoh or not
-                self._ended(stranger, "unauthenticated", "")
+            for stranger in strangers if short else () if gone is None else (gone,):
+                self._end(found[stranger], stranger, "unauthenticated", "")
             # Where nobody is left to be ended, it is not strangers who leave too few.
             self._keep_out(None if short and strangers else self._door.kept_out)
         self._descriptors = sockets.count()
@@ -180,7 +174,7 @@ class ConnectionReaper:
             self._counters.warn(
                 log, "kept_out", "door_shut hosts=%s", "all" if hosts is None else sorted(hosts)
             )
-            self._loops.turn_away()
+            self._filter.turn_away()
         self._shut = shut
 
     def _watch(
@@ -201,12 +195,12 @@ class ConnectionReaper:
                 thin.add(links[peer])
                 sockets.keep_short(found[peer])
             if one.stuck_s(now) > self._stuck_after_s:
-                sockets.end(found[peer])
-                self._ended(peer, "stuck_links", links[peer])
+                self._end(found[peer], peer, "stuck_links", links[peer])
         self._progress = progress
         self.thin = frozenset(thin)
 
-    def _ended(self, peer: Address, event: str, name: str) -> None:
+    def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:
+        sockets.end(connection)
         self._counters.warn(
             log, event, "connection_ended reason=%s peer=%s:%d name=%r", event, *peer, name
         )

@@ -1,8 +1,8 @@
 """Whom a replica's port accepts, and which strangers have to go. Pure: `now` is an argument.
 
 A stranger is who has connected and not said who he is: a robot in the midst of its handshake, or
-nobody that is wanted. Each costs Zenoh a handshake, and a rest in one of its `accept_loops`. So few
-are let in of each host, and those who stay long are ended.
+nobody that is wanted. Zenoh rests for 0.1 s after each handshake that fails, and all that come
+after wait for that. So few strangers are let in of each host, and they are ended one by one.
 
 Owns: the judgement. Not here: the sockets (`connection_reaper`, `listen_filter`).
 """
@@ -25,6 +25,8 @@ SHUT_LIMIT = 32
 LEAST_AGE_S = 0.5
 # A host is kept out for so long, where no robot there has a link.
 KEPT_OUT_S = 10.0
+# One at a time: longer than Zenoh's rest.
+END_EVERY_S = 0.12
 
 
 class Door:
@@ -33,18 +35,23 @@ class Door:
     def __init__(self) -> None:
         self._first_seen: dict[Address, float] = {}
         self._until: dict[str, float] = {}  # hosts that are kept out
+        self._ended_at = float("-inf")
 
     def look(
         self, strangers: Collection[Address], linked: Collection[Address], now: float
-    ) -> list[Address]:
-        """Take who is connected, linked or not; return the strangers to be ended now."""
+    ) -> Address | None:
+        """Take who is connected, linked or not; return the stranger to be ended now."""
         self._first_seen = {peer: self._first_seen.get(peer, now) for peer in strangers}
         known = {host for host, _ in linked}
         self._until = {
             host: until for host, until in self._until.items() if now < until and host not in known
         }
         self._until.update((host, now + KEPT_OUT_S) for host in full(strangers))
-        return condemned(self._first_seen, now)
+        gone = condemned(self._first_seen, now)
+        if not gone or now - self._ended_at < END_EVERY_S:
+            return None
+        self._ended_at = now
+        return gone[0]
 
     @property
     def kept_out(self) -> frozenset[str] | None:
@@ -61,13 +68,11 @@ def full(strangers: Collection[Address]) -> set[str]:
 
 def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
     """Return which strangers (when each was first seen) have to go, oldest first."""
-    by_age, crowded = sorted(strangers, key=lambda peer: strangers[peer]), full(strangers)
-    surplus = set[Address]()
-    for host in crowded:  # who shares its address is to have a turn
+    by_age = sorted(strangers, key=lambda peer: strangers[peer])
+    surplus = set(by_age[: max(0, len(by_age) - STRANGERS_LIMIT)])
+    for host in full(strangers):  # who shares its address is to have a turn
         of_host = [peer for peer in by_age if peer[0] == host]
         surplus.update(of_host[: len(of_host) - HOST_LIMIT // 2])
-    others = [peer for peer in by_age if peer[0] not in crowded]
-    surplus.update(others[: max(0, len(others) - STRANGERS_LIMIT)])
     return [
         peer
         for peer in by_age

@@ -6,37 +6,86 @@ from whom too many are under way nothing more is to be accepted. A filter on the
 meant it well sends that again after a second, or tries anew. Links that are open are other sockets:
 they pass no filter that drops their packets, and nothing stands between them and Zenoh.
 
-Owns: what the filter says. Not here: whose connections are dropped (`connection_reaper`), and the
-listening sockets (`accept_loops`).
+Owns: the listening socket's filter and its queue. Not here: whose connections are dropped
+(`connection_reaper`).
 """
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import ipaddress
+import select
+import socket
+import struct
+import time
 from collections.abc import Iterable
 
-from fogft.link.zenoh.replica.accept_loops import RETURN, AcceptLoops, Instruction
+from fogft.link.zenoh import sockets
 
 HOSTS_LIMIT = 32  # where more are to be kept out, all are
+# Connections that may wait for Zenoh. It takes them at once, but for its rests.
+WAITING_LIMIT = 4
 
-_LOAD_WORD, _LOAD_BYTE, _SHIFT_RIGHT, _JUMP_IF_EQUAL = 0x20, 0x30, 0x74, 0x15
+_ATTACH, _DETACH = 26, 27  # SO_ATTACH_FILTER and SO_DETACH_FILTER of asm-generic/socket.h
+# Classic BPF (linux/filter.h): the code, where to jump if true and if not, and a constant.
+_INSTRUCTION = struct.Struct("@HBBI")
+_LOAD_WORD, _LOAD_BYTE, _SHIFT_RIGHT, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x30, 0x74, 0x15, 0x06
 _IP_HEADER = -0x100000 & 0xFFFFFFFF  # SKF_NET_OFF
 _DROP, _PASS = 0, 0xFFFFFFFF
+
+Instruction = tuple[int, int, int, int]
 
 
 class ListenFilter:
     """What is dropped at one port of this process. For one thread."""
 
-    def __init__(self, loops: AcceptLoops) -> None:
-        self._loops = loops
+    def __init__(self, port: int) -> None:
+        self._listening = sockets.listening(port)
         self._dropped: frozenset[str] | None = frozenset()
+        if self._listening is not None:
+            with contextlib.suppress(OSError):  # it stopped listening
+                self._listening.listen(WAITING_LIMIT)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until a connection comes, but no longer than that; return whether one came."""
+        if self._listening is None:
+            time.sleep(timeout_s)
+            return False
+        waiting = select.poll()
+        waiting.register(self._listening, select.POLLIN)
+        return bool(waiting.poll(timeout_s * 1e3))
+
+    def turn_away(self) -> None:
+        """End the connections that wait for Zenoh to take them."""
+        if self._listening is None:
+            return
+        self._listening.setblocking(False)  # as it is for Zenoh
+        with contextlib.suppress(OSError):  # none waits any more
+            while True:
+                connection, _ = self._listening.accept()
+                sockets.abort(connection)
+                connection.close()
 
     def drop(self, hosts: frozenset[str] | None) -> None:
         """Drop the new connections of these hosts from now on, and of no others; None for all."""
-        if hosts != self._dropped:
-            code = instructions(None if hosts and len(hosts) > HOSTS_LIMIT else hosts)
-            self._loops.judge([] if hosts == frozenset() else code)
+        if hosts == self._dropped or self._listening is None:
+            return
+        hosts = None if hosts is not None and len(hosts) > HOSTS_LIMIT else hosts
+        with contextlib.suppress(OSError):  # it stopped listening
+            if hosts == frozenset():
+                self._listening.setsockopt(socket.SOL_SOCKET, _DETACH, 0)
+            else:
+                code = b"".join(_INSTRUCTION.pack(*one) for one in instructions(hosts))
+                held = ctypes.create_string_buffer(code, len(code))
+                program = struct.pack("@HP", len(code) // _INSTRUCTION.size, ctypes.addressof(held))
+                self._listening.setsockopt(socket.SOL_SOCKET, _ATTACH, program)
             self._dropped = hosts
+
+    def close(self) -> None:
+        """Let go of the port: nothing of ours keeps it open."""
+        if self._listening is not None:
+            self._listening.close()
 
 
 def instructions(hosts: Iterable[str] | None) -> list[Instruction]:
@@ -45,14 +94,14 @@ def instructions(hosts: Iterable[str] | None) -> list[Instruction]:
     Of an IPv6 address the network counts, its first 64 bits: who has one address has them all.
     """
     if hosts is None:
-        return [(RETURN, 0, 0, _DROP)]
+        return [(_RETURN, 0, 0, _DROP)]
     addresses = [ipaddress.ip_address(host.partition("%")[0]) for host in sorted(hosts)]
-    passed = (RETURN, 0, 0, _PASS)
+    passed = (_RETURN, 0, 0, _PASS)
     v4: list[Instruction] = [(_LOAD_WORD, 0, 0, _IP_HEADER + 12 & 0xFFFFFFFF)]
     v6: list[Instruction] = []
     for one in addresses:
         if one.version == 4:
-            v4 += [(_JUMP_IF_EQUAL, 0, 1, int(one)), (RETURN, 0, 0, _DROP)]
+            v4 += [(_JUMP_IF_EQUAL, 0, 1, int(one)), (_RETURN, 0, 0, _DROP)]
         else:
             network, host = divmod(int(one) >> 64, 1 << 32)
             v6 += [
@@ -60,7 +109,7 @@ def instructions(hosts: Iterable[str] | None) -> list[Instruction]:
                 (_JUMP_IF_EQUAL, 0, 3, network),
                 (_LOAD_WORD, 0, 0, _IP_HEADER + 12 & 0xFFFFFFFF),
                 (_JUMP_IF_EQUAL, 0, 1, host),
-                (RETURN, 0, 0, _DROP),
+                (_RETURN, 0, 0, _DROP),
             ]
     return [
         (_LOAD_BYTE, 0, 0, _IP_HEADER),
