@@ -22,7 +22,6 @@ from pathlib import Path
 from fogft import disk
 from fogft.cli import main
 from fogft.cloud.local import faults
-from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.sky.journal import Entry, Journal
 from fogft.cloud.sky.wheel import LockFolder, Locks
 from fogft.errors import FogftError
@@ -34,8 +33,8 @@ from fogft.model.replica import Member, Membership, Placement, ReplicaId
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.observed.services import Discovered
 from fogft.planning.rollout import Trial
+from fogft.pool.commands import status
 from fogft.pool.commands.composition import make_store
-from fogft.pool.commands.status import ask
 from fogft.pool.credentials import authority, claiming
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.lease import Lease
@@ -92,7 +91,7 @@ def _pool(paths: PoolPaths) -> None:
         lambda: records_cache.read(paths.records),
         lambda: Ledger(paths.credentials).by_hand(),
         lambda: Ledger(paths.credentials).gateways(),
-        lambda: ask(store, LocalCloud(paths.folder.parents[1] / "local"), time.time()),
+        lambda: status.read(paths, time.time()),
     ]
     for read in reads:
         with contextlib.suppress(FogftError):

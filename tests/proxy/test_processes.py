@@ -124,7 +124,7 @@ def a_killed_proxy_is_replaced_by_the_one_in_line(parts, robot, caller):
         robot.process.kill()
         robot.process.wait()
         caller.wait()
-        assert caller.servers() == 1
+        wait_for(lambda: caller.servers() == 1, "word of its end, long before its lease", 10.0)
         robot.process = standby
         wait_for(lambda: robot.report()["pid"] == robot.process.pid, "the standby's report")
         caller.ask(50)
