@@ -177,7 +177,9 @@ def test_every_launch_asks_for_the_guard_once_after_the_users_own_commands(
     silent.launch.return_value = "r1"
     # As the functions of the SDK do, whose place is taken here.
     monkeypatch.setattr("sky.utils.annotations.is_on_api_server", False)
-    skypilot_config.apply_cli_config(["aws.post_provision_runcmd=[echo mine]"])
+    skypilot_config.apply_cli_config(
+        ["aws.post_provision_runcmd=[echo mine]", "allowed_clouds=[aws]"]
+    )
     for _ in range(2):
         installed.launch({"run": "serve"}, "c")
         asked = carried()["aws"]["post_provision_runcmd"]
