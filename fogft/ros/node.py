@@ -218,12 +218,17 @@ class SerialisedNode:
         return ClientNode(*nodes[client], unique=len(processes) == 1)
 
     def participant(self, service: str) -> bytes:
-        """Return the first bytes of our participant's id; empty before it offers `service`."""
+        """Return the first bytes of our participant's id; empty before it offers `service`.
+
+        Empty as well while another of our name does: one that hands over to us, or was killed.
+        """
         requests, own = f"rq{service}Request", self._node.get_name()
-        for reader in self._endpoints(self._node.get_subscriptions_info_by_topic, requests):
-            if reader.node_name == own:
-                return bytes(reader.endpoint_gid)[: farewell.PREFIX_BYTES]
-        return b""
+        named = {
+            bytes(reader.endpoint_gid)[: farewell.PREFIX_BYTES]
+            for reader in self._endpoints(self._node.get_subscriptions_info_by_topic, requests)
+            if reader.node_name == own
+        }
+        return named.pop() if len(named) == 1 else b""
 
     def callers(self, service: str) -> int:
         """Count the clients of a service that discovery has found: those find us, too."""

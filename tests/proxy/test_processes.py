@@ -121,6 +121,7 @@ def a_killed_proxy_is_replaced_by_the_one_in_line(parts, robot, caller):
         standby = robot.start_standby()
         assert parts.start("proxy", robot.config, {}, "--standby").wait(LIMIT_S) == 1
         wait_for(lambda: robot.report().get("participant"), "its id in DDS")
+        wait_for(lambda: caller.servers() == 1, "the end of the leases of those killed before")
         robot.process.kill()
         robot.process.wait()
         caller.wait()

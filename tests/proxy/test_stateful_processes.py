@@ -313,6 +313,8 @@ def test_a_client_proxy_that_is_told_to_end_hands_its_order_over_without_losing_
     replicas = [parts.replica(0), parts.replica(1)]
     robot = parts.robot("robot", *replicas)
     counters = [clients(robot, "/count", lambda: ("add", 1)) for _ in range(3)]
+    for client in counters:
+        client.patience_s = TIMEOUT_S  # what is lost never comes
     wait_for(lambda: all(c.answered >= 5 for c in counters), "answers")
     for _ in range(2):
         leaving, robot.process = robot.process, robot.start_standby()

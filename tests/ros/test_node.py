@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,22 @@ def test_no_other_user_can_read_what_a_node_sends(
     segments = set(re.findall(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]{16}\b", maps))
     assert segments
     assert {Path(one).stat().st_mode & 0o777 for one in segments} == {0o600}
+
+
+def test_a_node_never_takes_another_of_its_name_for_itself(ros_domain: int) -> None:
+    """While both offer a service, as when one hands over to the other, neither tells its id."""
+    from fogft.ros.node import SerialisedNode
+
+    with closing(SerialisedNode("ours", ros_domain)) as second:
+        with closing(SerialisedNode("ours", ros_domain)) as first:
+            first.serve("/flag", SET_BOOL, lambda payload, handle: None)
+            wait_for(lambda: bool(first.participant("/flag")), "its own id")
+            own = first.participant("/flag")
+            second.serve("/flag", SET_BOOL, lambda payload, handle: None)
+            wait_for(lambda: not first.participant("/flag"), "the other one")
+            assert second.participant("/flag") != own
+        wait_for(lambda: bool(second.participant("/flag")), "the first one's end")
+        assert second.participant("/flag") != own
 
 
 def test_a_callback_that_raises_costs_only_its_own_message(
