@@ -31,6 +31,8 @@ class SendOptions:
     """Which services want the newest first, no compression, or a deadline on the way.
 
     Attributes:
+        latest: Those of which the newest request goes first.
+        plain: Those whose payloads are never compressed.
         timed: Those whose requests nobody wants after their time. Of others, such as topics and the
             orders of a stateful service, it only says when they are sent again.
     """
@@ -75,6 +77,7 @@ class ReplicaWord:
         ready: Names of the services that it can answer now.
         draining: It asks to be left alone: its machine will be taken.
         at_risk: Its cloud recommends to move it; it serves on meanwhile.
+        restarts: How often it restarted the user's `run` command.
         detail: Why it is not ready, in words; empty when it is.
         version: Of fogft on the replica; empty before 0.2.0.
         lease_age_s: Since it last heard of the pool's manager; None for never.
@@ -123,6 +126,7 @@ class ProbeAnswer(ReplicaWord):
     Attributes:
         incarnation: Random text made when the server proxy started. A new one at the
             same id means that it forgot every request.
+        work: What became of requests since its start, by name (`Responder.report`).
         offered: Service name -> type of what `run` offers, where it is to be found out.
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
@@ -143,7 +147,13 @@ class ProbeAnswer(ReplicaWord):
 
 
 class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
-    """The end of one attempt: `payload` if the service answered, else a `refusal`."""
+    """The end of one attempt: `payload` if the service answered, else a `refusal`.
+
+    Attributes:
+        service: The name given to `Link.offer`.
+        detail: What belongs to a refusal of its kind.
+        load: What the replica has to do, if it says so.
+    """
 
     request_id: bytes
     payload: bytes | None = None
@@ -164,7 +174,10 @@ class LinkEvents(Protocol):
         """
 
     def late(self, link: Link, answer: Answer) -> None:
-        """A forgotten attempt has ended; not told of every connection that was given up."""
+        """An attempt has ended that was forgotten: its bytes are for nobody.
+
+        Of a connection that was given up it may not be told.
+        """
 
     def changed(self, link: Link) -> None:
         """The link's `state`, `probe_answer` or room in its window has changed."""
@@ -172,7 +185,11 @@ class LinkEvents(Protocol):
 
 @dataclass(frozen=True)
 class Peer:
-    """A replica to dial, the name its certificate must have, and our interface; empty for any."""
+    """A replica to dial: its endpoint (``host:port``) and the name its certificate must have.
+
+    Attributes:
+        interface: Through which of our network interfaces; empty for whatever the routes say.
+    """
 
     id: ReplicaId
     endpoint: str
@@ -182,7 +199,12 @@ class Peer:
 
 @dataclass(frozen=True)
 class LinkStatus:
-    """A snapshot of a link. Durations in seconds. `ignores`: requests go in and never end."""
+    """A snapshot of a link. Durations in seconds.
+
+    Attributes:
+        uplinks: How each uplink does, where there are several, for people.
+        ignores: It takes requests and never ends them, though others answer them.
+    """
 
     state: LinkState
     probe_answer: ProbeAnswer | None
@@ -233,13 +255,17 @@ class Link(Protocol):
 
         Args:
             more: Others follow at once, then `send`: it may wait for them, to leave in one message.
+            handling: What the replica is asked to do with it.
         """
 
     def send(self) -> None:
         """Send what was offered with `more`. Cheap; never blocks."""
 
     def forget(self, request_id: bytes) -> None:
-        """Free the window of a request that is not wanted; at `flush` the replica knows."""
+        """Free the window of a request whose answer is no longer wanted. Unknown ids are fine.
+
+        The replica is told: at once if the request has been out for a while, else by `flush`.
+        """
 
     def flush(self) -> None:
         """Tell the replica of all that was forgotten and not answered. Cheap; never blocks."""
@@ -270,14 +296,24 @@ class Dialer(Protocol):
         """Return what replicas said last in place of what they were told; nothing is verified."""
 
     def certificate(self) -> str:
-        """Return the common name that every link uses; empty for none, or several."""
+        """Return the common name of the certificate that every link uses.
+
+        Empty while some still use another one, and where there are no certificates.
+        """
 
     def close(self) -> None:
         """Close every link."""
 
 
 class Incoming(Protocol):
-    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing."""
+    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing.
+
+    Attributes:
+        request_id: 16 bytes, made by the client proxy.
+        robot: Who asks; replies to one robot never wait for another.
+        remaining_s: Time that was left when the robot sent it.
+        handling: What this replica is asked to do with it.
+    """
 
     service: str
     request_id: bytes
@@ -287,7 +323,12 @@ class Incoming(Protocol):
     payload: bytes
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
-        """Send the serialised response. Never blocks."""
+        """Send the serialised response. Never blocks.
+
+        Args:
+            load: What the replica has to do for this service.
+            more: Others will soon follow, to leave in one message with it.
+        """
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal. Never blocks."""
