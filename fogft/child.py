@@ -14,7 +14,7 @@ _PROGRAM = """
 import ctypes, os, signal, sys
 ctypes.CDLL(None).prctl(1, int(signal.SIGKILL), 0, 0, 0)
 if os.getppid() != int(sys.argv[1]):
-    sys.exit("the parent died before its child began")
+    sys.exit("the parent process died before its child started")
 os.execvp(sys.argv[2], sys.argv[2:])
 """
 

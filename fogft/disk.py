@@ -1,4 +1,4 @@
-"""Files as every process here shares them: written whole, private, locked by the kernel.
+"""Files shared between processes: replaced atomically, private, locked by the kernel.
 
 A reader sees the old file or the new one, never a torn one; a full disk leaves the old one.
 Locks are flocks: they end with the process that holds them, whatever ends it.
@@ -14,18 +14,21 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fogft.errors import StateError
+from fogft.model.plain import stored
 
 if sys.platform != "win32":  # where files are only read and written by one process
     import fcntl
 
 _PATIENCE_S = 0.2
+_ROOM_BYTES = 64 << 10  # for a status file
+T = TypeVar("T")
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder that only this user can enter, and those above it.
+    """Create a folder that only this user can enter, with its parents.
 
     Raises:
         StateError: It cannot be made.
@@ -34,7 +37,7 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         hint = "check the disk and the owner, or set FOGFT_HOME to another folder"
-        raise StateError(f"`{path}` cannot be made: {error.strerror}", hint) from error
+        raise StateError(f"`{path}` cannot be created: {error.strerror}", hint) from error
     with contextlib.suppress(OSError):
         path.chmod(0o700)
 
@@ -75,18 +78,44 @@ def to_json(value: Any) -> str:
     return json.dumps(value, indent=1) + "\n"
 
 
-def read_json(path: Path) -> Any:
-    """Return what a JSON file holds, or None where there is no file."""
+def read_bytes(path: Path) -> bytes | None:
+    """Return what a file holds, or None where there is none. Raises StateError."""
     try:
-        text = path.read_text()
+        return path.read_bytes()
     except FileNotFoundError:
         return None
-    except (OSError, UnicodeDecodeError) as error:
-        raise StateError(f"`{path}` cannot be read: {error}") from error
+    except OSError as error:  # a folder, a link to itself, another user's
+        hint = "move it away, or see that this user may read it"
+        raise StateError(f"`{path}` cannot be read: {error.strerror}", hint) from error
+
+
+def read_json(path: Path) -> Any:
+    """Return what a JSON file holds, or None where there is no file. Raises StateError."""
+    raw = read_bytes(path)
+    if raw is None:
+        return None
     try:
-        return json.loads(text)
+        return json.loads(raw.decode())
     except (ValueError, RecursionError) as error:
         raise StateError(f"`{path}` is damaged: {error}") from error
+
+
+def read_as(cls: type[T], path: Path, hint: str = "") -> T | None:
+    """Return the value that a JSON file of ours describes, or None where there is no file.
+
+    Raises:
+        StateError: It cannot be read, or describes none.
+    """
+    raw = read_json(path)
+    return None if raw is None else stored(cls, raw, f"`{path}` is damaged", hint)
+
+
+def read_or(path: Path, otherwise: T) -> T:
+    """Return the same; another value of that class where there is no file, or a damaged one."""
+    try:
+        return read_as(type(otherwise), path) or otherwise
+    except StateError:
+        return otherwise
 
 
 class Lock:
@@ -100,7 +129,7 @@ class Lock:
         self._descriptor: int | None = None
 
     def acquire(self, *, wait: bool) -> bool:
-        """Take the lock; without `wait`, return False where another keeps it.
+        """Take the lock; without `wait`, return False where another keeps it. Raises OSError.
 
         Whoever only looks whether it is held (`is_locked`) holds it for an instant, so one
         refusal proves nothing: it is tried for a moment.
@@ -117,7 +146,7 @@ class Lock:
         return True
 
     def take_if_free(self) -> bool:
-        """Take the lock if it is free now, without patience, for who only wants to look."""
+        """Take the lock only if it is free now."""
         return self._try(fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def _try(self, how: int) -> bool:
@@ -138,7 +167,7 @@ class Lock:
 
 
 def standby_lock(path: Path) -> Path:
-    """Return the lock of who is next in line for a lock."""
+    """Return the lock that the next holder of a lock waits with."""
     return path.with_name(f"{path.stem}-standby{path.suffix}")
 
 
@@ -149,10 +178,7 @@ def locked(path: Path) -> Iterator[None]:
     try:
         lock.acquire(wait=True)
     except OSError as error:
-        raise StateError(
-            f"`{path}` cannot be opened: {error.strerror}",
-            "check the disk's free space and the folder's owner",
-        ) from error
+        raise not_opened(path, error) from error
     try:
         yield
     finally:
@@ -160,14 +186,64 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a living process holds the lock of this file."""
+    """Return whether a living process holds the lock of this file. Raises StateError."""
     if not path.exists():
         return False
     lock = Lock(path)
-    if not lock.take_if_free():
-        return True
+    try:
+        if not lock.take_if_free():
+            return True
+    except FileNotFoundError:  # its folder has just gone
+        return False
+    except OSError as error:
+        raise not_opened(path, error) from error
     lock.release()
     return False
+
+
+def not_opened(path: Path, error: OSError) -> StateError:
+    """Return what is said of a lock's file that cannot be opened."""
+    return StateError(
+        f"`{path}` cannot be opened: {error.strerror}",
+        "check the disk's free space and the folder's owner",
+    )
+
+
+def holder(lock: Path, *, said: bool = True) -> int | None:
+    """Return the process that holds a lock; None for nobody.
+
+    By the kernel's own list; in a container, whose overlays that list may know by another device,
+    by what the holder wrote, unless that is not to be believed (`said`).
+    """
+    try:
+        stat = lock.stat()
+        lines = Path("/proc/locks").read_text().splitlines()
+    except OSError:
+        return None
+    wanted = f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
+    for line in lines:
+        fields = line.split()
+        if len(fields) >= 6 and fields[1] == "FLOCK" and fields[5] == wanted:
+            pid = int(fields[4])
+            return pid if pid > 0 else None
+    try:
+        pid = int(lock.read_text()) if said else 0
+    except (OSError, ValueError):
+        return None
+    return pid if pid > 0 and is_locked(lock) else None
+
+
+def unwritable(folder: Path) -> str:
+    """Say why the disk of a folder takes nothing more, `full` or `read-only`; empty where it does.
+
+    Raises:
+        OSError: The folder cannot be looked at.
+    """
+    seen = os.statvfs(folder)
+    if seen.f_flag & os.ST_RDONLY:
+        return "read-only"
+    no_room = seen.f_bavail * seen.f_frsize < _ROOM_BYTES or (seen.f_files and not seen.f_favail)
+    return "full" if no_room else ""
 
 
 def version(path: Path) -> tuple[int, int, int] | None:
@@ -180,7 +256,7 @@ def version(path: Path) -> tuple[int, int, int] | None:
 
 
 class Watched:
-    """A file that is replaced whole: tells when it became another one."""
+    """Watches a file for being replaced."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

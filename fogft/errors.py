@@ -1,4 +1,4 @@
-"""Every error that a user can meet. Each has a message (what, where) and a hint (what to do).
+"""All errors shown to users. Each has a message (what, where) and a hint (what to do).
 
 The command line prints a `FogftError` as ``error:`` and ``hint:``, without a stack
 trace, and exits with status 1. Anything else is a defect of ours and keeps its trace.
@@ -46,7 +46,7 @@ class SpecError(FogftError):
 
 
 class StateError(FogftError):
-    """What is stored on disk for a pool cannot be used."""
+    """A pool's files on disk cannot be used."""
 
 
 class PoolNotFound(FogftError):
@@ -62,11 +62,11 @@ class RosError(FogftError):
 
 
 class Unreadable(RosError):
-    """These bytes are no message of the type: sending them again cannot help."""
+    """Bytes are not a message of their type; sending them again cannot help."""
 
 
 class WireError(FogftError):
-    """A link or a listener cannot be made."""
+    """A link or a listener cannot be created."""
 
 
 class CredentialError(FogftError):
@@ -74,27 +74,27 @@ class CredentialError(FogftError):
 
 
 class CloudError(FogftError):
-    """A cloud refused something, and said so."""
+    """A cloud refused a request."""
 
 
 class CloudUnreachable(CloudError):
-    """The cloud did not answer: nothing is known, and nothing may be concluded."""
+    """The cloud did not answer: nothing is known about its machines."""
 
 
 class NoCapacity(CloudError):
-    """This placement is full now. Another one, or another time, may do."""
+    """This placement is full now; another one, or a later attempt, may succeed."""
 
 
 class QuotaExceeded(CloudError):
-    """The account may not have more here. Waiting does not help."""
+    """The account's quota is used up here; waiting does not help."""
 
 
 class FrameError(ValueError):
-    """Bytes from a peer are not a frame of this version. Not for users: the peer is told."""
+    """Bytes from a peer are not a frame of this version. Sent to the peer, not shown to users."""
 
 
 def told(error: FogftError) -> str:
-    """Return an error in one sentence, with what to do about it."""
+    """Return an error and its hint in one sentence."""
     return f"{error.message}; {error.hint}" if error.hint else error.message
 
 

@@ -1,4 +1,4 @@
-"""Log files: all output of a process and its children, in one file that is bounded."""
+"""Log files: all output of a process and its children, in one file of bounded size."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _TAIL_BYTES = 4096
 
 
 def size(path: Path) -> int:
-    """Return how long a log is; 0 if there is none."""
+    """Return the size of a log in bytes; 0 if there is none."""
     return path.stat().st_size if path.exists() else 0
 
 
 def tail(path: Path, begin: int = 0, lines: int = TAIL_LINES) -> str:
-    """Return the last lines that were written to a log since it had a size; empty without one."""
+    """Return the last lines written to a log since it had a given size; empty without a log."""
     try:
         with path.open("rb") as file:
             file.seek(max(begin, size(path) - _TAIL_BYTES))
@@ -28,7 +28,7 @@ def tail(path: Path, begin: int = 0, lines: int = TAIL_LINES) -> str:
 
 
 def bound(path: Path, limit_bytes: int = LIMIT_BYTES, kept_bytes: int = KEPT_BYTES) -> None:
-    """Keep only the end of a log that has grown too long. Its writers append, so they go on."""
+    """Cut a log that has grown too long to its end. Writers append and are not disturbed."""
     if size(path) <= limit_bytes:
         return
     with path.open("r+b") as file:

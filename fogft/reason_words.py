@@ -1,4 +1,4 @@
-"""Reasons in words for people: command line, logs, reports. Nothing is decided from them."""
+"""Reasons in words, for command line, logs and reports. Nothing is decided from them."""
 
 from __future__ import annotations
 
@@ -141,38 +141,39 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.NOT_READY: "not ready after {r.seconds:.0f} s",
     Cause.NOT_SET_UP: "still setting up after {r.seconds:.0f} s",
     Cause.NOTICE: "preemption notice",
-    Cause.DRAINS_ITSELF: "preemption notice, told by the replica",
+    Cause.DRAINS_ITSELF: "preemption notice, reported by the replica",
     Cause.SILENT: "silent for {r.seconds:.0f} s",
     Cause.DISAGREES: "its answers differ from the other replicas'",
     Cause.MISREAD: "its answers cannot be read as responses of the service's type",
     Cause.IGNORES: "it takes requests and never answers them",
     Cause.AT_RISK: "the cloud recommends moving it (rebalance)",
     Cause.SERVICE_AWAY: "its service has been unavailable for {r.seconds:.0f} s",
+    Cause.NOT_LISTED: "no longer listed by the cloud",
     Cause.DRAINED: "drained by the user",
     Cause.EXCLUDED: lambda r: (
         f"excluded location {r.location}" if r.location else "excluded by `fogft exclude`"
     ),
     Cause.NO_GROUP: "its group is not in the pool file",
-    Cause.OUTDATED: "runs an outdated version",
+    Cause.OUTDATED: "runs another version than the pool",
     Cause.SUPERSEDED: "superseded by {r.replica}",
     Cause.BETTER_SPREAD: "moves to {r.location}: better spread",
     Cause.BETTER_SCORE: "moves to {r.location}: {r.share:.0%} better",
     Cause.SPOT_AGAIN: "moves to {r.location}: spot",
     Cause.ON_DEMAND_AGAIN: "moves to {r.location}: on demand",
     Cause.MAX_HOURS: _max_hours,
-    Cause.NOT_WANTED: "not wanted{after}",
+    Cause.NOT_WANTED: "no longer needed{after}",
     Cause.REPLACED: "replaced{after}",
     Cause.REPLACED_FIRST: "replaced, old before new{after}",
     Cause.ENOUGH_SPOT: "enough spot machines are ready{after}",
-    Cause.BUDGET_FULL: "{main}, and the budget has no room",
+    Cause.BUDGET_FULL: "{main}, and `max_usd_per_hour` leaves no room",
     Cause.REPLACES: _replaces,
-    Cause.FOLLOWS: lambda r: _launch(f"follows {r.replica}", r.because),
+    Cause.FOLLOWS: lambda r: _launch(f"successor of {r.replica}", r.because),
     Cause.NEW_SLOT: lambda r: _launch("fills a new slot", r.because),
-    Cause.STANDS_IN: "stands in until enough spot machines are ready",
+    Cause.STANDS_IN: "fills in until enough spot machines are ready",
     Cause.FAILED_LONGEST_AGO: "all locations are backing off, this one longest",
     Cause.NOTHING_OFFERED: "no cloud offers these resources at the moment",
     Cause.IMPOSSIBLE_PRICE: _impossible_price,
-    Cause.LOCATION_FULL: "a location may not hold more of the replicas",
+    Cause.LOCATION_FULL: "no location may hold more of the replicas",
     Cause.ALL_EXCLUDED: "every offered location is excluded",
     Cause.BACKING_OFF: _backing_off,
     Cause.ALL_BACKING_OFF: _all_backing_off,
@@ -201,7 +202,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
         "to reach {r.share:.6g}, and {main}"
     ),
     Cause.FULL_TOGETHER: (
-        "no location has room for spot machines in {r.share:.2%} of the time: on-demand "
+        "no location has spot capacity {r.share:.2%} of the time: on-demand "
         "machines in their place (`fallback: true`) bridge that"
     ),
     Cause.MOST_REPLICAS: "{r.count} is the maximum",
@@ -221,7 +222,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.NO_ANSWER: "the cloud did not answer: {r.words}",
     Cause.NO_PRICES: "no prices are available: {r.words}",
     Cause.UPLINK_SUSPECTED: "all links are silent at once: the robot's uplink is suspected",
-    Cause.NOBODY_HEARD: "nothing is ended while no replica can be heard",
+    Cause.NOBODY_HEARD: "nothing is ended while no replica can be reached",
     Cause.ENDS_SOON: ("the pool shuts down in {minutes:.0f} min (`max_hours`)"),
     Cause.CLOCK_SET: _clock_set,
     Cause.CLOCK_DOUBTED: (

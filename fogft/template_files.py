@@ -1,4 +1,4 @@
-"""Find the `templates/` folder: examples, scripts and profiles that come with the program."""
+"""The `templates/` folder: examples, scripts and profiles shipped with fogft."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from fogft.errors import FogftError
 
 
 def folder() -> Path:
-    """Return the folder of templates: inside the installed package, or of this checkout."""
+    """Return the templates folder of the installed package or of this checkout."""
     package = Path(__file__).resolve().parent
     for candidate in (package / "templates", package.parent / "templates"):
         if (candidate / "echo" / "pool.yaml").is_file():
@@ -20,7 +20,7 @@ def folder() -> Path:
 
 
 def read_text(name: str) -> str:
-    """Return a template of the templates' folder as it stands there."""
+    """Return the text of a template."""
     path = folder() / name
     try:
         return path.read_text(encoding="utf-8")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import gc
 import os
 import signal
 import sys
@@ -13,6 +14,7 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from fogft.ros import shared_memory
 from tests import own_process
 from tests.dealing import dealt
 from tests.link.namespaces import Namespaces
@@ -63,6 +65,17 @@ COMPUTING = {
 }
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Look for no garbage among some thousand tests, neither while they are made nor later."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+        gc.freeze()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Among several workers, let the long tests begin first: see `dealing`."""
 
@@ -94,6 +107,12 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Close with what was not run, and why."""
     for line in not_run(terminalreporter.stats.get("skipped", [])):
         terminalreporter.write_line(line, yellow=True)
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove the shared memory that killed ROS processes left, once all workers have ended."""
+    if not hasattr(config, "workerinput"):
+        shared_memory.sweep()
 
 
 @pytest.hookimpl(tryfirst=True)

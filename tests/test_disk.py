@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pathlib
 import signal
 import stat
 import subprocess
@@ -14,6 +15,7 @@ import pytest
 
 from fogft import disk
 from fogft.errors import StateError
+from tests.needs import needs
 
 
 def test_a_file_is_replaced_whole_and_private(tmp_path):
@@ -46,7 +48,7 @@ def test_a_missing_folder_is_a_clear_error(tmp_path):
 
 def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(StateError, match="/file/home` cannot be made: Not a directory"):
+    with pytest.raises(StateError, match="/file/home` cannot be created: Not a directory"):
         disk.make_folder(tmp_path / "file" / "home")
 
 
@@ -131,7 +133,33 @@ def test_nothing_is_locked_where_there_is_no_file(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_nothing_is_locked_in_a_folder_that_goes_at_that_moment(tmp_path, monkeypatch):
+    monkeypatch.setattr(pathlib.Path, "exists", lambda path: True)
+    assert not disk.is_locked(tmp_path / "gone" / "lock")
+
+
 def test_a_lock_in_a_folder_that_is_gone_is_a_clear_error(tmp_path):
     with pytest.raises(StateError, match="cannot be opened: No such file"):
         with disk.locked(tmp_path / "missing" / "lock"):
             pass
+
+
+DISKS = """
+set -e
+mount -t tmpfs -o size=1m tmpfs "$1"
+for state in free full free read-only; do
+    rm -f "$1/fill"
+    [ "$state" != full ] || head -c 2m /dev/zero >"$1/fill" 2>/dev/null || true
+    [ "$state" != read-only ] || mount -o remount,ro "$1"
+    "$2" -c 'import sys; from fogft import disk; print(disk.unwritable(sys.argv[1]))' "$1"
+done
+"""
+
+
+@needs("namespaces")
+def test_a_disk_that_takes_nothing_more_is_known(tmp_path):
+    done = subprocess.run(
+        ["unshare", "--mount", "bash", "-c", DISKS, "bash", str(tmp_path), sys.executable],
+        capture_output=True, text=True, timeout=100, check=False,
+    )  # fmt: skip
+    assert done.stdout.split("\n") == ["", "full", "", "read-only", ""], done.stderr

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Count = Annotated[int, typer.Argument(min=1, max=100, metavar="N", help="Number of replicas.")]
 
-Wait = Annotated[bool, typer.Option("--wait", help="Wait until it is done.")]
+Wait = Annotated[bool, typer.Option("--wait", help="Wait until the change is complete.")]
 
 
 scale = group("Add or remove replicas.")
@@ -104,7 +104,7 @@ def include(
 
     store = composition.store_of(pool)
     change(store, lambda before: intent.include(before, location))
-    output.done(f"`{location}` is allowed for `{store.name}` again")
+    output.done(f"`{location}` may be used for `{store.name}` again")
     _warn_without_manager(store)
 
 
@@ -115,7 +115,7 @@ def retry(pool: PoolOption = None) -> None:
 
     store = composition.store_of(pool)
     change(store, lambda before: intent.retry(before, time.time()))
-    output.done(f"`{store.name}` launches replicas again")
+    output.done(f"`{store.name}` will launch replicas again")
     _warn_without_manager(store)
 
 

@@ -38,7 +38,9 @@ def preempt(
     slot: Slot,
     notice: Annotated[
         float | None,
-        typer.Option(min=0, metavar="S", help="Seconds until the end; by default the zone's."),
+        typer.Option(
+            min=0, metavar="S", help="Seconds from the notice to the end; by default the zone's."
+        ),
     ] = None,
     pool: PoolOption = None,
 ) -> None:
@@ -102,7 +104,7 @@ def blackhole(slot: Slot, lasting: Duration = None, pool: PoolOption = None) -> 
     """Drop everything on the link to a replica, without closing it."""
     machine = _machine(pool, slot)
     _chaos().blackhole(machine, lasting)
-    output.done(f"the link to `{machine.short}` drops everything")
+    output.done(f"the link to `{machine.short}` drops all traffic")
 
 
 @chaos.command(cls=Command, epilog="fogft chaos outage local/us-west-2")
@@ -120,7 +122,7 @@ def capacity(
 ) -> None:
     """Limit the capacity of a location."""
     _chaos().capacity(location, machines)
-    output.done(f"`{location}` now has capacity for {machines} machines; running ones stay")
+    output.done(f"`{location}` now has capacity for {machines} machines; running machines are kept")
 
 
 @chaos.command(cls=Command, epilog="fogft chaos clear")

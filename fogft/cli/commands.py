@@ -1,4 +1,4 @@
-"""Which commands there are, by what people want to do, and how their help looks.
+"""The list of commands, grouped by task, and the layout of their help.
 
 A command's module is imported when the command is run or described, so that each starts
 without loading the others. A name stands for a function of that name in its module, or for a
@@ -116,7 +116,7 @@ class Group(TyperGroup):
         return [("Commands", self.commands)]
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write one list a section."""
+        """Write one list for each section."""
         for title, names in self.sections():
             with formatter.section(title):
                 formatter.write_dl(
@@ -142,7 +142,7 @@ class Commands(Group):
 
 
 class Command(TyperCommand):
-    """A command whose arguments stand as ``SLOT`` or ``[FILE]``, without types and ranges.
+    """A command whose help shows arguments as ``SLOT`` or ``[FILE]``, without types and ranges.
 
     Its epilog is an example of its use.
     """
@@ -151,7 +151,7 @@ class Command(TyperCommand):
         super().__init__(*args, **{**options, "rich_markup_mode": None})
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
-        """Return what stands behind the command's name in its usage line."""
+        """Return the parts of the usage line that follow the command's name."""
         return ["[OPTIONS]", *map(_word, self._arguments(ctx))]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:

@@ -1,4 +1,4 @@
-"""``fogft credentials | join | export | import``: a pool's certificates, and its move.
+"""``fogft credentials | join | export | import``: a pool's certificates, and moving a pool.
 
 A passphrase is typed, read from a file or generated; it is never an argument. Keys are never
 shown.
@@ -118,7 +118,7 @@ def revoke(
 
     A replica whose certificate is revoked is replaced.
     """
-    from fogft.pool.commands.credentials import revoke_credentials
+    from fogft.pool.commands.change import revoke_credentials
 
     holders, told = revoke_credentials(composition.store_of(pool), _role(role), name)
     listed = ", ".join(f"`{holder.short}`" for holder in holders)
@@ -126,7 +126,7 @@ def revoke(
         output.done(f"{role} {listed} is revoked")
     else:
         output.warn(
-            f"{role} {listed} is revoked, but without a running manager other members are not told"
+            f"{role} {listed} is revoked, but no manager is running to tell the other members"
         )
         output.hint("start one with `fogft up`")
 
@@ -135,7 +135,7 @@ def revoke(
 def rotate(
     role: RoleName,
     name: Annotated[
-        str, typer.Argument(metavar="NAME", help="A replica's slot; by default all.")
+        str, typer.Argument(metavar="NAME", help="Slot of a replica; by default, all replicas.")
     ] = "",
     pool: PoolOption = None,
 ) -> None:
@@ -146,7 +146,7 @@ def rotate(
     machine, issue a new bundle, join there, and revoke the old generation.
     """
     from fogft.model.credentials import Role
-    from fogft.pool.commands.credentials import rotate_replicas, rotate_robot
+    from fogft.pool.commands.change import rotate_replicas, rotate_robot
 
     store, which = composition.store_of(pool), _role(role)
     if which is Role.REPLICA:

@@ -1,4 +1,4 @@
-"""``fogft doctor``: what is wrong here, and what to do about each finding."""
+"""``fogft doctor``: find problems on this machine and say how to fix them."""
 
 from __future__ import annotations
 
@@ -40,7 +40,9 @@ def doctor(
         output.json_data([asdict(finding) for finding in found])
     failed = sum(f.verdict is Verdict.FAIL for f in found)
     warned = sum(f.verdict is Verdict.WARN for f in found)
-    output.say(f"\n{len(found)} checks: {failed} failed, {warned} warnings")
+    output.say(
+        f"\n{len(found)} checks: {failed} failed, {warned} warning{'' if warned == 1 else 's'}"
+    )
     if failed:
         raise typer.Exit(1)
 
@@ -50,8 +52,7 @@ def _show(finding: Finding) -> None:
 
     verdict = finding.verdict.value
     text = output.indented(output.printable(finding.text), 26, sys.stdout)
-    output.show(
-        Text.assemble((f"{verdict:<4}", _STYLES[verdict]), f"  {finding.check:<18}  {text}")
-    )
+    parts = (f"{verdict:<4}", _STYLES[verdict]), f"  {finding.check:<18}  {text}"
+    output.show(Text.assemble(*parts), folds=False)  # folded already, around whole paths
     if finding.advice:
         output.data(f"{'':<26}-> {output.indented(finding.advice, 29, sys.stdout)}")

@@ -1,4 +1,4 @@
-"""``fogft init | up | down``: begin and end a pool."""
+"""``fogft init | up | down``: create, start and shut down a pool."""
 
 from __future__ import annotations
 
@@ -119,13 +119,13 @@ def up(
     if outcome is not Outcome.ANSWERING:
         what = {
             Outcome.RUN_KEEPS_ENDING: "does not answer: `run` keeps exiting",
-            Outcome.NEVER_READY: "does not answer: no replica was ever ready",
+            Outcome.NEVER_READY: "does not answer: no replica has become ready",
             Outcome.TYPES_DIFFER: "cannot answer: robot and replicas define its type differently",
         }
         raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
     found = seen.status
     if not found.target:
-        output.done(f"`{name}` is set up; its schedule wants no replica now")
+        output.done(f"`{name}` is set up; its schedule asks for no replicas now")
         return
     missing = max(0, found.target - found.ready)
     rest = f"; {missing} more starting, see `fogft status`" if missing else ""
@@ -139,13 +139,13 @@ def up(
 
 
 def services_at_fault(status: PoolStatus) -> list[str]:
-    """Return the services that cannot be answered; where types differ, those of such types."""
+    """Return the services without an answering replica; if types differ, only those that do."""
     differing = {name for one in status.replicas for name in one.differing}
     return sorted(differing) or [one.name for one in status.services if not one.ready_replicas]
 
 
 def not_answering(seen: Seen, what: str) -> FogftError:
-    """Return the error of an `up` that failed, with all that is known of the reason."""
+    """Return the error for an `up` that failed, with everything known about the reason."""
     from fogft import logfile
     from fogft.pool.commands import logs
     from fogft.pool.commands.outcome import is_given_up
@@ -200,7 +200,7 @@ def down(
     if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
         told(f"{len(swept)} shared-memory files of dead processes")
     if elsewhere:
-        output.done(f"nothing of `{store.name}` is left here; another machine manages it")
+        output.done(f"nothing of `{store.name}` remains on this machine; another one manages it")
         return
     output.done(f"`{store.name}` is shut down; nothing is left")
     if paid and not composition.pools():

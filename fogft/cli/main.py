@@ -1,4 +1,4 @@
-"""The ``fogft`` command, and how each of its commands ends.
+"""The ``fogft`` command: runs a command and turns its outcome into an exit status.
 
 Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage; 130
 interrupted; 141 nobody reads stdout any more. Anything else is a defect of ours and

@@ -1,4 +1,4 @@
-"""Options that several commands have, and what the shell offers for them after a Tab.
+"""Options shared by several commands, and their shell completion.
 
 A completion never fails and never prints: what cannot be known is not offered.
 """

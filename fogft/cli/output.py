@@ -29,7 +29,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # which a log may have, and which says 
 
 
 def data(text: str) -> None:
-    """Write a line (or lines) of data to stdout, at once, without what cannot be printed."""
+    """Write lines of data to stdout, flushed, with unprintable characters removed."""
     sys.stdout.write(printable(text) + "\n")
     sys.stdout.flush()
 
@@ -39,13 +39,13 @@ def json_data(value: Any) -> None:
     data(json.dumps(value, indent=2, default=str))
 
 
-def show(*parts: RenderableType, stream: IO[str] | None = None) -> None:
-    """Write tables, trees and lines below each other, to stdout if nothing else is said.
+def show(*parts: RenderableType, stream: IO[str] | None = None, folds: bool = True) -> None:
+    """Write tables, trees and lines below each other, to stdout by default.
 
-    On a terminal a line is folded between words; elsewhere nothing is folded or cut.
+    On a terminal a line is folded between words if it `folds`; elsewhere nothing is folded or cut.
     """
     stream = stream or sys.stdout
-    stream.write(_drawn(stream, *parts, limit=width(stream)) + "\n")
+    stream.write(_drawn(stream, *parts, limit=width(stream) if folds else None) + "\n")
     stream.flush()
 
 
@@ -57,7 +57,7 @@ def cell(text: str, style: str = "") -> Text:
 
 
 def printable(text: str) -> str:
-    """Return text with control characters but newlines escaped: it must not move the cursor."""
+    """Return text with control characters except newlines escaped, so it cannot move the cursor."""
     if text.isprintable():
         return text
     plain = _COLOUR.sub("", text)
@@ -65,7 +65,7 @@ def printable(text: str) -> str:
 
 
 def say(text: str) -> None:
-    """Write a message to stderr, at once."""
+    """Write a message to stderr, flushed."""
     sys.stderr.write(printable(text) + "\n")
     sys.stderr.flush()
 
@@ -106,7 +106,7 @@ def confirm(question: str) -> bool:
 
 
 def is_terminal(stream: IO[str]) -> bool:
-    """Whether a person looks at this stream."""
+    """Whether this stream is a terminal."""
     try:
         return stream.isatty()
     except ValueError:  # closed
@@ -114,14 +114,14 @@ def is_terminal(stream: IO[str]) -> bool:
 
 
 def width(stream: IO[str]) -> int | None:
-    """Return how many characters fit in a line of a stream; None where no person looks."""
+    """Return the width of a stream in characters; None if it is not a terminal."""
     if not is_terminal(stream) and not os.environ.get("COLUMNS"):
         return None
     return _console(stream).width
 
 
 def indented(text: str, by: int, stream: IO[str]) -> str:
-    """Return text that stands behind a margin, folded between words with the same margin."""
+    """Return text wrapped between words, with the same left margin on each line."""
     import textwrap
 
     room = (width(stream) or _UNLIMITED) - by
@@ -131,7 +131,7 @@ def indented(text: str, by: int, stream: IO[str]) -> str:
 
 @contextmanager
 def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
-    """Yield a function that shows something in place of what it showed before, long lines cut."""
+    """Yield a function that redraws its output in place; long lines are cut."""
     from rich.live import Live
     from rich.text import Text
 
@@ -146,7 +146,7 @@ def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
 
 
 def stdout_closed() -> bool:
-    """Whether nobody reads stdout any more, as after ``| head``."""
+    """Whether the reader of stdout is gone, as after ``| head``."""
     try:
         poll = select.poll()
         poll.register(sys.stdout.fileno(), 0)
@@ -156,7 +156,7 @@ def stdout_closed() -> bool:
 
 
 def silence_stdout() -> None:
-    """Send what is still buffered for a closed stdout nowhere, so that exit stays quiet."""
+    """Discard what is buffered for a closed stdout, so that exiting prints no error."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.close(nowhere)

@@ -127,11 +127,13 @@ def cost(pool: PoolArgument = None, as_json: AsJson = False, named: PoolOption =
     name = pool or named
     found = [one for one in read_all(home() / "costs") if name in (None, one.pool)]
     if name is not None and not found:
-        raise PoolNotFound(f"no cost is known of a pool `{name}`", "`fogft cost` lists all of them")
+        raise PoolNotFound(
+            f"no costs are recorded for a pool `{name}`", "`fogft cost` lists every pool with costs"
+        )
     if as_json:
         output.json_data([_costs_json(one) for one in found])
     elif not found:
-        output.say("nothing was spent from here")
+        output.say("nothing has been spent from this machine")
     else:
         _show_costs(found)
 

@@ -190,7 +190,7 @@ def install(
     rendezvous: Rendezvous = None,
     system: System = False,
 ) -> None:
-    """Write units for the manager and two client proxies, and start them.
+    """Install and start units for the manager and two client proxies.
 
     Units get the current environment, so source ROS 2 first. Running processes hand over.
     """
@@ -205,7 +205,7 @@ def install(
     for unit in wanted:
         output.data(str(where.folder / unit.name))
     if refused:
-        output.warn(f"systemd did not start them: {'; '.join(refused)}")
+        output.warn(f"systemd did not start: {'; '.join(refused)}")
         return
     if paths is not None:
         units.hand_over(where, paths, wanted)
@@ -216,7 +216,7 @@ def install(
 
 @service.command(cls=Command, epilog="fogft service status")
 def status(*, system: System = False) -> None:
-    """Show the units, and whether they run."""
+    """Show the units and their state."""
     from fogft.pool.commands import service as units
 
     where = units.services(system=system)
@@ -232,7 +232,7 @@ def remove(
     rendezvous: Rendezvous = None,
     system: System = False,
 ) -> None:
-    """Stop the units, and delete them. Replicas go on; `fogft up` starts a manager."""
+    """Stop and delete the units. Replicas keep running; `fogft up` starts a manager."""
     from fogft.pool.commands import service as units
 
     where = units.services(system=system)
@@ -242,4 +242,4 @@ def remove(
         names = [unit.name for unit in _units(pool, gateway, rendezvous, system=system)]
     found = units.installed(where, names)
     units.remove(where, found)
-    output.done(f"removed {', '.join(found)}" if found else "there were none")
+    output.done(f"removed {', '.join(found)}" if found else "nothing was installed")

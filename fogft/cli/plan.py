@@ -19,7 +19,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         typer.Option(metavar="CSV", help="Take prices from a CSV file in SkyPilot's format."),
     ] = None,
     offline: Annotated[
-        bool, typer.Option("--offline", help="Do not measure round trips; use known ones.")
+        bool, typer.Option("--offline", help="Use known round trips; measure none.")
     ] = False,
     everything: Annotated[
         bool, typer.Option("--all", help="Show every offer, not just the best of each region.")
@@ -53,11 +53,11 @@ def bake(
     file: PoolFile = DEFAULT_FILE,
     base: Annotated[
         str | None,
-        typer.Option("--from", metavar="IMAGE", help="Build on this image, not the file's own."),
+        typer.Option("--from", metavar="IMAGE", help="Base image, in place of the file's own."),
     ] = None,
-    push: Annotated[bool, typer.Option("--push", help="Push it to its registry, too.")] = False,
+    push: Annotated[bool, typer.Option("--push", help="Also push it to its registry.")] = False,
 ) -> None:
-    """Build a Docker image in which a pool's set-up is done.
+    """Build a Docker image with a pool's set-up already done.
 
     Replicas that start from it are ready sooner: they use what fits and set up the rest.
     """

@@ -1,4 +1,4 @@
-"""How a plan looks: a table of offers, then what the pool costs and gives; or JSON."""
+"""Format a plan: a table of offers, then cost, latency and availability; or JSON."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _lost(one: Considered) -> str:
 
 
 def price_source(offer: Offer, now: float) -> str:
-    """Return where an offer's price comes from and how old it is; empty where it is simulated."""
+    """Return the source and age of an offer's price; empty if the price is simulated."""
     if not offer.source or not offer.as_of:
         return offer.source
     return f"{offer.source}, {age(max(0.0, now - offer.as_of))} old"
@@ -150,8 +150,9 @@ def _summary(shown: PlanShown) -> list[str]:
         out.append(f"  ${extras:.3f}/h of it for disks and addresses")
     if shown.ready_p90_s is not None:
         out.append(
-            f"ready         within {shown.ready_p90_s:.0f} s of the order (p90 of {shown.launches} "
-            "launches; used as the time away below)"
+            f"ready         within {shown.ready_p90_s:.0f} s of being ordered (p90 of "
+            f"{shown.launches} "
+            "launches; used as the recovery below)"
         )
     for name, one in shown.traffic.items():
         out.append(
@@ -173,8 +174,8 @@ def _summary(shown: PlanShown) -> list[str]:
     out += _verdict(shown)
     trips = [f"{rtt_s * 1000:.0f} ms" for rtt_s in plan.round_trips_s]
     if trips:
-        best = f"{trips[0]} and the service's own time"
-        second = f"; {trips[1]} while that replica is away" if len(trips) > 1 else ""
+        best = f"{trips[0]} plus the service's own time"
+        second = f"; {trips[1]} while that replica is down" if len(trips) > 1 else ""
         sources = sorted({distance.source for distance in shown.distances.values()})
         out.append(f"response      {best}{second} ({', '.join(sources)})")
     else:
@@ -191,7 +192,7 @@ def _verdict(shown: PlanShown) -> list[str]:
     reached, usd = plan.with_fallback or (0.0, 0.0)
     single = plan.single[1].usd_per_hour
     if not plan.is_cheapest and reached >= target and usd < single:
-        return [f"cheapest      {asked}: with `fogft.on_demand.fallback: true`, some ${usd:.3f}/h"]
+        return [f"cheapest      {asked}: with `fogft.on_demand.fallback: true`, about ${usd:.3f}/h"]
     if plan.is_cheapest is None:
         return [f"cheapest      {asked}: neither this pool nor one on-demand machine is enough"]
     if plan.is_cheapest:
@@ -206,9 +207,10 @@ def _availability(shown: PlanShown) -> list[str]:
     return [
         f"availability  {least.correlated:.6f} expected{target} "
         f"({least.independent:.6f} if replicas failed independently)",
-        f"  assuming spot up {assumed.spot_uptime_s / 3600:.3g} h, on demand "
-        f"{assumed.on_demand_uptime_s / 3600:.4g} h, away {assumed.recovery_s / 60:.3g} min, "
-        f"a location full {100 * assumed.no_room:.3g} % of the time; "
+        f"  assuming uptime {assumed.spot_uptime_s / 3600:.3g} h spot, "
+        f"{assumed.on_demand_uptime_s / 3600:.4g} h on demand; recovery "
+        f"{assumed.recovery_s / 60:.3g} min; no capacity "
+        f"{100 * assumed.no_room:.3g} % of the time; "
         f"correlation {levels.zone:g} in a zone, {levels.region:g} in a region, "
         f"{levels.cloud:g} in a cloud",
     ]

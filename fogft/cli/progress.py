@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from fogft.pool.manager.status import UpdateStatus
 
 LOOK_EVERY_S = 0.2
+MANAGER_GONE_S = 3.0  # one that an `up` of another version, or the client proxy, replaces is back
 LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
 
@@ -34,7 +35,7 @@ REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup
 def announce(
     preview: Preview, joined: UpdateStatus | None = None, *, upgrade_from: str = ""
 ) -> None:
-    """Say what will be done.
+    """Print what `up` is about to do.
 
     Args:
         joined: The update that is under way to this very file.
@@ -79,8 +80,8 @@ def _no_room(spec: PoolSpec) -> str:
     else:
         why = f"${spec.max_usd_per_hour:g}/h (`max_usd_per_hour`) leaves no room for both"
     if spec.replicas == 1:
-        return f"{why}, and the only replica is not ended first: it stays as it is"
-    return f"{why}: one replica fewer answers meanwhile"
+        return f"{why}, and the only replica is never ended first: it is not updated"
+    return f"{why}: one replica fewer serves in the meantime"
 
 
 def _show_launches(preview: Preview) -> None:
@@ -108,10 +109,13 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
     from fogft.pool.commands.outcome import Outcome
 
     deadline = time.monotonic() + timeout_s
+    managed_at = time.monotonic()
     with _shown() as show:
         while True:
             seen = status.read(paths, time.time())
-            if not seen.manager_alive:
+            if seen.manager_alive:
+                managed_at = time.monotonic()
+            elif time.monotonic() - managed_at >= MANAGER_GONE_S:
                 name, log = paths.folder.name, logfile.tail(paths.manager_log, lines=8)
                 raise FogftError(
                     f"the manager of `{name}` has exited:\n{log}",
@@ -127,7 +131,7 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
 
 
 def settle(store: PoolStore, settled: Settled, what: str) -> None:
-    """Show a pool's progress until a change of it is done."""
+    """Show a pool's progress until a change is complete."""
     from fogft.pool.commands.outcome import Outcome
 
     is_local = store.identity().cloud == composition.LOCAL

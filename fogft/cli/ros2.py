@@ -1,4 +1,4 @@
-"""``ros2 fog``: the commands of ``fogft`` for who types ``ros2``. Loaded by ros2cli only.
+"""``ros2 fog``: the commands of ``fogft`` as verbs of ``ros2``. Loaded by ros2cli only.
 
 Each verb hands its words to `fogft.cli.main` unread, so that both ways behave the same.
 """
@@ -15,7 +15,7 @@ VERBS = "fogft.ros2_verb"  # the group of entry points
 
 
 class FogCommand(CommandExtension):  # type: ignore[misc]
-    """Keep services answering on replicas that come and go."""
+    """Run ROS 2 services on cheap machines that come and go."""
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
         """Add a parser for each verb."""
@@ -23,7 +23,7 @@ class FogCommand(CommandExtension):  # type: ignore[misc]
         add_subparsers_on_demand(parser, cli_name, "_verb", VERBS, required=False)
 
     def main(self, *, parser: argparse.ArgumentParser, args: Any) -> int:
-        """Run the verb; without one, show which there are."""
+        """Run the verb; without one, list the verbs."""
         del parser
         if not hasattr(args, "_verb"):
             self._parser.print_help()
@@ -33,7 +33,7 @@ class FogCommand(CommandExtension):  # type: ignore[misc]
 
 
 class Verb:
-    """A verb that is the command of ``fogft`` with its class's name, help and options included."""
+    """A verb that runs the ``fogft`` command of the same name, with its help and options."""
 
     EXTENSION_POINT_VERSION = "0.1"
 
@@ -41,7 +41,7 @@ class Verb:
         satisfies_version(PLUGIN_SYSTEM_VERSION, "^0.1")
 
     def add_arguments(self, parser: argparse.ArgumentParser, cli_name: str) -> None:
-        """Take every word as it is, ``--help`` too."""
+        """Pass every argument on unchanged, ``--help`` included."""
         del cli_name
         parser.add_argument("words", nargs=argparse.REMAINDER)
         parser.prefix_chars = "\0"  # no word is an option of this parser

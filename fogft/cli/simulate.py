@@ -58,8 +58,8 @@ def simulate(
 
     Runs the real planner, and launches nothing. The same seeds give the same results.
     """
-    from fogft.simulation import run
     from fogft.simulation.plot import check, draw
+    from fogft.simulation.report import simulate as run
 
     if plot is not None:
         check(plot)
@@ -67,7 +67,7 @@ def simulate(
         show = None
         if output.is_terminal(sys.stderr):
             show = shown.enter_context(output.redrawn(sys.stderr))
-        report = run.simulate(
+        report = run(
             file,
             traces=traces,
             prices=prices,
@@ -130,7 +130,7 @@ def _cells(row: Row) -> list[str | Text]:
 
 
 def percent(share: float) -> str:
-    """Return a share in percent, never rounded up to all."""
+    """Return a fraction in percent, never rounded up to 100 %."""
     for digits in (2, 3, 4, 5):
         shown = f"{100 * share:.{digits}f}"
         if share >= 1 or float(shown) < 100:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft import __version__
+from fogft import __version__, disk
 from fogft.cli import options, output, status_text
 from fogft.cli.options import PoolArgument, PoolOption
 from fogft.cli.status_text import age
@@ -52,10 +52,13 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
 ) -> None:
     """Show a pool: its replicas, links, and request counters.
 
-    What is not known at the moment is shown as `?`.
+    What is not known at the moment is shown as `?`. FIRST counts requests that a replica answered
+    first, LATE answers that came after another's, WAITING requests without an answer yet. Slots
+    from 100 on stand in for spot machines, those from 2000 on were started by hand. Counters start
+    at 0 with each client proxy.
     """
     if schema:
-        from fogft.pool.commands.status_schema import status_schema
+        from fogft.pool.commands.status import status_schema
 
         output.json_data(status_schema())
         return
@@ -72,7 +75,7 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
         output.json_data(seen.to_json())
     else:
         output.show(status_text.rendered(seen, width=output.width(sys.stdout)))
-    _remark(seen)
+    _remark(seen, paths.folder)
     if check and not seen.answers:
         raise typer.Exit(1)
 
@@ -97,7 +100,7 @@ def _watch(paths: PoolPaths, *, as_json: bool) -> None:
             show(status_text.rendered(seen, width=width))
 
 
-def _remark(seen: Seen) -> None:
+def _remark(seen: Seen, folder: Path) -> None:
     if seen.status.ended and not seen.manager_alive:
         output.hint(
             f"restart it with `fogft up {seen.status.file}`, or remove it with `fogft down`"
@@ -110,6 +113,9 @@ def _remark(seen: Seen) -> None:
         output.hint(
             f"start one with `fogft up {seen.status.file}`, or shut the pool down with `fogft down`"
         )
+    elif why := disk.unwritable(folder):
+        output.warn(f"the disk of `{folder}` is {why}: what is shown is old, nothing is launched")
+        output.hint("requests continue, and the manager as soon as there is room")
     elif seen.status.manager_version not in ("", __version__):
         output.warn(
             f"the pool runs fogft {seen.status.manager_version}, this command is {__version__}"
@@ -117,7 +123,7 @@ def _remark(seen: Seen) -> None:
         output.hint(f"`fogft up {seen.status.file}` upgrades it while it serves")
     elif seen.age_s is not None and seen.stale:
         output.warn(f"the manager has not observed the pool for {seen.age_s:.0f} s")
-        output.hint("see `fogft logs`, and `fogft doctor`: is the disk full?")
+        output.hint("see `fogft logs`, and `fogft doctor`")
 
 
 def logs(
@@ -166,7 +172,7 @@ _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?")
 
 
 def in_order(logs: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
-    """Merge logs into (name, line) by the times at the beginnings of lines.
+    """Merge logs into (name, line), ordered by the timestamps of their lines.
 
     A line without a time, such as a service's own, stays behind the one before it.
     """
@@ -181,7 +187,7 @@ def in_order(logs: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
 
 
 class Tail:
-    """One file that grows, from its `last` lines on (None: from the first). It may be missing."""
+    """A growing log, read from its `last` lines on (None: all of it). It may be missing."""
 
     def __init__(self, path: Path, last: int | None) -> None:
         self._path = path
@@ -191,7 +197,7 @@ class Tail:
         self._position = 0
 
     def new_lines(self) -> Iterable[str]:
-        """Return the whole lines that were added since the last call."""
+        """Return the complete lines added since the last call."""
         last, self._last = self._last, None  # a log that appears later is shown whole
         return self._added() if last is None else deque(self._added(), maxlen=last)
 

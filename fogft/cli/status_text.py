@@ -1,4 +1,4 @@
-"""How a pool's status looks: a line, tables of replicas and services, who talks through whom."""
+"""Format a pool's status: a headline, tables of replicas and services, the gateway tree."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ NUMBERS = ("$/H", "RTT", "FIRST", "AGE", *SERVICE_COLUMNS[1:], *TOPIC_COLUMNS[3:
 
 
 def rendered(seen: Seen, *, width: int | None) -> Group:
-    """Return the whole screen for lines of a width."""
+    """Return the whole status for a given line width."""
     status = seen.status
     rows = [*status.replicas, *status.by_hand]
     parts: list[Sequence[RenderableType]] = [
-        [headline(seen)],
+        [headline(seen, width)],
         replicas(rows, REPLICA_COLUMNS, width=width, links_known=seen.links_known),
         [services(status.services, width=width, links_known=seen.links_known)]
         if status.services
@@ -57,7 +57,7 @@ def rendered(seen: Seen, *, width: int | None) -> Group:
 
 
 def starting(status: PoolStatus, *, width: int | None) -> Group:
-    """Return what `up` shows meanwhile: without what only matters later."""
+    """Return the shorter status that `up` shows while it waits."""
     return _lines([*replicas(status.replicas, STARTING_COLUMNS, width=width), *notes(status)])
 
 
@@ -67,8 +67,8 @@ def _lines(parts: Sequence[RenderableType]) -> Group:
     return Group(*parts)
 
 
-def headline(seen: Seen) -> Text:
-    """Return the line on top: how many are ready, the price, and how old all this is."""
+def headline(seen: Seen, width: int | None) -> Text:
+    """Return the headline: ready replicas, price, and the age of the information."""
     status = seen.status
     pool = cell(status.pool, "bold")
     if status.ended and not seen.manager_alive:
@@ -94,7 +94,8 @@ def headline(seen: Seen) -> Text:
             cell("not observed yet" if seen.age_s is None else f"seen {age(seen.age_s)} ago"),
             *([] if links_age_s is None else [cell(f"links seen {age(links_age_s)} ago")]),
             *(cell(text, "bold red") for text, sounds in alarms.items() if sounds),
-        ]
+        ],
+        width,
     )
 
 
@@ -109,8 +110,14 @@ def _answering(seen: Seen) -> list[Text]:
     return [cell(f"not answering{named}", "bold red")]
 
 
-def _joined(words: Sequence[Text]) -> Text:
-    return cell("  ").join(words)
+def _joined(words: Sequence[Text], width: int | None = None) -> Text:
+    """Join words by two spaces, or by a new line before one that would not fit."""
+    joined, column = words[0].copy(), len(words[0])
+    for word in words[1:]:
+        fits = width is None or column + 2 + len(word) <= width
+        joined.append("  " if fits else "\n").append_text(word)
+        column = (column + 2 if fits else 0) + len(word)
+    return joined
 
 
 def notes(status: PoolStatus) -> list[Text]:
@@ -122,20 +129,19 @@ def notes(status: PoolStatus) -> list[Text]:
             found.append(f"`{row.name}` is unavailable: {order['trouble']}")
         needed = row.counters.get("needed_replicas")
         if needed:
-            found.append(f"`{row.name}`: more is asked than the replicas can do; {needed} would do")
+            found.append(
+                f"`{row.name}`: load exceeds the capacity of its replicas; {needed} would do"
+            )
         poison = row.counters.get("poison")
         if poison:
             at = time.strftime("%F %T", time.localtime(row.counters["poisoned_at"]))
             requests = "a request" if poison == 1 else f"{poison} requests"
-            found.append(
-                f"`{row.name}`: services died over {requests}, which were not sent again; "
-                f"the last time at {at}"
-            )
+            found.append(f"`{row.name}`: crashed by {requests}, not retried; most recently at {at}")
     for one in status.replicas:
         if one.strangers >= _STRANGERS_SHOWN:
             found.append(
-                f"replica {one.slot}.{one.generation} has turned away {number(one.strangers)} "
-                "connections of strangers: let a firewall admit only who should reach its port"
+                f"replica {one.slot}.{one.generation} has refused {number(one.strangers)} "
+                "unauthenticated connections: restrict access to its port with a firewall"
             )
     if status.excluded:
         found.append(f"excluded: {', '.join(status.excluded)}")
@@ -148,13 +154,13 @@ def notes(status: PoolStatus) -> list[Text]:
 
 
 def troubles(status: PoolStatus) -> list[str]:
-    """Return what does not reach the other side, and why, a sentence each."""
+    """Return a sentence for each service or topic that does not get through, with the reason."""
     found = [row.counters["trouble"] for row in status.services if row.counters.get("trouble")]
     for row in status.topics:
         if row.counters.trouble:
             found.append(row.counters.trouble)
         elif not row.heard_by and status.ready:
-            found.append(f"nobody hears `{row.name}`: no node of a replica subscribes to it")
+            found.append(f"`{row.name}` has no subscriber: no node on a replica subscribes to it")
     return found
 
 
@@ -165,7 +171,7 @@ def replicas(
     width: int | None,
     links_known: bool = True,
 ) -> list[RenderableType]:
-    """Return the table of replicas; details stand in it where there is room, else below it."""
+    """Return the table of replicas; details are in it if there is room, else below it."""
     from fogft.cli.table import table
 
     if not rows:
@@ -201,7 +207,7 @@ def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
 def services(
     rows: Sequence[ServiceStatus], *, width: int | None, links_known: bool = True
 ) -> RenderableType:
-    """Return the table of services and what became of their requests."""
+    """Return the table of services and of the outcomes of their requests."""
     from fogft.cli.table import table
 
     cells: list[list[str | Text]] = []
@@ -231,7 +237,7 @@ def services(
 def topics(
     rows: Sequence[TopicStatus], *, width: int | None, links_known: bool = True
 ) -> RenderableType:
-    """Return the table of topics: who hears them, and what became of their messages."""
+    """Return the table of topics: their subscribers and the outcomes of their messages."""
     from fogft.cli.table import table
 
     cells: list[list[str | Text]] = []
@@ -252,7 +258,7 @@ def topics(
 
 
 def topology(drawn: Mapping[str, Any]) -> list[RenderableType]:
-    """Return who talks through whom, a tree for each robot; nothing where there are no gateways.
+    """Return a tree of gateways for each robot; nothing without gateways.
 
     How a link does is known for this machine's robot only, and for its own gateways.
     """
@@ -289,15 +295,15 @@ def _gateway(gateway: Mapping[str, Any], link: Mapping[str, Any] | None) -> Text
         words.append(cell("no certificate", "bold red"))
     if link is not None:
         words.append(cell(link["state"], LINKS.get(link["state"], "")))
-        if link["rtt_s"] is not None and link["state"] == "up":
+        if link.get("rtt_s") is not None and link["state"] == "up":
             words.append(cell(milliseconds(link["rtt_s"])))
-        if link["detail"]:
+        if link.get("detail"):
             words.append(cell(link["detail"]))
     return _joined(words)
 
 
 def utc(seconds: float) -> str:
-    """Return a moment as ``2026-11-23 18:05 UTC``."""
+    """Return a time as ``2026-11-23 18:05 UTC``."""
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(seconds))
 
 
@@ -307,7 +313,7 @@ def price(usd: float) -> str:
 
 
 def number(value: int) -> str:
-    """Return a count with its thousands apart."""
+    """Return a count with separated thousands."""
     return f"{value:,}".replace(",", " ")
 
 

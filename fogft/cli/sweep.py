@@ -42,16 +42,23 @@ def sweep(
         _show(one)
     unowned = [machine for one in found for machine in one.unowned]
     if not unowned:
-        output.done("every machine belongs to a managed pool")
+        blind = any(one.cloud == "sky" and not one.asked for one in found)
+        known = " that SkyPilot knows" if blind else ""
+        output.done(f"every machine{known} belongs to a managed pool")
+        if blind:
+            output.hint(
+                "no cloud could be asked about machines that SkyPilot has forgotten; "
+                "`sky check` tests the credentials"
+            )
         if cloud is None and not any(one.cloud == "sky" for one in found):
             output.hint(
-                "real clouds were never used from this machine: `--cloud sky` checks them as well"
+                "no real cloud has been used from this machine; `--cloud sky` checks them anyway"
             )
         return
     if not end:
         output.hint(
-            "`fogft sweep --end` ends them; `fogft up FILE` gives a pool on this machine its "
-            "manager back"
+            "`fogft sweep --end` ends them; `fogft up FILE` restarts the manager of a "
+            "pool on this machine"
         )
         return
     if not yes and not output.confirm(f"end {len(unowned)}?"):
@@ -69,7 +76,7 @@ def _show(found: Swept) -> None:
 
     if found.cloud == "sky":
         asked = ", ".join(f"`{name}`" for name in sorted(found.asked)) or "no cloud"
-        output.say(f"asked SkyPilot for all its clouds, and {asked} directly")
+        output.say(f"checked all of SkyPilot's clouds, and {asked} directly")
     now = time.time()
     rows = [
         (

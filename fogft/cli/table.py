@@ -1,4 +1,4 @@
-"""Tables that fit a terminal: first text is folded between words, then columns go below.
+"""Tables that fit the terminal: text wraps between words, then columns move below.
 
 Numbers and words are never cut, and no column is left out but an empty one that says nothing.
 """
@@ -61,7 +61,7 @@ def table(
     optional: Collection[str] = (),
     titled: bool = True,
 ) -> RenderableType:
-    """Return a table without lines, or several below each other that begin with one column.
+    """Return a table without rules, split into several that repeat the first column if needed.
 
     Args:
         folds: Columns whose cells may be folded.

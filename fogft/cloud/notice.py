@@ -126,7 +126,7 @@ def watch(
         sources = list(known.values()) if source == "auto" else [known[source]]
     else:
         raise CloudError(
-            f"there is no source of preemption notices `{source}`",
+            f"unknown source of preemption notices `{source}`",
             f"`file:PATH`, {', '.join(f'`{name}`' for name in NOTICE_SOURCES)}",
         )
     return Watch(sources, on_notice, POLL_S if poll_s is None else poll_s)

@@ -1,4 +1,4 @@
-"""What clouds tell a machine before they take it, read into one shape. Pure.
+"""Preemption notices of different clouds, read into one form. Pure.
 
 | cloud | what is asked | how long before |
 |---|---|---|
@@ -21,7 +21,7 @@ from typing import Any
 
 
 class NoticeKind(str, Enum):
-    """What a machine was told."""
+    """The kinds of notices."""
 
     REBALANCE = "rebalance"  # a hint: it is more likely than before to be taken
     PREEMPTION = "preemption"  # it will be taken
@@ -29,7 +29,7 @@ class NoticeKind(str, Enum):
 
 @dataclass(frozen=True)
 class Notice:
-    """A machine was told that it may have to go, or will."""
+    """A notice that a machine may be preempted, or will be."""
 
     kind: NoticeKind
     at: float | None  # when it ends, in seconds since the epoch; None when that was not said

@@ -87,10 +87,10 @@ class Cloud(Protocol):
 
 @runtime_checkable
 class Accounts(Protocol):
-    """A cloud that costs money, and needs credentials for each cloud that it stands for."""
+    """A cloud that costs money and needs credentials for each provider behind it."""
 
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
-        """Test credentials: cloud -> empty, or what is wrong and what to do about it.
+        """Test credentials: cloud -> empty, or the problem and how to fix it.
 
         Without names of clouds it tests all that can be used.
         """
@@ -99,21 +99,21 @@ class Accounts(Protocol):
         """Raise `SpecError` for what cannot be honoured on these clouds, before it is ordered."""
 
     def left_out(self) -> Sequence[str]:
-        """Return, in sentences, what was not offered so far because it cannot be launched."""
+        """Return, in sentences, what was left out of the offers because it cannot be launched."""
 
     def credentials_end_at(self) -> float | None:
-        """Return when the first credentials end that end by themselves, in seconds since the epoch.
+        """Return when the first credentials expire, in seconds since the epoch; None for never.
 
         Cheap. None where nobody knows of an end.
         """
 
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
-        """Return, in sentences, what may keep launches from working until a time; None for ever."""
+        """Return, in sentences, what may make launches fail until a time; None for no limit."""
 
     def exposures(
         self, clouds: Sequence[str], *, open_port: int | None, allow_from: Sequence[str] = ()
     ) -> Sequence[str]:
-        """Return, in sentences, what machines there are given or open to that they need not be.
+        """Return, in sentences, unneeded credentials and open ports of machines there.
 
         Args:
             clouds: Where they may be.
@@ -124,7 +124,7 @@ class Accounts(Protocol):
         """
 
     def unverified(self, cloud: str) -> str:
-        """Return why what exists in a cloud cannot be checked there; empty when it can."""
+        """Return why a cloud's machines cannot be listed directly; empty when they can."""
 
 
 @runtime_checkable
@@ -132,7 +132,7 @@ class Baking(Protocol):
     """A cloud whose machines may start from an image that has a replica's environment already."""
 
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
-        """Write into a folder what `docker build` builds an image of.
+        """Write the build context for `docker build` into a folder.
 
         Args:
             task: A pool file's task, with paths from its folder.
@@ -145,7 +145,7 @@ class Baking(Protocol):
 
 @dataclass(frozen=True)
 class Audit:
-    """What exists, asked past every memory."""
+    """The machines that exist, looked up without any cache."""
 
     machines: tuple[Machine, ...]  # in any phase, ordered by id
     # Clouds (as in `Placement.cloud`) whose own list was read. Of all others it is what was
@@ -155,10 +155,10 @@ class Audit:
 
 @runtime_checkable
 class Auditing(Protocol):
-    """A cloud that can be asked for all that exists, whoever knows of it."""
+    """A cloud that can list all machines that exist, even those fogft forgot."""
 
     def audit(self, pool_uid: str = "") -> Audit:
-        """Look for what exists of a pool, or of all of this user's pools. Takes seconds.
+        """List the machines of a pool, or of all of this user's pools. Takes seconds.
 
         Raises CloudUnreachable: it cannot tell; nothing may be concluded.
         """
@@ -166,10 +166,10 @@ class Auditing(Protocol):
 
 @runtime_checkable
 class Refreshing(Protocol):
-    """A cloud whose list is from memory, and may still show what is gone."""
+    """A cloud whose list is cached and may still show machines that are gone."""
 
     def refresh(self, id: ReplicaId) -> None:
-        """Ask the provider about one machine, so that `machines` is true of it afterwards.
+        """Ask the provider about one machine, so that `machines` is up to date about it.
 
         Takes seconds: not from the manager's loop. Raises CloudUnreachable: it cannot tell.
         """

@@ -1,4 +1,4 @@
-"""Find out why a pool cannot work here, and say what to do about each reason.
+"""Checks of why a pool may not work on this machine, with a remedy for each.
 
 A check is a function that yields findings. It never changes anything, and never raises
 for what it looks for: a missing file is a finding. `run` turns a check's own failure

@@ -6,13 +6,13 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from fogft.doctor import leftovers, machine, pools, ros
+from fogft.doctor import machine, pools, ros
 from fogft.doctor.finding import Check, Finding, Situation, run
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 from fogft.poolfile.file import read
 
-ALL: tuple[Check, ...] = (*machine.CHECKS, *ros.CHECKS, *leftovers.CHECKS, *pools.CHECKS)
+ALL: tuple[Check, ...] = (*machine.CHECKS, *ros.CHECKS, *pools.CHECKS)
 
 
 def examine(file: Path | None = None) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""What a check found, and what to do about it."""
+"""The result of a check, with a remedy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fogft.model.spec import PoolSpec
 
 
 class Verdict(str, Enum):
-    """How bad it is."""
+    """How serious a finding is."""
 
     OK = "ok"
     WARN = "warn"  # works, but will surprise
@@ -20,7 +20,7 @@ class Verdict(str, Enum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """The result of one check."""
 
     check: str
     verdict: Verdict
@@ -30,7 +30,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Situation:
-    """What the checks may look at."""
+    """The input of all checks."""
 
     home: Path
     pools: tuple[str, ...] = ()
@@ -42,17 +42,17 @@ Check = Callable[[Situation], Iterable[Finding]]
 
 
 def ok(check: str, text: str) -> Finding:
-    """Return a finding that needs nothing done."""
+    """Return a finding without a problem."""
     return Finding(check, Verdict.OK, text)
 
 
 def warn(check: str, text: str, advice: str) -> Finding:
-    """Return a finding that will surprise somebody, with what to do."""
+    """Return a finding that may cause trouble, with advice."""
     return Finding(check, Verdict.WARN, text, advice)
 
 
 def fail(check: str, text: str, advice: str) -> Finding:
-    """Return a finding that stops a pool from working, with what to do."""
+    """Return a finding that stops a pool from working, with advice."""
     return Finding(check, Verdict.FAIL, text, advice)
 
 

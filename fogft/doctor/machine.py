@@ -87,7 +87,7 @@ def ports(_: Situation) -> Iterator[Finding]:
     except OSError:
         yield warn(
             "ports",
-            f"TCP port {LINK_PORT} is in use, which is the default of `fogft serve`",
+            f"TCP port {LINK_PORT}, the default of `fogft serve`, is in use",
             "pass `--listen HOST:PORT` when you run `fogft serve` here; pools on the local "
             "cloud pick free ports",
         )
@@ -102,7 +102,7 @@ def clock(situation: Situation) -> Iterator[Finding]:
     if situation.now < built - 86400:
         yield fail(
             "clock",
-            f"it is {shown} here, before fogft itself was installed",
+            f"the clock says {shown}, which is before fogft was installed",
             "set the clock, for example with `sudo timedatectl set-ntp true`",
         )
     else:

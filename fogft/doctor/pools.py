@@ -1,14 +1,21 @@
-"""Checks of a pool file and of the pools on this machine: credentials, manager, proxy, links."""
+"""Checks of a pool file and of the pools on this machine: credentials, manager, proxy, links.
+
+And of what forgotten pools and faults on purpose left behind.
+"""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
 from functools import partial
 from pathlib import Path
 
+from fogft import disk
+from fogft.cloud.local import faults
+from fogft.cloud.local.processes import find
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
-from fogft.errors import CredentialError, StateError
+from fogft.errors import CredentialError, FogftError, StateError
 from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.replica import LinkState
@@ -16,9 +23,44 @@ from fogft.pool.commands import status
 from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import read_identity
 
 _EXPIRY_WARNING = timedelta(days=3)
 _UP = "`fogft up FILE`"
+
+
+def orphaned_processes(situation: Situation) -> Iterator[Finding]:
+    """No replica of the local cloud runs without its pool."""
+    uids = []
+    for pool in situation.pools:
+        with contextlib.suppress(FogftError):
+            uids.append(read_identity(PoolPaths.of(pool, situation.home)).uid)
+    owned = {pid for uid in uids for pid in find(pool_uid=uid)}
+    orphans = [pid for pid in find() if pid not in owned]
+    if not orphans:
+        yield ok("leftovers", "no replicas without a pool")
+        return
+    yield warn(
+        "leftovers",
+        f"{len(orphans)} processes of replicas run whose pool is not in `{situation.home}`",
+        "they belong to a pool in another state folder: set FOGFT_HOME to it, and `fogft down` "
+        "ends the pool. If the folder is lost, they end after `unmanaged_max_hours`",
+    )
+
+
+def chaos(situation: Situation) -> Iterator[Finding]:
+    """No faults injected by `fogft chaos` are active."""
+    broken = faults.read_cloud(situation.home / "local")
+    found = [f"`{place}` is out" for place in broken.out(situation.now)]
+    found += [
+        f"`{place}` has room for {n} machines" for place, n in sorted(broken.capacity.items())
+    ]
+    if found:
+        yield warn(
+            "leftovers",
+            f"faults of `fogft chaos` are still active, for every pool: {', '.join(found)}",
+            "undo it with `fogft chaos clear`",
+        )
 
 
 def pool_file(situation: Situation) -> Iterator[Finding]:
@@ -30,7 +72,7 @@ def pool_file(situation: Situation) -> Iterator[Finding]:
     for service in situation.spec.services:
         if situation.spec.rmw.robot is Speaks.ZENOH and not service.needs_type:
             yield ok(
-                "pool file", f"service `{service.name}` is forwarded without looking at its type"
+                "pool file", f"service `{service.name}` is forwarded without checking its type"
             )
             continue
         problem = trouble(partial(load_service_type, service.type))
@@ -108,11 +150,16 @@ def processes(situation: Situation) -> Iterator[Finding]:
             continue
         yield from judge_processes(pool, seen)
         yield from judge_traffic(pool, seen)
-        yield from judge_links(pool, seen)
+        folder = PoolPaths.of(pool, situation.home).folder
+        if why := disk.unwritable(folder):
+            remedy = "change that: the manager launches nothing before, and goes on by itself then"
+            yield fail("disk", f"pool `{pool}`: the disk of `{folder}` is {why}", remedy)
+        else:  # or its links' report is old for that
+            yield from judge_links(pool, seen)
 
 
 def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
-    """Judge who lives, and whether the pool answers, as `fogft status` does."""
+    """Judge which processes run, and whether the pool answers, as `fogft status` does."""
     proxy, up = seen.status.proxy_alive, f"run `fogft up {seen.status.file}`"
     if seen.manager_alive:
         yield ok("manager", f"pool `{pool}`: runs")
@@ -136,7 +183,7 @@ def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
 
 
 def judge_traffic(pool: str, seen: Seen) -> Iterator[Finding]:
-    """Tell of clients that get no answers, and of topics that do not pass."""
+    """Report clients that get no answers, and topics that do not get through."""
     for service in seen.status.services:
         if why := service.counters.get("trouble"):
             yield fail("middleware", f"pool `{pool}`: {why}", "see `fogft logs`")
@@ -146,13 +193,13 @@ def judge_traffic(pool: str, seen: Seen) -> Iterator[Finding]:
         elif not topic.heard_by and seen.answers:
             yield warn(
                 "topics",
-                f"pool `{pool}`: nobody hears `{topic.name}`",
-                "is its `name` in the pool file what the nodes of `run` subscribe to?",
+                f"pool `{pool}`: no node on a replica subscribes to `{topic.name}`",
+                "compare its `name` in the pool file with what the nodes of `run` subscribe to",
             )
 
 
 def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
-    """Judge what the client proxy of a pool says of its links."""
+    """Judge the links that a pool's client proxy reports."""
     status = seen.status
     if not status.proxy_alive:
         return
@@ -185,7 +232,7 @@ def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
             yield warn(
                 "replicas",
                 f"{replica} is not ready: {one.detail}",
-                f"{log} shows what `run` says; compare each `name` and "
+                f"{log} shows what `run` prints; compare each `name` and "
                 "`type` in the pool file with what the node offers",
             )
     if reported and not up:
@@ -198,4 +245,4 @@ def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
         yield ok("links", f"pool `{pool}`: {len(up)} of {len(reported)} up")
 
 
-CHECKS: tuple[Check, ...] = (pool_file, certificates, processes)
+CHECKS: tuple[Check, ...] = (orphaned_processes, chaos, pool_file, certificates, processes)

@@ -25,7 +25,7 @@ _RMW_WITH_PROFILE = "rmw_fastrtps_cpp"
 # Above, the ports of DDS run into those that Linux gives to outgoing connections.
 _LAST_SAFE_DOMAIN, _LAST_DOMAIN = 101, 232
 _KNOWN = {
-    "rmw_cyclonedds_cpp": "works, but no service call passes between it and Fast DDS on a machine",
+    "rmw_cyclonedds_cpp": "works, but service calls between it and Fast DDS on one machine fail",
     "rmw_zenoh_cpp": "works, and with `rmw: zenoh` in the pool file fogft needs no ROS 2 for it",
 }
 _RANGES = ("SUBNET", "LOCALHOST", "OFF", "SYSTEM_DEFAULT")
@@ -56,12 +56,12 @@ def rclpy(_: Situation) -> Iterator[Finding]:
 
 
 def judge_middleware(rmw: str) -> Finding:
-    """Tell which middleware is in use, and what is known of it."""
+    """Report which middleware is in use, and how well it is tested with fogft."""
     if rmw == _RMW_WITH_PROFILE:
         return ok("middleware", f"{rmw}: fogft's measurements were made with it")
     return warn(
         "middleware",
-        f"{rmw}: {_KNOWN.get(rmw, 'nobody has tried it with fogft')}",
+        f"{rmw}: {_KNOWN.get(rmw, 'not tried with fogft')}",
         f"set the same RMW_IMPLEMENTATION for your nodes, or {_RMW_WITH_PROFILE} for all",
     )
 
@@ -72,7 +72,7 @@ def domain(_: Situation) -> Iterator[Finding]:
 
 
 def judge_domain(environ: Mapping[str, str]) -> Iterator[Finding]:
-    """Judge the variables that decide who sees whom."""
+    """Judge the environment variables that control ROS discovery."""
     text = environ.get("ROS_DOMAIN_ID", "") or "0"
     if not text.isdecimal() or int(text) > _LAST_DOMAIN:
         yield fail(
@@ -217,8 +217,8 @@ def _self_test(*arguments: str) -> dict[str, Any]:
     try:
         result = json.loads(ended.stdout.strip().splitlines()[-1])
     except (ValueError, IndexError):
-        said = ended.stderr.strip().splitlines() or ["nothing was said"]
-        return {"error": f"it ended with status {ended.returncode}: {said[-1]}"}
+        said = ended.stderr.strip().splitlines() or ["it printed nothing"]
+        return {"error": f"it exited with status {ended.returncode}: {said[-1]}"}
     return result if isinstance(result, dict) else {"error": "no answer"}
 
 

@@ -54,13 +54,16 @@ class CloudNode(Node):  # type: ignore[misc]
     Takes what `launch_ros.actions.Node` takes. Name, namespace, parameters, remappings,
     environment and arguments are kept; `output` and `respawn` have no effect: replicas'
     logs are always shown, and their nodes always restarted.
+
+    Raises:
+        FogftError: An argument cannot be carried to another machine.
     """
 
     def __init__(self, **arguments: Any) -> None:
         for key, instead in _NOT_CARRIED.items():
             if arguments.get(key):
                 what = arguments.get("executable", "?")
-                raise FogftError(f"cloud node `{what}`: `{key}` cannot be carried", instead)
+                raise FogftError(f"cloud node `{what}`: `{key}` is not supported", instead)
         self._is_path = not arguments.get("package")
         super().__init__(**arguments)
 
@@ -94,7 +97,7 @@ class CloudNode(Node):  # type: ignore[misc]
         """Run it on this machine, in a fog pool that stays here."""
         if not _stays_here(context):
             raise FogftError(
-                "a cloud node is outside of any fog pool", "put it into a `FogPool` (`fog_pool`)"
+                "a cloud node is outside any fog pool", "put it into a `FogPool` (`fog_pool`)"
             )
         result: list[Action] | None = super().execute(context)
         return result
@@ -216,7 +219,7 @@ def _running(
     def ended(event: Any, _context: LaunchContext) -> list[Action]:
         if event.returncode == 0:
             return []
-        return [EmitEvent(event=Shutdown(reason=f"the fog pool `{name}` did not come up"))]
+        return [EmitEvent(event=Shutdown(reason=f"the fog pool `{name}` did not start"))]
 
     return [
         RegisterEventHandler(OnProcessIO(target_action=process, on_stdout=heard)),
@@ -243,7 +246,7 @@ def _evaluated(context: LaunchContext, value: Any) -> Any:
         return list(value)
     text = _text(context, value)
     if "\n" not in text and text[:1] not in ("{", "["):
-        return int(text) if text.isdigit() else text
+        return int(text) if text.isdecimal() else text
     try:
         found = yaml.safe_load(text)
     except yaml.YAMLError:

@@ -25,6 +25,7 @@ class NodeCommand:
     Attributes:
         package: Its ROS package; empty when `executable` is a path or a program's name.
         arguments: After the executable, ``--ros-args`` included.
+        environ: Set for this node besides what the replica has.
         files: Contents of parameter files, by the argument that names each.
     """
 
@@ -40,6 +41,9 @@ def run_text(nodes: Sequence[NodeCommand]) -> str:
 
     One node replaces the shell. Of several, the end of one ends all, so that they are
     started again together.
+
+    Raises:
+        FogftError: There is no node, or a parameter file is too large to be carried.
     """
     if not nodes:
         raise FogftError("a fog pool contains no cloud node", "move a node into it as a cloud node")
@@ -92,7 +96,11 @@ def pool_tree(
     task: Mapping[str, Any],
     fogft: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return a pool file's tree: a base file with what the launch file says laid over it."""
+    """Return a pool file's tree: a base file overridden by the launch file.
+
+    Raises:
+        FogftError: The base runs something itself, or there is no name.
+    """
     if base.get("run"):
         raise FogftError(
             "the pool file of a fog pool has a `run` of its own",

@@ -26,13 +26,15 @@ class _Interrupted(Exception):
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run a pool until a signal comes; return the exit status."""
+    """Run a pool until a signal arrives; return the exit status."""
     parser = argparse.ArgumentParser(prog="fogft.launch.run_pool")
     parser.add_argument("file")
     parser.add_argument("--pool", required=True)
     parser.add_argument("--cloud")
     parser.add_argument("--timeout")
-    parser.add_argument("--down", action="store_true", help="End the pool with us.")
+    parser.add_argument(
+        "--down", action="store_true", help="Shut the pool down when this process exits."
+    )
     asked = parser.parse_args(arguments)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, _interrupt)

@@ -41,7 +41,12 @@ def is_batch(header: bytes) -> bool:
 def encode_requests(
     requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
 ) -> tuple[bytes, bytes]:
-    """Return header and payload for requests: id, remaining seconds, handling and payload."""
+    """Return header and payload for requests: id, remaining seconds, handling and payload.
+
+    Args:
+        requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
+        seen: The stamp of the last answer that the connection has seen.
+    """
     parts = []
     for id, remaining_s, handling, payload in requests:
         parts.append(_REQUEST.pack(id, remaining_s, handling, len(payload)))
@@ -50,7 +55,11 @@ def encode_requests(
 
 
 def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
-    """Return the requests of a batch, each with a header. Raises FrameError: none is believed."""
+    """Return the requests of a batch, each with a header of its own.
+
+    Raises:
+        FrameError: It is not one: then none of it is to be believed.
+    """
     if not is_batch(header):
         raise FrameError("no batch of requests")
     seen = header[1:_STAMPED]

@@ -1,4 +1,4 @@
-"""Compress what a thin uplink carries, where it pays, and decompress it. No Zenoh.
+"""Compress payloads on thin uplinks where that pays, and decompress them. No Zenoh.
 
 zlib at its lowest level: it is in every Python, and on the links where compression can pay at
 all it is not what limits. What pays is measured for each service: how far its bytes shrink and
@@ -47,7 +47,11 @@ class Compression:
         self._pause = _FIRST_PAUSE
 
     def pack(self, payload: bytes, bytes_per_s: float | None) -> bytes | None:
-        """Return the payload compressed; None where it is to be sent as it is."""
+        """Return the compressed payload; None if it is to be sent uncompressed.
+
+        Args:
+            bytes_per_s: What the link was seen to drain; None for not known, which is fast.
+        """
         if bytes_per_s is None or bytes_per_s > FASTEST_BYTES_PER_S:
             return None
         if not LEAST_BYTES <= len(payload) <= LIMIT_BYTES:
@@ -85,7 +89,7 @@ class Compression:
 
 
 def unpack(packed: bytes, limit: int = LIMIT_BYTES) -> bytes:
-    """Return what was compressed. Raises ValueError: it is not whole, or above `limit` bytes."""
+    """Decompress a payload. Raises ValueError: it is incomplete, or above `limit` bytes."""
     reader = zlib.decompressobj()
     try:
         payload = reader.decompress(packed, limit)

@@ -1,4 +1,4 @@
-"""Count events by name, and log those that people should know of.
+"""Count events by name, and log those that matter to people.
 
 Owns: numbers. Not here: what they are shown as (`fogft.proxy`, `fogft.pool`).
 """
@@ -27,7 +27,7 @@ class Counters:
             return self._counts[event]
 
     def warn(self, log: logging.Logger, event: str, message: str, *values: object) -> None:
-        """Count an event and log it with its count, the more often it happens the more seldom."""
+        """Count an event and log it with its count, less often the more it happens."""
         count = self.add(event)
         if worth_logging(count):
             log.warning(f"{message} count=%d", *values, count)

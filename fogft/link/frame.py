@@ -52,8 +52,13 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
     """The header of a request.
 
     Attributes:
+        request_id: 16 bytes, made by the client proxy.
+        remaining_s: Time left when it was sent, in seconds.
+        token: Names the robot's connection, so that replies queue apart.
+        seen: The stamp of the last answer that its connection has seen.
         may_pack: The answer may be compressed.
         reads_packed: It may be where the replica itself finds the link to be thin.
+        handling: What the replica is asked to do with it.
     """
 
     request_id: bytes
@@ -69,7 +74,13 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
 
 @dataclass(frozen=True)
 class Greeting:
-    """Sent with a probe to authenticate the connection."""
+    """Sent with a probe to authenticate the connection.
+
+    Attributes:
+        token: Names the robot's connection; requests under it are the greeter's.
+        certificate: The robot's (DER), with the first probe; empty once it was answered.
+        signature: Over `greeted_bytes`, with that certificate's key (DER).
+    """
 
     token: bytes
     certificate: bytes = b""
@@ -77,7 +88,11 @@ class Greeting:
 
 
 def origin(robot: str, token: bytes) -> bytes:
-    """Return what all headers of a connection begin with. Raises ValueError: a bad name."""
+    """Return the prefix of all headers of a connection.
+
+    Raises:
+        ValueError: The token is not 8 bytes, or the name not 1 to 64 printable bytes.
+    """
     name = robot.encode()
     if len(token) != TOKEN_BYTES:
         raise ValueError(f"a token has {TOKEN_BYTES} bytes")
@@ -148,7 +163,7 @@ def decode_request(frame: bytes) -> RequestHeader:
 
 
 def read_handling(flags: int) -> Handling:
-    """Return what a replica is asked to do."""
+    """Read how a replica is asked to handle the request."""
     handling = _HANDLINGS.get(flags)
     if handling is None:
         raise FrameError(f"a request with flags {flags:#x}")
@@ -156,7 +171,7 @@ def read_handling(flags: int) -> Handling:
 
 
 def encode_load(load: Load | None) -> bytes:
-    """Return what a replica has to do, in `LOAD_BYTES`; what is larger than fits is cut."""
+    """Encode a replica's load in `LOAD_BYTES`; larger values are capped."""
     if load is None:
         return NO_LOAD
     waiting, running, slots, service_s, spent_s = load
@@ -166,7 +181,7 @@ def encode_load(load: Load | None) -> bytes:
 
 
 def decode_load(frame: bytes) -> Load | None:
-    """Return what a replica has to do; None where it does not say. `frame` has `LOAD_BYTES`."""
+    """Decode a replica's load; None if it gives none. `frame` has `LOAD_BYTES`."""
     if frame == NO_LOAD:
         return None
     load = Load(*_LOAD.unpack(frame))
@@ -220,7 +235,7 @@ def read_reason(said: bytes) -> str:
 
 
 def greeted_bytes(token: bytes, replica: str) -> bytes:
-    """Return what a greeting's signature covers: one connection, one replica's name."""
+    """Return the bytes that a greeting's signature covers: one connection, one replica's name."""
     return b"fogft greeting 1\n" + token + replica.encode()
 
 
@@ -268,10 +283,10 @@ def decode_cancel(frame: bytes) -> list[bytes]:
 
 
 def check_version(version: Any) -> None:
-    """Refuse what another version wrote. Raises FrameError: it is not of this version."""
+    """Check the link version of a frame. Raises FrameError: it is not this version."""
     if version is True or version != VERSION:
         older = isinstance(version, int) and version < VERSION
         raise FrameError(
-            f"version {version!r:.20} of the link, and here is version {VERSION}: upgrade fogft "
+            f"link version {version!r:.20} there and {VERSION} here: upgrade fogft "
             + ("there" if older else "here")
         )

@@ -28,7 +28,7 @@ from fogft.requests.load import Handling, Load
 
 @dataclass(frozen=True)
 class SendOptions:
-    """Which services want the newest first, no compression, or a deadline on the way.
+    """Services that want the newest request first, no compression, or deadlines on the link.
 
     Attributes:
         latest: Those of which the newest request goes first.
@@ -43,7 +43,7 @@ class SendOptions:
 
     @classmethod
     def of(cls, services: Iterable[ServiceSpec]) -> SendOptions:
-        """Return what these services want."""
+        """Return the options of these services."""
         known = tuple(services)
         return cls(
             frozenset(s.name for s in known if s.freshness is Freshness.LATEST),
@@ -57,7 +57,7 @@ DEFAULT_OPTIONS = SendOptions()
 
 @dataclass(frozen=True)
 class Probe:
-    """What a robot tells a replica with each probe.
+    """The content of a robot's probe.
 
     Attributes:
         describe: The answer shall tell the definitions of the services' types.
@@ -71,7 +71,7 @@ class Probe:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplicaWord:
-    """What a replica says of itself, as its probes' answers and gateways tell it.
+    """A replica's own state, as reported in probe answers and by gateways.
 
     Attributes:
         ready: Names of the services that it can answer now.
@@ -98,7 +98,7 @@ class ReplicaWord:
 
 @dataclass(frozen=True, kw_only=True)
 class GatewayView(ReplicaWord):
-    """What a gateway sees of one replica behind it. Durations in seconds.
+    """A gateway's link to one replica behind it. Durations in seconds.
 
     Attributes:
         through: The gateways on the way, beginning with the one that is asked, and its name
@@ -121,7 +121,7 @@ class GatewayView(ReplicaWord):
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeAnswer(ReplicaWord):
-    """What a replica answers to each probe.
+    """A replica's answer to a probe.
 
     Attributes:
         incarnation: Random text made when the server proxy started. A new one at the
@@ -164,17 +164,17 @@ class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thri
 
 
 class LinkEvents(Protocol):
-    """What a link tells its owner. Called from the link's threads; must not block."""
+    """Callbacks from a link to its owner. Called from the link's threads; must not block."""
 
     def answered(self, link: Link, answer: Answer) -> None:
-        """One attempt has ended. Exactly one call for each accepted `offer`.
+        """An attempt has ended. Called exactly once for each accepted `offer`.
 
         An attempt whose link dies ends with ``Refusal.LOST``; a later answer of the
         old connection is dropped by the link.
         """
 
     def late(self, link: Link, answer: Answer) -> None:
-        """An attempt has ended that was forgotten: its bytes are for nobody.
+        """A forgotten attempt has ended; its bytes are not needed.
 
         Of a connection that was given up it may not be told.
         """
@@ -212,7 +212,6 @@ class LinkStatus:
     silent_for_s: float
     rtt_s: float | None
     in_flight: int
-    in_flight_bytes: int
     reopened: int
     detail: str
     uplinks: tuple[Mapping[str, Any], ...] = ()
@@ -224,7 +223,7 @@ class Link(Protocol):
 
     @property
     def peer(self) -> Peer:
-        """Whom it talks to."""
+        """The replica at the other end."""
 
     @property
     def usable(self) -> bool:
@@ -236,7 +235,7 @@ class Link(Protocol):
 
     @property
     def draining(self) -> bool:
-        """Whether the replica asked to be left alone. Cheap."""
+        """Whether the replica is draining: it asked for no new requests. Cheap."""
 
     def offer(
         self,
@@ -259,7 +258,7 @@ class Link(Protocol):
         """
 
     def send(self) -> None:
-        """Send what was offered with `more`. Cheap; never blocks."""
+        """Flush requests that were offered with `more`. Cheap; never blocks."""
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request whose answer is no longer wanted. Unknown ids are fine.
@@ -268,7 +267,7 @@ class Link(Protocol):
         """
 
     def flush(self) -> None:
-        """Tell the replica of all that was forgotten and not answered. Cheap; never blocks."""
+        """Send cancellations for forgotten, unanswered requests. Cheap; never blocks."""
 
     def status(self) -> LinkStatus:
         """Return a snapshot, for people and for the manager."""
@@ -278,22 +277,22 @@ class Link(Protocol):
 
 
 class Dialer(Protocol):
-    """Makes links. One for each client proxy."""
+    """Creates links. One for each client proxy."""
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
         """Start a link to the keys of these services; return at once, in CONNECTING."""
 
     def adopt(self, options: SendOptions) -> None:
-        """Set what services want of their links, from the next connection on."""
+        """Set the options of services, from the next connection on."""
 
     def renew(self) -> None:
-        """Take the credentials that now stand in their files into use. No request is lost."""
+        """Reload the credentials from their files. No request is lost."""
 
     def tell(self, records: Sequence[SignedRecord]) -> None:
-        """Tell every replica these records, now and whenever a link comes up."""
+        """Send these records to every replica, now and whenever a link comes up."""
 
     def newer(self) -> list[SignedRecord]:
-        """Return what replicas said last in place of what they were told; nothing is verified."""
+        """Return newer records that replicas sent in reply; nothing is verified."""
 
     def certificate(self) -> str:
         """Return the common name of the certificate that every link uses.

@@ -1,4 +1,4 @@
-"""Probes and their answers, as JSON: what is added later, an older peer does not look at. Pure.
+"""Probes and their answers as JSON; older peers ignore keys added later. Pure.
 
 Like `frame`: a decoder returns a value or raises `FrameError`, whatever bytes come in.
 """

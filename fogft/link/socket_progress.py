@@ -1,16 +1,29 @@
-"""How fast one connection drains, and since when it does not. Pure: `now` is an argument.
+"""How fast one connection drains, since when it does not, and what cannot arrive in time over it.
 
 A send that takes long is no fault on a thin uplink: 1 MB needs eight seconds at 1 Mbit/s. It is
 one when nothing moves. The kernel knows: it counts the bytes that the peer has acknowledged. So
 how long a link may take follows from what is measured, and no time-out has to be guessed.
 
-Owns: the rate, and what counts as progress. Not here: where the counts come from (`sockets`).
+Where more is asked of a thin link than it carries, each request leaves after those before it, with
+too little of its time left: every one arrives too late, and none in time. So the window follows
+from the rate that the link was seen to carry and from the time that is left; who is declined at
+once may be sent on another uplink, or to another replica. The rate is known for ten seconds only:
+then a request is let through again, by which the link is measured anew.
+
+Owns: the rate, what counts as progress, and that judgement. `now` is an argument.
+Not here: where the counts come from (`sockets`), the bounds by bytes and by count (`window`).
 """
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from statistics import median_high
+
+from fogft.link.compression import Compression
+from fogft.link.window import OpenAttempt
+from fogft.log_limits import worth_logging
 
 SPAN_S = 0.5
 ENOUGH = 4  # spans, before anybody is turned away: longer than any pause that is no loss
@@ -36,7 +49,7 @@ class Throughput:
         self._still_s = 0.0  # since something was acknowledged
 
     def look(self, moved: int, lasted_s: float, now: float, *, queued: bool) -> None:
-        """Take what was acknowledged since; `queued`: more waited the whole time."""
+        """Take the bytes acknowledged since; `queued`: more were waiting the whole time."""
         self._still_s += lasted_s
         if not queued:
             self._open, self._before = False, None
@@ -64,7 +77,7 @@ class Throughput:
         self._before, self._moved, self._lasted_s = rate, 0, 0.0
 
     def bytes_per_s(self, now: float) -> float | None:
-        """Return what it carries, as lately seen; None where that is not known."""
+        """Return the recent throughput; None if unknown."""
         if not self._spans:  # the usual case
             return None
         rates = [rate for at, rate in self._spans if now - at <= KEPT_S]
@@ -81,9 +94,11 @@ _SHORTEST_LOOK_S = 0.05
 
 @dataclass(frozen=True)
 class Flow:
-    """What the kernel says of one connection.
+    """The kernel's counters of one connection.
 
     Attributes:
+        acknowledged: Bytes that the peer's kernel has acknowledged so far.
+        received: Bytes that came from the peer so far.
         outstanding: Bytes handed to the kernel that are not acknowledged.
         round_trip_s: The smoothed time to an acknowledgement, with four times its variation.
         unsent: Bytes among the outstanding ones that have not left: the path takes no more now.
@@ -97,7 +112,11 @@ class Flow:
 
 
 class SocketProgress:
-    """The progress of one connection. Times are monotonic seconds."""
+    """The progress of one connection. Times are monotonic seconds.
+
+    Attributes:
+        throughput: What it was seen to carry over some time.
+    """
 
     def __init__(self) -> None:
         self.throughput = Throughput()
@@ -109,9 +128,12 @@ class SocketProgress:
         self.bytes_per_s: float | None = None
 
     def look(self, flow: Flow, now: float, sending_for_s: float = 0.0) -> float:
-        """Take a new count; return for how many of the seconds since the last one bulk moved.
+        """Take a new count; return for how many seconds since the last one data moved.
 
         These are not to be held against the peer: whatever it says queues behind that.
+
+        Args:
+            sending_for_s: For how long something large has been on its way into the kernel.
         """
         last, since_s = self._last, now - self._last_at
         if last is not None and since_s < _SHORTEST_LOOK_S:
@@ -143,18 +165,83 @@ class SocketProgress:
         self.bytes_per_s = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
 
     def left_bytes(self, now: float, bytes_per_s: float) -> float:
-        """Return what of the outstanding bytes will not have arrived yet."""
+        """Return how many of the outstanding bytes have not arrived yet."""
         outstanding = self._last.outstanding if self._last is not None else 0
         return max(0.0, outstanding - bytes_per_s * (now - self._last_at))
 
     def stuck_s(self, now: float) -> float:
-        """Return since when bytes are outstanding of which none is acknowledged, in seconds."""
+        """Return for how many seconds outstanding bytes have gone unacknowledged."""
         return 0.0 if self._progress_at is None else max(0.0, now - self._progress_at)
 
     def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
-        """Whether a queue has stood still for longer than this path's own pauses explain."""
+        """Whether the queue has been still for longer than pauses of this path explain.
+
+        Args:
+            shortest_s: However quick the path: its peer's processor may be busy.
+            longest_s: However slow the path, no longer than that.
+        """
         last = self._last
         if last is None or last.outstanding < BULK_BYTES:
             return False
         pause_s = max(shortest_s, 4 * last.round_trip_s)
         return self.stuck_s(now) > min(pause_s, longest_s)
+
+
+log = logging.getLogger(__name__)
+
+
+class DeadlineFilter:
+    """Judges the requests of one connection. Any thread.
+
+    Args:
+        timed: Services whose requests are of no use after their time.
+        carries: Returns what the link carries, by the clock, in bytes a second; None where that is
+            not known.
+        left: Returns how many bytes sent before have not arrived, by the clock and that rate.
+        packs: Returns a service's compression; None where its payloads leave as they are.
+    """
+
+    def __init__(
+        self,
+        timed: Collection[str],
+        carries: Callable[[float], float | None],
+        left: Callable[[float, float], float],
+        packs: Callable[[str], Compression | None],
+    ) -> None:
+        self.declined = 0
+        self._timed = timed
+        self._carries = carries
+        self._left = left
+        self._packs = packs
+
+    def may_arrive(
+        self,
+        attempt: OpenAttempt,
+        remaining_s: float,
+        now: float,
+        before: Callable[[str], Iterable[OpenAttempt]] = lambda service: (),
+    ) -> bool:
+        """Whether an attempt may arrive in time behind what leaves `before` it."""
+        rate = self._carries(now)
+        if rate is None or attempt.service not in self._timed:
+            return True
+        size = self._left(now, rate) + sum(
+            map(self._on_the_way, (attempt, *before(attempt.service)))
+        )
+        if size <= rate * remaining_s:
+            return True
+        self.declined += 1
+        if worth_logging(self.declined):
+            log.warning(
+                "request_too_slow service=%s bytes=%d bytes_per_s=%d remaining_s=%.3f count=%d",
+                attempt.service, size, rate, remaining_s, self.declined,
+            )  # fmt: skip
+        return False
+
+    def _on_the_way(self, attempt: OpenAttempt) -> float:
+        """Return how many bytes an attempt will be at least; 0 where that is not known."""
+        compression = self._packs(attempt.service)
+        if compression is None:
+            return attempt.size
+        ratio = compression.ratio
+        return 0.0 if ratio is None else attempt.size * min(1.0, ratio)

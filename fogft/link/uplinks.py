@@ -1,12 +1,11 @@
-"""Several uplinks at once: one link a replica *and* interface, put together as one link.
+"""Several uplinks at once: a link for each replica *and* interface, combined into one.
 
 Whoever uses it sees one link to one replica. A request goes out on one uplink or on all, as
 its service's policy says, under one id: the replica runs it once, whichever copies arrive.
 When an uplink is lost with requests on it, they go out on another one, without the caller's
 policy hearing of it. Only when no uplink is left an attempt ends as lost.
 
-Owns: which uplinks an attempt is on. Not here: the links themselves (`link`), policies
-(`fogft.model.uplinks`).
+Owns: which uplinks an attempt is on. Not here: the links themselves (`link`).
 """
 
 from __future__ import annotations
@@ -27,14 +26,32 @@ from fogft.link.port import (
     Peer,
     SendOptions,
 )
+from fogft.model.choices import UplinkPolicy
 from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec
-from fogft.model.uplinks import UplinkPolicy, choose
 from fogft.requests.load import Handling
 
 _ANSWERED_KEPT = 1024
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
+
+
+def choose(
+    policy: UplinkPolicy, usable: Sequence[int], current: int | None
+) -> tuple[Sequence[int], int | None]:
+    """Return which of the usable uplinks a request takes, and which is current from now on.
+
+    Args:
+        usable: Uplinks that are up and not on the request already, as listed in the pool file.
+        current: The one that `failover` uses; None before the first.
+    """
+    if policy is UplinkPolicy.ALL or not usable:
+        return usable, current
+    if policy is UplinkPolicy.FAILOVER and current is not None and current in usable:
+        return (current,), current
+    later = [one for one in usable if current is not None and one > current]
+    chosen = later[0] if policy is UplinkPolicy.FAILOVER and later else usable[0]
+    return (chosen,), chosen
 
 
 @dataclass
@@ -49,7 +66,7 @@ class _Attempt:
 
 
 class UplinksLink:
-    """Links to one replica, one an interface; see `port.Link`. Made by `UplinkDialer`."""
+    """Links to one replica, one for each interface; see `port.Link`. Created by `UplinkDialer`."""
 
     def __init__(
         self, dialer: UplinkDialer, peer: Peer, services: Mapping[str, str], events: LinkEvents
@@ -77,12 +94,12 @@ class UplinksLink:
 
     @property
     def ready(self) -> frozenset[str]:
-        """Services that the replica called ready, by any uplink that is up."""
+        """Services that the replica reports ready, over any uplink that is up."""
         return frozenset(name for link in self._links for name in link.ready)
 
     @property
     def draining(self) -> bool:
-        """Whether the replica asked to be left alone."""
+        """Whether the replica is draining."""
         return any(link.draining for link in self._links)
 
     def offer(
@@ -143,7 +160,7 @@ class UplinksLink:
         return True
 
     def send(self) -> None:
-        """Do nothing: no uplink is told of more to come."""
+        """Do nothing: uplinks send each request at once."""
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request whose answer is no longer wanted, on every uplink."""
@@ -154,7 +171,7 @@ class UplinksLink:
             self._links[index].forget(request_id)
 
     def flush(self) -> None:
-        """Send again what lost its uplink, and tell the replica of what was forgotten."""
+        """Resend requests that lost their uplink, and send cancellations."""
         with self._lock:
             again, self._again = self._again, []
         for request_id in again:
@@ -171,7 +188,6 @@ class UplinksLink:
         return replace(
             best,
             in_flight=sum(status.in_flight for status in found),
-            in_flight_bytes=sum(status.in_flight_bytes for status in found),
             reopened=sum(status.reopened for status in found),
             uplinks=tuple(
                 {
@@ -232,19 +248,24 @@ class UplinksLink:
         self._events.answered(self, answer)
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Tell of work in vain; a second copy of an answer is none: the replica ran it once."""
+        """Report wasted work; a second copy of an answer is not one: the replica ran it once."""
         with self._lock:
             copy = answer.request_id in self._answered
         if not copy:
             self._events.late(self, answer)
 
     def changed(self, link: Link) -> None:
-        """Tell that an uplink has changed."""
+        """Report that an uplink has changed."""
         self._events.changed(self)
 
 
 class UplinkDialer:
-    """Makes links that use several uplinks; see `port.Dialer`."""
+    """Makes links that use several uplinks; see `port.Dialer`.
+
+    Attributes:
+        interfaces: Names of network interfaces, the preferred one first; none for whatever the
+            routes say.
+    """
 
     def __init__(self, inner: Dialer) -> None:
         self.inner = inner
@@ -255,7 +276,7 @@ class UplinkDialer:
         self._options = DEFAULT_OPTIONS
 
     def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
-        """Set the uplinks and what services want; whether links have to be dialled anew."""
+        """Set the uplinks and the options of services; return whether links must be redialled."""
         options = SendOptions.of(services)
         # Not `timed`: who becomes stateful, or comes anew, has its links dialled anyway.
         old = (self.interfaces, self._options.latest, self._options.plain)
@@ -266,7 +287,7 @@ class UplinkDialer:
         return changed
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
-        """Start a link; return at once. What is on this machine takes no uplink."""
+        """Start a link; return at once. Replicas on this machine use no uplink."""
         if not self.interfaces or peer.endpoint.startswith(("127.", "[::1]")):
             return self.inner.dial(peer, services, events)
         return UplinksLink(self, peer, services, events)

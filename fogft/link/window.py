@@ -1,16 +1,30 @@
-"""What a connection keeps of attempts: those open, unanswered, or about to leave together.
+"""What a connection keeps of attempts: those open, unanswered, about to leave, or cancelled.
 
 An attempt is in its window from the moment it is accepted until it has ended; whoever removes it
 reports its end, so that each end is reported once. The offering thread, the sender thread
 and Zenoh's threads meet here: each step holds one short lock. No clock, no Zenoh.
 
-Owns: which attempts are open, and whether there is room. Not here: sending, deadlines.
+On a thin uplink attempts wait for seconds until they are sent. Of a service that wants the latest,
+the newest takes the turn of the oldest; the others keep waiting, and are sent while their time
+lasts. Between services the order is that of arrival.
+
+To tell a replica that a request was cancelled costs a message, and is worth it only where there is
+work to be saved. A request that was sent a moment ago is most likely answered before the message is
+there. So it is told at once if the request has been out for `WORTH_S` and the replica was told
+nothing for `EVERY_S`, else with the next flush, and not at all if the answer comes first.
+
+Owns: which attempts are open, whether there is room, the order of sending, and which ids are to be
+told. Not here: sending (`attempts`), deadlines.
 """
 
 from __future__ import annotations
 
+import heapq
 import threading
+from collections.abc import Collection
 from dataclasses import dataclass
+from itertools import count
+from queue import SimpleQueue
 
 from fogft.link import batch_frames
 from fogft.requests.load import Handling
@@ -23,7 +37,7 @@ BYTES_LIMIT = 64 << 20
 
 @dataclass(slots=True, eq=False)
 class OpenAttempt:
-    """A request on its way through one connection.
+    """A request on one connection.
 
     Attributes:
         payload: None once it was sent, or is not wanted.
@@ -48,9 +62,9 @@ class OpenAttempt:
 class LinkWindow:
     """The attempts open on one connection."""
 
-    def __init__(self, limit: int = ATTEMPTS_LIMIT, limit_bytes: int = BYTES_LIMIT) -> None:
-        self._limit = limit
-        self._limit_bytes = limit_bytes
+    limit, limit_bytes = ATTEMPTS_LIMIT, BYTES_LIMIT  # a larger single one still gets in alone
+
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         self._open: dict[bytes, OpenAttempt] = {}
         self.held_bytes = 0  # bytes of all open attempts
@@ -66,7 +80,7 @@ class LinkWindow:
         with self._lock:
             if self._closed or attempt.request_id in self._open:
                 return False
-            full = len(self._open) >= self._limit or self.held_bytes + size > self._limit_bytes
+            full = len(self._open) >= self.limit or self.held_bytes + size > self.limit_bytes
             if full and self._open:
                 self._declined = True
                 return False
@@ -106,8 +120,8 @@ class LinkWindow:
             return False
         with self._lock:
             # A quarter free: a window that is full to the brim is not announced for each slot.
-            roomy = len(self._open) <= self._limit * 3 // 4
-            if roomy and self.held_bytes <= self._limit_bytes * 3 // 4:
+            roomy = len(self._open) <= self.limit * 3 // 4
+            if roomy and self.held_bytes <= self.limit_bytes * 3 // 4:
                 self._declined = False
                 return True
             return False
@@ -122,8 +136,6 @@ class LinkWindow:
             return ended
 
 
-# The window holds 512; a replica that never answers what was forgotten holds no more than this.
-UNANSWERED_LIMIT = 8192
 # A replica ends all that it takes, cancelled requests too. One that has ended none of so many in a
 # row that others answered, not even so long past their deadlines, ignores what it is sent.
 IGNORED_LIMIT = 3
@@ -133,8 +145,10 @@ IGNORED_AFTER_S = 10.0
 class Unanswered:
     """The requests sent on one connection and not answered yet, by id."""
 
-    def __init__(self, limit: int = UNANSWERED_LIMIT) -> None:
-        self._limit = limit
+    # The window holds 512; a replica that never answers what was forgotten holds no more than this.
+    limit = 8192
+
+    def __init__(self) -> None:
         self._attempts: dict[bytes, OpenAttempt] = {}
         self._lock = threading.Lock()
         self._sent = 0
@@ -154,8 +168,8 @@ class Unanswered:
         with self._lock:
             self._sent += 1
         self._attempts[attempt.request_id] = attempt
-        if len(self._attempts) > self._limit:
-            for id in list(self._attempts)[: self._limit // 8]:
+        if len(self._attempts) > self.limit:
+            for id in list(self._attempts)[: self.limit // 8]:
                 self._attempts.pop(id, None)
 
     def answered(self, request_id: bytes) -> OpenAttempt | None:
@@ -209,3 +223,88 @@ class BatchBuffer:
     def _take(self) -> list[OpenAttempt]:
         taken, self._attempts, self._bytes = self._attempts, [], 0
         return taken
+
+
+WORTH_S = 0.005
+EVERY_S = 0.01  # under load each answer has a loser: they are told together
+CANCELLED_LIMIT = (
+    4096  # what one message carries; further ones are not told, and their work is not saved
+)
+
+
+class Cancellations:
+    """Ids of cancelled requests of which a replica is still to be told.
+
+    Each step is one operation on a dictionary, which is atomic.
+    """
+
+    def __init__(self) -> None:
+        self._ids: dict[bytes, None] = {}
+        self._told_at = float("-inf")
+
+    def __bool__(self) -> bool:
+        return bool(self._ids)
+
+    def add(self, request_id: bytes, sent_at: float, now: float) -> bool:
+        """Cancel a request sent at `sent_at`; return whether to tell the replica at once."""
+        if len(self._ids) < CANCELLED_LIMIT:
+            self._ids[request_id] = None
+        if now - sent_at < WORTH_S or now - self._told_at < EVERY_S:
+            return False
+        self._told_at = now
+        return True
+
+    def answered(self, request_id: bytes) -> None:
+        """Note that the answer came anyway, so nothing needs to be sent."""
+        self._ids.pop(request_id, None)
+
+    def take(self) -> list[bytes]:
+        """Remove and return the ids to send now."""
+        return [id for id in list(self._ids) if self._ids.pop(id, self) is None]
+
+
+Waiting = list[tuple[float, int, OpenAttempt]]
+
+
+class SendQueue:
+    """A queue of attempts; None ends the sender thread. Any thread.
+
+    Args:
+        latest: Services of which the newest is preferred.
+    """
+
+    def __init__(self, latest: Collection[str] = ()) -> None:
+        self._queued: SimpleQueue[OpenAttempt | str | None] = SimpleQueue()
+        self.qsize = self._queued.qsize
+        self._lock = threading.Lock()
+        self._order = count()
+        self._waiting: dict[str, Waiting] = {service: [] for service in latest}
+
+    def overtakes(self, service: str) -> bool:
+        """Whether a service's newest request is sent first."""
+        return service in self._waiting
+
+    def put(self, attempt: OpenAttempt | None) -> None:
+        """Queue an attempt; None ends the sender after all before it."""
+        waiting = self._waiting.get(attempt.service) if attempt is not None else None
+        if attempt is None or waiting is None:
+            self._queued.put(attempt)
+            return
+        with self._lock:
+            heapq.heappush(waiting, (-attempt.deadline, next(self._order), attempt))
+        self._queued.put(attempt.service)
+
+    def get(self) -> OpenAttempt | None:
+        """Wait for the next one."""
+        turn = self._queued.get()
+        if not isinstance(turn, str):
+            return turn
+        with self._lock:
+            return heapq.heappop(self._waiting[turn])[2]
+
+    def stalest(self, than: OpenAttempt) -> OpenAttempt | None:
+        """Return the oldest waiting attempt that a newer one of its service may replace."""
+        with self._lock:
+            waiting = [entry for entry in self._waiting.get(than.service, ()) if entry[2].payload]
+        oldest = max(waiting, default=None)
+        return oldest[2] if oldest is not None and oldest[2].deadline < than.deadline else None

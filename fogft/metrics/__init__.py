@@ -1,4 +1,4 @@
-"""Counters of proxies, the page that Prometheus reads, and spans for OpenTelemetry.
+"""Counters of proxies, Prometheus metrics, and OpenTelemetry spans.
 
 Not here: the manager's metrics (`fogft.pool.manager.tally`).
 """

@@ -1,4 +1,4 @@
-"""What became of one service's requests: counters, latencies, and who won.
+"""Outcomes of one service's requests: counters, latencies and first responses.
 
 All methods are called under the dispatcher's lock, but `late`, which has its own.
 """
@@ -40,7 +40,7 @@ class Outcome(str, Enum):
 
 @dataclass
 class OfReplica:
-    """How often a replica was first, and how often it answered a request well or not, at all."""
+    """A replica's counts of first responses, and of good and bad answers."""
 
     won: int = 0
     well: int = 0
@@ -72,12 +72,12 @@ class Outcomes:
         self.trace: deque[dict[str, Any]] | None = None
 
     def received(self, size_bytes: int) -> None:
-        """Count a request that came."""
+        """Count a received request."""
         self.count["received"] += 1
         self.count["request_bytes"] += size_bytes
 
     def won(self, replica: int, took_s: float, size_bytes: int) -> None:
-        """Count a request that a replica has answered first, and the size of its response."""
+        """Count a replica's first response, and its size."""
         self.count["answered"] += 1
         self.count["response_bytes"] += size_bytes
         ended = self.of[replica]
@@ -98,7 +98,7 @@ class Outcomes:
         refused: Mapping[int, Refusal] = MappingProxyType({}),
         replica: str = "",
     ) -> None:
-        """Trace how a request ended, and when (on the clock of whoever traces)."""
+        """Trace how and when a request ended (on the tracer's clock)."""
         if self.trace is not None:
             self.trace.append(
                 {
@@ -113,18 +113,18 @@ class Outcomes:
             )
 
     def refusal(self, reason: Refusal, replica: int | None = None) -> None:
-        """Count a refusal, and hold it against the replica if it was of a request."""
+        """Count a refusal, also against the replica if it refused a request."""
         self.refused[reason.value] = self.refused.get(reason.value, 0) + 1
         if replica is not None and Effect.FAULT in reason.effect:
             self.of[replica].ill += 1
 
     def rejected(self, replica: int) -> None:
-        """Count a response that was real, but not ok."""
+        """Count a valid response whose `ok_field` was false."""
         self.count["rejected"] += 1
         self.of[replica].ill += 1
 
     def late(self) -> None:
-        """Count an answer that came too late to be used. Any thread, no other lock."""
+        """Count an answer that came too late to be used. Any thread; takes no other lock."""
         with self._late_lock:
             self.count["late"] += 1
 

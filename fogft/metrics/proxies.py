@@ -1,12 +1,12 @@
-"""What the proxies tell Prometheus, made of what they report."""
+"""Prometheus metrics of the proxies, from their reports."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fogft.metrics.families import counter, gauge, histogram
 from fogft.metrics.outcomes import BUCKETS_S
+from fogft.metrics.scrape import counter, gauge, histogram
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
@@ -37,11 +37,17 @@ _LINK_COUNTS = {
 _WORK_GAUGES = {"held": ("fogft_requests_held", "Requests held and not yet answered.")}
 _WORK_COUNTS = {
     "ran": ("fogft_requests_run_total", "Requests passed on to a service."),
-    "ran_s": ("fogft_request_run_seconds_total", "Time that services took for them."),
-    "saved": ("fogft_requests_saved_total", "Requests dropped unbegun: answered elsewhere."),
-    "interrupted": ("fogft_requests_interrupted_total", "Requests at work that were cancelled."),
-    "wasted": ("fogft_requests_wasted_total", "Requests run although answered elsewhere."),
-    "wasted_s": ("fogft_request_wasted_seconds_total", "Time that those took."),
+    "ran_s": ("fogft_request_run_seconds_total", "Time that services spent on requests."),
+    "saved": (
+        "fogft_requests_saved_total",
+        "Requests dropped before they began: answered elsewhere.",
+    ),
+    "interrupted": ("fogft_requests_interrupted_total", "Running requests that were cancelled."),
+    "wasted": (
+        "fogft_requests_wasted_total",
+        "Requests run to the end although answered elsewhere.",
+    ),
+    "wasted_s": ("fogft_request_wasted_seconds_total", "Time spent on those requests."),
 }
 
 
@@ -157,7 +163,7 @@ def of_server(report: Mapping[str, Any]) -> Iterator[Metric]:
     yield _refusals((count, {"reason": reason}) for reason, count in report["refused"].items())
     yield gauge(
         "fogft_concurrency_limit",
-        "Requests that a service is given at once.",
+        "Requests that a service is given at the same time.",
         ((limit, {"service": name}) for name, limit in report["limits"].items()),
     )
     yield gauge(

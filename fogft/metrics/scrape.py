@@ -1,33 +1,130 @@
-"""Serve metrics to Prometheus over plain HTTP, by `prometheus-client`'s own application.
+"""Metrics as `prometheus-client` has them, made at a scrape, and served over plain HTTP.
 
-A scraper that is slow or hostile costs a thread for seconds. Whatever goes wrong here harms nothing
-else in the process.
+Nothing is counted through the library: counting on a request's way stays a plain addition. It is
+imported at the first scrape, so that a process that nobody scrapes never loads it. A scraper that
+is slow or hostile occupies a thread, but there are few of those: a newer connection ends the
+oldest. Whatever goes wrong here harms nothing else in the process.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import math
+import platform
+import socket
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from socketserver import ThreadingMixIn
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
-from fogft.metrics.families import Labels, registry
+import fogft
 from fogft.model.names import host_and_port
 
 if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry, Metric
+
+Labels = Mapping[str, str]
+Values = Iterable[tuple[float, Labels]]
+
+
+def counter(name: str, help: str, values: Values) -> Metric:
+    """Return counters of one name, which ends in ``_total``, by their labels."""
+    return _family(name.removesuffix("_total"), "counter", help, values, "_total")
+
+
+def gauge(name: str, help: str, values: Values) -> Metric:
+    """Return gauges of one name by their labels; a name ends in its unit."""
+    return _family(name, "gauge", help, values)
+
+
+def histogram(
+    name: str,
+    help: str,
+    bounds: Sequence[float],
+    counted: Iterable[tuple[Sequence[int], float, Labels]],
+) -> Metric:
+    """Return histograms of one name, which ends in its unit.
+
+    Args:
+        bounds: Upper bounds of the buckets, rising; one more is without bound.
+        counted: How many values fell into each bucket, the last one included; their sum; labels.
+    """
+    family = _family(name, "histogram", help, ())
+    for counts, total, labels in counted:
+        known, so_far = _printable(labels), 0
+        for bound, count in zip((*bounds, math.inf), counts, strict=True):
+            so_far += count
+            family.add_sample(f"{name}_bucket", {**known, "le": _bound(bound)}, so_far)
+        family.add_sample(f"{name}_count", known, so_far)
+        family.add_sample(f"{name}_sum", known, total)
+    return family
+
+
+def _bound(bound: float) -> str:
+    return "+Inf" if bound == math.inf else str(float(bound))
+
+
+def _family(name: str, kind: str, help: str, values: Values, suffix: str = "") -> Metric:
     from prometheus_client import Metric
+
+    family = Metric(name, help, kind)
+    for value, labels in values:
+        family.add_sample(f"{name}{suffix}", _printable(labels), float(value))
+    return family
+
+
+def _printable(labels: Labels) -> dict[str, str]:
+    """Return labels that can be sent: a lone surrogate cannot."""
+    return {key: value.encode(errors="replace").decode() for key, value in labels.items()}
+
+
+class _Collector:
+    """What one process tells: its families as measured now, each with the process's labels."""
+
+    def __init__(self, measure: Callable[[], Iterable[Metric]], labels: Labels) -> None:
+        self._measure = measure
+        self._labels = dict(labels)
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield what there is to tell; families without samples are left out."""
+        yield gauge(
+            "fogft_build_info",
+            "Version of fogft and of Python.",
+            [(1, {"version": fogft.__version__, "python": platform.python_version()})],
+        )
+        from prometheus_client import ProcessCollector
+
+        for family in chain(self._measure(), ProcessCollector(registry=None).collect()):
+            family.samples = [
+                sample._replace(labels={**self._labels, **sample.labels})
+                for sample in family.samples
+            ]
+            if family.samples:
+                yield family
+
+
+def registry(measure: Callable[[], Iterable[Metric]], labels: Labels) -> CollectorRegistry:
+    """Return a process's metrics registry, collected at each scrape, with these labels."""
+    from prometheus_client import CollectorRegistry
+
+    made = CollectorRegistry(auto_describe=False)
+    made.register(_Collector(measure, labels))
+    return made
+
 
 log = logging.getLogger(__name__)
 
 _LIMIT_S = 5.0
+_AT_ONCE = 8
 
 Measure = Callable[[], "Iterable[Metric]"]
 
 
 class Scrape:
-    """Metrics at an endpoint, which may change or be none; measured for each request."""
+    """Metrics at an endpoint, which may change or be none; collected for each request."""
 
     def __init__(self, measure: Measure, labels: Labels) -> None:
         self._measure = measure
@@ -44,7 +141,7 @@ class Scrape:
         return f"{host!s}:{port}"
 
     def at(self, endpoint: str) -> None:
-        """Serve at ``host:port`` (port 0 for any that is free); empty for nowhere. Repeatable.
+        """Serve at ``host:port`` (port 0: any free port); empty to stop. Repeatable.
 
         A port that cannot be had is logged, and nothing is served.
         """
@@ -68,7 +165,7 @@ class Scrape:
         log.info("metrics_served endpoint=%s", self.endpoint)
 
     def close(self) -> None:
-        """Give the port back. Repeatable."""
+        """Stop serving. Repeatable."""
         server, self._server, self._wanted = self._server, None, ""
         if server is not None:
             server.shutdown()
@@ -78,6 +175,26 @@ class Scrape:
 class _Server(ThreadingMixIn, WSGIServer):
     daemon_threads = True
     block_on_close = False
+
+    def server_activate(self) -> None:
+        """Begin to listen."""
+        self._open: dict[socket.socket, None] = {}  # oldest first
+        super().server_activate()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Answer a request in a thread of its own; end the oldest where there are too many."""
+        self._open[request] = None
+        if len(self._open) > _AT_ONCE:
+            oldest = list(self._open)[0]  # noqa: RUF015 - in one step: other threads take theirs out
+            self._open.pop(oldest, None)
+            with contextlib.suppress(OSError):  # its thread closes it
+                oldest.shutdown(socket.SHUT_RDWR)
+        super().process_request(request, client_address)
+
+    def shutdown_request(self, request: Any) -> None:
+        """A request has ended."""
+        self._open.pop(request, None)
+        super().shutdown_request(request)
 
 
 class _Request(WSGIRequestHandler):

@@ -31,7 +31,7 @@ _WANTED_BY = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT
 
 
 class Spans:
-    """Exports spans over OTLP (HTTP), in the background; what cannot be sent is dropped.
+    """Exports spans over OTLP (HTTP) in the background; spans that cannot be sent are dropped.
 
     OpenTelemetry's environment variables apply: the endpoint, its headers, the sampler.
 
@@ -52,7 +52,7 @@ class Spans:
         atexit.register(self._batches.force_flush, _LEFT_MS)
 
     def asked(self, requests: Iterable[Mapping[str, Any]]) -> None:
-        """Export what the robot's side saw: a span for each request, one for each replica asked.
+        """Export the robot's side: a span for each request, and one for each replica asked.
 
         Args:
             requests: As `Outcomes.note` has them, with ``service``; moments on the wall clock.
@@ -79,7 +79,7 @@ class Spans:
                 )
 
     def ran(self, request: bytes, service: str, replica: str, moments: tuple[float, ...]) -> None:
-        """Export what a replica saw: the request's stay there, and its time in the service.
+        """Export the replica's side: the request's time there, and its time in the service.
 
         Args:
             moments: When it arrived, was passed on to the service, and was answered; monotonic.
@@ -157,7 +157,7 @@ class _Span:
 
 
 def wanted(process: str, pool: str) -> Spans | None:
-    """Return an exporter where the environment names an endpoint, else None."""
+    """Return an exporter if the environment names an endpoint, else None."""
     if not any(map(os.environ.get, _WANTED_BY)):
         return None
     try:

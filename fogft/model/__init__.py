@@ -1,4 +1,4 @@
-"""The values that all rooms speak of: replicas, placements, membership, what a pool file asks for.
+"""Values used everywhere: replicas, placements, membership, pool specs.
 
 Not here: reading them from files (`fogft.poolfile`), deciding by them (`planning`, `requests`).
 """

@@ -104,7 +104,7 @@ class Shape:
             self._root = None
 
     def fault(self, payload: bytes) -> str:
-        """Return what is wrong with the bytes of a message, in words; empty if nothing is."""
+        """Return the problem with a message's bytes, in words; empty if they are well-formed."""
         length_at = _BYTE_ORDERS.get(payload[:2])
         if len(payload) < HEADER_BYTES or length_at is None:
             return f"{len(payload)} bytes without the header of a ROS 2 message"

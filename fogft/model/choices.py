@@ -1,4 +1,4 @@
-"""What a pool file says about where, how many, when and at what price. Values only.
+"""Pool file values about placement, numbers, schedule and price. Values only.
 
 Each field that is made by `key` is a key of the pool file.
 """
@@ -33,18 +33,19 @@ MAX_REPLICAS = 100
 MAX_USD_PER_HOUR = 1_000_000
 DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 _LOCATION = re.compile(r"[\w.-]+(/[\w.-]+)?")
+_INTERFACE = re.compile(r"[A-Za-z0-9._-]{1,15}")
 _CLOCK = re.compile(r"(\d{1,2}):(\d{2})")
 
 
 class Freshness(str, Enum):
-    """Which of a service's requests goes first where several wait."""
+    """Which of a service's waiting requests goes first."""
 
     EVERY = "every"  # the one that came first, or whose deadline is nearest
     LATEST = "latest"  # the newest: of a camera's images the older ones are worth less
 
 
 class Spread(str, Enum):
-    """What keeps replicas apart, where on-demand machines may stand in for spot ones."""
+    """How far spot replicas are spread when on-demand machines may fill in."""
 
     PREFER = "prefer"  # at most half of them in one location
     REQUIRE = "require"  # one in each
@@ -57,11 +58,24 @@ class Compression(str, Enum):
     OFF = "off"
 
 
+class UplinkPolicy(str, Enum):
+    """How a service's requests use several uplinks."""
+
+    PREFER = "prefer"  # the first that is up, in the order listed
+    FAILOVER = "failover"  # one until it fails, then the next; no way back before that one fails
+    ALL = "all"  # every one, at once
+
+
 class Speaks(str, Enum):
     """How a proxy speaks ROS."""
 
     RCLPY = "rclpy"  # by the ROS 2 that is installed where it runs, whatever its middleware
     ZENOH = "zenoh"  # as the nodes of `rmw_zenoh` do, with no ROS installed
+
+
+def is_interface(name: str) -> bool:
+    """Whether this can be the name of a network interface on Linux."""
+    return bool(_INTERFACE.fullmatch(name)) and name not in (".", "..")
 
 
 @dataclass(frozen=True)
@@ -82,7 +96,7 @@ class Middleware:
 
 @dataclass(frozen=True)
 class Correlation:
-    """How much replicas are down together: in one zone, in one region, in one cloud.
+    """Correlation of replica outages within a zone, a region and a cloud.
 
     Each is in [0, 1], and none above the one before. Those for a region and a cloud were measured
     (docs/design/availability.md). A zone that has no room takes all of its machines: they are one.
@@ -102,7 +116,7 @@ class Correlation:
 
 @dataclass(frozen=True)
 class Assumption:
-    """What is taken for granted about machines, for lack of a measurement.
+    """Assumptions about machines, for lack of measurements.
 
     With 20 min of recovery, 12 million seconds are the 99.99 % that clouds promise.
     """
@@ -119,13 +133,13 @@ class Assumption:
     )
     recovery_s: float = key(
         Number(DAY_S, "seconds"),
-        "Time from gone to ready elsewhere; FogROS2-FT's 20 min.",
+        "Time from the loss of a replica to a ready replacement; FogROS2-FT's 20 min.",
         default=1200.0,
     )
     no_room: float = key(
         Number(1.0, "one", from_zero=True),
-        "Fraction of time that a location has no room for a spot machine; while none has, spot "
-        "replicas that were lost stay away.",
+        "Fraction of time that a location has no spot capacity; while no location has any, lost "
+        "spot replicas are not replaced.",
         default=0.0625,
     )
     correlation: Correlation = field(default_factory=Correlation)
@@ -133,7 +147,7 @@ class Assumption:
 
 @dataclass(frozen=True)
 class AvailabilitySpec(Assumption):
-    """How available the pool shall be, and what is assumed of machines."""
+    """The pool's target availability, and assumptions about machines."""
 
     target: float = key(
         Number(0.99999, "one"),
@@ -149,7 +163,7 @@ def _metrics(default_port: int) -> Text:
 
 @dataclass(frozen=True)
 class MetricsSpec:
-    """Where processes listen for Prometheus: ``host:port``; empty for nowhere."""
+    """Addresses at which processes serve metrics: ``host:port``; empty for none."""
 
     proxy: str = key(
         _metrics(9464),
@@ -184,15 +198,15 @@ class OnDemandSpec:
     )
     fallback: bool = key(
         Flag(),
-        "Whether on-demand machines stand in while too few spot ones are ready, ordered beside the "
-        "search for spot, within `max_usd_per_hour` and `max_surge`.",
+        "Use on-demand machines while too few spot machines are ready; the search for spot "
+        "continues. Within `max_usd_per_hour` and `max_surge`.",
         default=False,
     )
 
 
 @dataclass(frozen=True)
 class GroupSpec:
-    """Replicas of one pool that have machines of their own kind."""
+    """A group of replicas with their own kind of machine."""
 
     name: str = key(
         Text(
@@ -213,7 +227,7 @@ class GroupSpec:
         default_factory=dict,
     )
     on_demand: OnDemandSpec = key(
-        Map(OnDemandSpec), "As the pool's, for this group.", default_factory=OnDemandSpec
+        Map(OnDemandSpec), "Like the pool's key, for this group.", default_factory=OnDemandSpec
     )
 
 
@@ -251,7 +265,7 @@ _DAYS_FORM = Special(
 
 @dataclass(frozen=True)
 class WindowSpec:
-    """A time of the week, in the schedule's time zone; None for the pool's own number or cap.
+    """A weekly time window in the schedule's time zone; None for the pool's own number or cap.
 
     Attributes:
         days: 0 for Monday to 6 for Sunday: on which it begins.
@@ -267,14 +281,14 @@ class WindowSpec:
     )
     begins_s: int = key(
         _CLOCK_FORM,
-        "Start, by the clock on the wall: windows follow daylight-saving time.",
+        "Start, in local time: windows follow daylight-saving time.",
         name="from",
         default=0,
         usual="0:00",
     )
     ends_s: int = key(
         _CLOCK_FORM,
-        "End; at or before `from` it is on the next day.",
+        "End; on the next day if not after `from`.",
         name="to",
         default=86_400,
         usual="24:00",
@@ -304,14 +318,14 @@ class ScheduleSpec:
     )
     windows: tuple[WindowSpec, ...] = key(
         Maps(WindowSpec, "write `windows: [{days: mon-fri, from: 8:00, ...}]`"),
-        "The first window that holds a moment applies; outside all, the pool's own numbers.",
+        "The first window that matches applies; outside all windows, the pool's own numbers.",
     )
     prelaunch_s: float = 600.0
 
 
 @dataclass(frozen=True)
 class MigrationSpec:
-    """A replica moves for a score lower by the fraction `gain`, `stay_s` after it was ready."""
+    """When a replica moves: for a score lower by `gain`, at least `stay_s` after it was ready."""
 
     gain: float = 0.3
     stay_s: float = 3600.0
@@ -333,7 +347,7 @@ def _robot_at(written: Any) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class PlacementSpec:
-    """How locations are weighed, and what is known of distances.
+    """How locations are scored, and known distances.
 
     Attributes:
         rtt_s: ``cloud/region`` or ``cloud`` -> round trip in seconds; goes before measurements.
@@ -341,7 +355,7 @@ class PlacementSpec:
 
     latency_weight: float = key(
         Number(100, "times", from_zero=True),
-        "Weight of a percent of round trip against a percent of price; 0 to ignore distance.",
+        "Weight of one percent of round trip against one percent of price; 0 ignores distance.",
         default=1.0,
     )
     robot_at: tuple[float, float] | None = key(
@@ -363,8 +377,8 @@ class PlacementSpec:
                 only(_LOCATION.fullmatch),
             ),
         ),
-        "Round trips that you know better than fogft, by `cloud/region`, such as "
-        "`{aws/us-west-2: 0.021}`.",
+        "Known round trips, by `cloud/region`, such as `{aws/us-west-2: 0.021}`; they override "
+        "measurements.",
         default_factory=dict,
         usual="measured",
     )
@@ -372,14 +386,14 @@ class PlacementSpec:
 
 @dataclass(frozen=True)
 class TrafficSpec:
-    """What is asked of one service, for costs. Zero where it is not said."""
+    """Load on one service, for cost estimates. Zero if not given."""
 
     requests_per_s: float = key(
         Number(1e6, "requests", from_zero=True), "Mean over the whole month.", default=0.0
     )
     request_bytes: float = key(
         Number(1e10, "bytes", from_zero=True),
-        "Size of one request; clouds do not charge for what comes in.",
+        "Size of one request; clouds do not charge for ingress.",
         default=0.0,
     )
     response_bytes: float = key(
@@ -403,15 +417,15 @@ class FallbackSpec:
     )
     after_s: float | None = key(
         Number(DAY_S, "seconds"),
-        "Ask it this long after the request came, beside the replicas: the first answer wins. "
-        "Below `timeout_s`.",
+        "Call it this long after the request arrived, in parallel with the replicas: the first "
+        "answer wins. Below `timeout_s`.",
         default=None,
         usual="at the deadline",
     )
     while_none_ready: bool = key(
         Flag(),
-        "Ask it at once while no replica is ready. The service is then offered on the robot from "
-        "the start.",
+        "Call it at once while no replica is ready. The service is then offered on the robot "
+        "from the start.",
         default=False,
     )
     limit_s: float = 1.0

@@ -1,4 +1,4 @@
-"""Who holds a certificate, and what its role lets it do. Pure.
+"""Certificate holders and their roles. Pure.
 
 A certificate's common name says who its holder is: ``role.name.generation.pool``, for
 instance ``robot.ada.2.0123456789abcdef``; a replica's name is its slot. TLS proves the
@@ -21,7 +21,7 @@ NAME_PATTERN = re.compile(rf"[A-Za-z0-9]([A-Za-z0-9_-]{{0,{NAME_LIMIT - 2}}}[A-Z
 
 
 class Role(str, Enum):
-    """What the holder of a certificate may do."""
+    """The role of a certificate holder."""
 
     ROBOT = "robot"  # asks
     REPLICA = "replica"  # answers
@@ -32,7 +32,7 @@ class Role(str, Enum):
 
 @dataclass(frozen=True, order=True)
 class Holder:
-    """Whom a certificate names.
+    """The holder that a certificate names.
 
     Attributes:
         name: A robot's or gateway's name; a replica's slot, as text.
@@ -51,12 +51,12 @@ class Holder:
 
     @property
     def short(self) -> str:
-        """Name and generation, as people see it: ``ada.2``."""
+        """Name and generation, as shown to people: ``ada.2``."""
         return f"{self.name}.{self.generation}"
 
 
 def manager_of(pool_uid: str) -> Holder:
-    """Return who signs a pool's membership."""
+    """Return the manager that signs a pool's membership."""
     return Holder(Role.MANAGER, "manager", 1, pool_uid)
 
 

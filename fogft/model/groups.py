@@ -1,4 +1,4 @@
-"""Kinds of replicas within one pool, and which slots are whose. Pure.
+"""Groups of replicas within one pool, and their slots. Pure.
 
 A group has machines of its own kind: a small on-demand one for up-time, large spot ones for
 speed. Where the pool file names no groups there is one. Every replica carries every service.
@@ -28,32 +28,32 @@ LAST_BY_HAND = 999_999
 
 @dataclass(frozen=True)
 class Group(GroupSpec):
-    """One kind of replicas, whose name is empty where the pool file names no groups."""
+    """A group of replicas; its name is empty if the pool file has no groups."""
 
     block: int = 0
 
     @property
     def first_slot(self) -> int:
-        """Its lowest slot."""
+        """The lowest slot of the group."""
         return self.block * BLOCK
 
     @property
     def first_stand_in(self) -> int:
-        """The lowest slot of its on-demand machines that stand in for spot ones."""
+        """The lowest slot of its on-demand stand-ins for spot machines."""
         return self.first_slot + STAND_INS
 
     def owns(self, slot: int) -> bool:
-        """Whether a slot is one of its own."""
+        """Whether a slot belongs to the group."""
         return slot // BLOCK == self.block
 
 
 def is_stand_in(slot: int) -> bool:
-    """Whether a slot is that of an on-demand machine that stands in for a spot one."""
+    """Whether a slot belongs to an on-demand stand-in for a spot machine."""
     return slot % BLOCK >= STAND_INS
 
 
 def group_of(groups: Sequence[Group], slot: int) -> Group:
-    """Return the group that a slot's replica counts for: its own, else the last one."""
+    """Return the group of a slot; the last group if no group has it."""
     return next((group for group in groups if group.owns(slot)), groups[-1])
 
 
@@ -70,7 +70,7 @@ def groups_of(spec: PoolSpec) -> tuple[Group, ...]:
 
 
 def replica_hash(spec: PoolSpec, slot: int) -> str:
-    """Return the hash that a replica in this slot should have; see `PoolSpec.replica_hash`."""
+    """Return the expected hash of a replica in this slot; see `PoolSpec.replica_hash`."""
     key = "hash", slot // BLOCK
     found: str | None = spec.derived.get(key)
     if found is None:
@@ -80,14 +80,14 @@ def replica_hash(spec: PoolSpec, slot: int) -> str:
 
 
 def task_at(spec: PoolSpec, slot: int) -> dict[str, Any]:
-    """Return the task of the replica in a slot: its group's resources, all else the file's."""
+    """Return the task of a slot's replica: the file's task with its group's resources."""
     if not spec.groups:
         return dict(spec.task)
     return {**spec.task, "resources": dict(group_of(groups_of(spec), slot).resources)}
 
 
 def sales(spec: PoolSpec) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-    """Return what a cloud is to be asked prices for: a group's name, and resources.
+    """Return the resources to get prices for, by group name.
 
     A group that mixes spot and on-demand is asked for twice.
     """
@@ -101,7 +101,7 @@ def sales(spec: PoolSpec) -> tuple[tuple[str, Mapping[str, Any]], ...]:
 
 
 def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:
-    """Return a `resources` section that asks for spot machines only, or for none."""
+    """Return a `resources` section restricted to spot machines, or to on-demand ones."""
     out = {**resources, "use_spot": spot}
     for key in ("any_of", "ordered"):
         if isinstance(out.get(key), list):
@@ -112,7 +112,7 @@ def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:
 
 
 def shares(groups: tuple[Group, ...], total: int) -> tuple[int, ...]:
-    """Share replicas as the file says; what is more or less concerns the last groups first."""
+    """Distribute replicas over groups as in the file; differences affect the last groups first."""
     if len(groups) == 1:
         return (max(0, total),)
     counts = [group.replicas for group in groups]

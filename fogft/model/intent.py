@@ -1,4 +1,4 @@
-"""What the user wants besides the pool file: scaled, drained, excluded, stopping. Pure.
+"""The user's changes besides the pool file: scale, drain, exclude, down. Pure.
 
 Each command is one operation that returns a new intent, so that it works whether or not
 a manager lives: the command line writes the result, the manager reads it.
@@ -20,7 +20,7 @@ LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
 
 @dataclass(frozen=True)
 class Intent:
-    """The user's wishes.
+    """The user's changes to a pool.
 
     Attributes:
         target: Replicas wanted by `scale`; None when the pool file decides.
@@ -41,7 +41,7 @@ class Intent:
     retried_at: Moment = 0.0
 
     def wanted(self, spec: PoolSpec) -> int:
-        """Return how many replicas the user or the file names; see `sizing` for what follows."""
+        """Return the number of replicas set by the user or the file; see `sizing` for its use."""
         if self.stopping:
             return 0
         if self.target is not None and self.is_scaled(spec):
@@ -49,7 +49,7 @@ class Intent:
         return spec.replicas
 
     def is_scaled(self, spec: PoolSpec) -> bool:
-        """Whether the user's own number holds, and not the file's."""
+        """Whether the user's number of replicas overrides the file's."""
         return self.target is not None and self.scaled_from == spec.replicas
 
     def is_drained(self, slot: int, generation: int) -> bool:
@@ -62,7 +62,7 @@ class Intent:
 
 
 def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
-    """Want `change` more replicas (fewer when negative)."""
+    """Change the number of replicas by `change`."""
     if spec.availability is not None:
         raise FogftError(
             f"`{spec.name}` cannot be scaled: `availability` sets its number of replicas",
@@ -84,14 +84,14 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
 
 
 def drain(intent: Intent, slot: int, generation: int) -> Intent:
-    """Replace what runs in a slot, up to this generation. Repeating it changes nothing."""
+    """Replace the replica in a slot, up to this generation. Repeating it changes nothing."""
     drained = dict(intent.drained)
     drained[slot] = max(generation, drained.get(slot, 0))
     return replace(intent, drained=drained)
 
 
 def exclude(intent: Intent, location: str) -> Intent:
-    """Keep out of a location. Repeatable."""
+    """Exclude a location. Repeatable."""
     return replace(intent, excluded=intent.excluded | {checked_location(location)})
 
 
@@ -105,12 +105,12 @@ def include(intent: Intent, location: str) -> Intent:
 
 
 def retry(intent: Intent, now: float) -> Intent:
-    """Launch again what was given up, as if it had never been launched."""
+    """Resume launching a pool file that was given up."""
     return replace(intent, retried_at=now)
 
 
 def file_changed(intent: Intent, before: PoolSpec, after: PoolSpec) -> Intent:
-    """Take a new pool file into account: its own `replicas`, when changed, ends a `scale`."""
+    """Apply a new pool file: a changed `replicas` overrides an earlier `scale`."""
     stopping = replace(intent, stopping=False)
     if before.replicas != after.replicas:
         return replace(stopping, target=None, scaled_from=None)

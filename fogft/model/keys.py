@@ -1,4 +1,4 @@
-"""All that is to be said of a key of the pool file, said once, beside the value that it sets. Pure.
+"""Descriptions of pool file keys, each beside the dataclass field that it sets. Pure.
 
 A field of a specification's dataclass is made by `key`: what may stand there, its unit, its
 default and its help. The reader of the pool file, the JSON Schema, the page
@@ -23,7 +23,7 @@ LONGEST_S = 1e7  # what a request's header can carry
 
 @dataclass(frozen=True)
 class Number:
-    """A number above 0, or from 0 on, up to a limit."""
+    """A number above 0, or 0 and above, up to a limit."""
 
     most: float
     unit: str = ""
@@ -46,7 +46,7 @@ class Flag:
 
 @dataclass(frozen=True)
 class OneOf:
-    """One of an enumeration's values; `hidden` ones stand only in the proxies' configurations."""
+    """An enumeration's value; `hidden` ones occur only in the proxies' configurations."""
 
     of: type[Enum]
     hidden: tuple[Enum, ...] = ()
@@ -72,7 +72,7 @@ class Text:
 
 
 def only(is_right: Callable[[str], object], what: str = "") -> Callable[[str], str]:
-    """Return a check that takes a text as it is where it is right; `what` says what it must be."""
+    """Return a check that accepts a text if a predicate holds; `what` describes valid texts."""
 
     def check(written: str) -> str:
         if not is_right(written):
@@ -116,7 +116,7 @@ class Map:
 
 @dataclass(frozen=True)
 class Maps:
-    """A list of such maps, each with a name of its own."""
+    """A list of such maps, each with a unique name."""
 
     of: type
     hint: str
@@ -125,14 +125,14 @@ class Maps:
 
 @dataclass(frozen=True)
 class Free:
-    """A map that is passed on as it is."""
+    """A map that is passed on unchanged."""
 
     hint: str
 
 
 @dataclass(frozen=True)
 class Special:
-    """What no other form describes: for people, how it is read, and as a JSON Schema has it.
+    """Any other form: its description, its reader and its JSON Schema.
 
     `read` raises ValueError; a hint may follow ``; ``.
     """
@@ -146,7 +146,7 @@ Form = Number | Whole | Flag | OneOf | Text | Listed | Table | Map | Maps | Free
 
 
 def words(form: Form) -> str:  # noqa: PLR0911
-    """Return what may stand there, for people."""
+    """Describe the allowed values, for people."""
     match form:
         case Number(most, unit, from_zero):
             limits = f"{'from' if from_zero else 'above'} 0, at most {most:.10g}"
@@ -175,7 +175,7 @@ def words(form: Form) -> str:  # noqa: PLR0911
 
 
 def checked(form: Form, value: Any) -> Any:
-    """Return a value of a key that the proxies are told, if its form allows it.
+    """Return a value of a proxy's configuration key, if its form allows it.
 
     Raises:
         ValueError: It does not.
@@ -187,7 +187,7 @@ def checked(form: Form, value: Any) -> Any:
             except ValueError:
                 raise ValueError(f"`{value:.80}` is not {form.what}") from None
         case Listed() | Maps() if len(value) > form.most:
-            raise ValueError(f"{len(value)} entries, where {form.most} are the limit")
+            raise ValueError(f"{len(value)} entries; the limit is {form.most}")
         case Listed():
             return tuple(checked(form.of, one) for one in value)
         case Number() if not 0 <= value <= max(form.most, LONGEST_S):
@@ -199,7 +199,7 @@ def checked(form: Form, value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Key:
-    """What is said of one key.
+    """The description of one key.
 
     Attributes:
         name: The key, where the field is called otherwise.
@@ -226,7 +226,7 @@ class Entry(NamedTuple):
 
     @property
     def required(self) -> bool:
-        """Whether it must be there."""
+        """Whether the key is required."""
         return self.default is MISSING
 
 
@@ -252,7 +252,7 @@ _KNOWN: dict[type, tuple[Entry, ...]] = {}
 
 
 def keys_of(cls: type) -> tuple[Entry, ...]:
-    """Return the keys of a dataclass, in order; those that must be there first."""
+    """Return the keys of a dataclass, in order; required ones first."""
     if cls in _KNOWN:
         return _KNOWN[cls]
     found = []

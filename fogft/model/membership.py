@@ -1,4 +1,4 @@
-"""Who is where: the record that the manager writes and proxies follow. Pure.
+"""Membership: which replicas exist and where, written by the manager, read by proxies. Pure.
 
 A membership is ordered by (epoch, version): the epoch is the writing manager's lease, so
 what an old manager wrote late never replaces what its successor wrote. Its JSON form
@@ -30,7 +30,7 @@ class Found(Enum):
 
     @classmethod
     def of(cls, spec: PoolSpec) -> Found:
-        """Return how the replicas of a pool are found."""
+        """Return how proxies find the replicas of a pool."""
         if spec.dial_in:
             return cls.BY_DOOR
         return cls.BY_RECORD if spec.rendezvous else cls.BY_CLOUD
@@ -45,7 +45,7 @@ def members_of(
     revoked: Collection[str] = (),
     found: Found = Found.BY_CLOUD,
 ) -> tuple[Member, ...]:
-    """Return whom a proxy should hold a link to.
+    """Return the members that a proxy should hold links to.
 
     Those are ours, not ending, not revoked, and can be found.
     """
@@ -66,7 +66,7 @@ def members_of(
 
 
 def with_by_hand(members: tuple[Member, ...], by_hand: Iterable[ReplicaId]) -> tuple[Member, ...]:
-    """Return members with those that people start themselves, whom no cloud lists.
+    """Return members plus manually started replicas, which no cloud lists.
 
     Of several generations of a slot the highest is meant; a slot that a machine has is its own.
     """
@@ -143,13 +143,13 @@ def from_content(content: Any) -> Membership:
     except ValueError as error:
         raise StateError(f"not a membership: {error}") from error
     if not uids <= {membership.pool_uid}:
-        raise StateError("not a membership: it names what is another pool's")
+        raise StateError("not a membership: it names members of another pool")
     if wrong := trouble(membership.topology):
         raise StateError(f"not a membership: {wrong}")
     return membership
 
 
 def checksum(content: Any) -> str:
-    """Return what stored JSON data, such as a membership's, is checked by."""
+    """Return the checksum of stored JSON data, such as a membership's."""
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()[:16]

@@ -1,4 +1,4 @@
-"""Identifiers that both ends derive by themselves: keys, certificate names, request ids.
+"""Identifiers that both ends derive: Zenoh keys, certificate names, request ids.
 
 A connection is known by pool, slot, service and type, never by an address, so a replica
 that is launched again elsewhere resumes the same connection. The identifier is the
@@ -37,7 +37,7 @@ POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
 def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str:
-    """Return the 32 hexadecimal digits that name a connection for good."""
+    """Return the 32 hexadecimal digits that permanently name a connection."""
     digest = hashlib.sha256()
     for part in (pool_uid, str(slot), service, type_name):
         encoded = part.encode()
@@ -47,17 +47,17 @@ def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str
 
 
 def slot_prefix(pool_uid: str, slot: int) -> str:
-    """Return the key prefix that a slot owns: it may serve these keys and no others."""
+    """Return the Zenoh key prefix of a slot, which may serve only keys below it."""
     return f"fogft/{pool_uid}/{slot}"
 
 
 def service_key(pool_uid: str, slot: int, service: str, type_name: str) -> str:
-    """Return the Zenoh key at which a slot hears requests of a service."""
+    """Return the Zenoh key at which a slot receives requests of a service."""
     return f"{slot_prefix(pool_uid, slot)}/s/{connection_id(pool_uid, slot, service, type_name)}"
 
 
 def service_keys(pool_uid: str, slot: int, types: Mapping[str, str]) -> dict[str, str]:
-    """Return service -> the key at which a slot hears its requests, of service -> type."""
+    """Return service -> Zenoh key of a slot, from service -> type."""
     return {name: service_key(pool_uid, slot, name, kind) for name, kind in types.items()}
 
 
@@ -67,7 +67,7 @@ def services_key(pool_uid: str, slot: int) -> str:
 
 
 def answers_key(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key at which a slot is asked for a connection's answers to come."""
+    """Return the Zenoh key of a slot for the queries that carry a connection's answers."""
     return f"{slot_prefix(pool_uid, slot)}/answers"
 
 
@@ -77,17 +77,17 @@ def probe_key(pool_uid: str, slot: int) -> str:
 
 
 def records_key(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key at which a slot takes signed records, revocations above all."""
+    """Return the Zenoh key at which a slot receives signed records, such as revocations."""
     return f"{slot_prefix(pool_uid, slot)}/records"
 
 
 def cancel_key(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key at which a slot hears which requests are no longer wanted."""
+    """Return the Zenoh key at which a slot receives cancellations."""
     return f"{slot_prefix(pool_uid, slot)}/cancel"
 
 
 def gateway_slot(gateway: str) -> int:
-    """Return the slot of a gateway, which is like a replica to those who talk to it.
+    """Return the slot of a gateway, which robots treat like a replica.
 
     It holds 32 bits of a hash of the name; the pool file's reader refuses two that share one.
     """
@@ -96,7 +96,7 @@ def gateway_slot(gateway: str) -> int:
 
 
 def is_endpoint(text: str) -> bool:
-    """Whether this is ``host:port``; an IPv6 address stands in brackets."""
+    """Whether a text is ``host:port``; IPv6 addresses are in brackets."""
     host, _, port = text.rpartition(":")
     in_brackets = host.startswith("[") and host.endswith("]")
     if not host or len(host) > 255 or not (in_brackets or ":" not in host):

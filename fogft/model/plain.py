@@ -27,7 +27,7 @@ _MOST = 1e300  # further on there is no arithmetic
 
 
 class Misfit(ValueError):
-    """This is no value of a class: `path` leads to what is wrong there."""
+    """Data does not fit a class; `path` locates the problem."""
 
     def __init__(self, path: tuple[str | int, ...], what: str) -> None:
         parts = (f"[{part}]" if isinstance(part, int) else f".{part:.40}" for part in path)
@@ -50,7 +50,7 @@ Generation = Annotated[int, within(1, 1 << 31)]
 
 
 def as_line(text: str) -> str:
-    """Return a text as one line of what can be printed: a peer takes no other."""
+    """Return a text as one printable line, the only form that peers accept."""
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
@@ -183,7 +183,7 @@ def _by_value(kind: type[Enum]) -> Read:
         try:
             return kind(raw)
         except ValueError:
-            raise ValueError(f"{raw!r:.40} is no {kind.__name__}") from None
+            raise ValueError(f"{raw!r:.40} is not a {kind.__name__}") from None
 
     return read
 

@@ -1,4 +1,4 @@
-"""What the proxies' configuration files hold. Values only; relative paths begin at the file."""
+"""The proxies' configuration files. Values only; paths are relative to the file."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from fogft.model.choices import Speaks
+from fogft.model.choices import Speaks, is_interface
 from fogft.model.credentials import CredentialPaths
 from fogft.model.keys import LONGEST_S, only
 from fogft.model.names import (
@@ -22,7 +22,6 @@ from fogft.model.plain import Generation, within
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.topic import TopicSpec
-from fogft.model.uplinks import is_interface
 
 
 def _is_robot(written: str) -> bool:
@@ -44,7 +43,7 @@ LastsFor = Annotated[float, within(1e-12, LONGEST_S)]
 
 @dataclass(frozen=True, kw_only=True)
 class ProxyConfig:
-    """What every proxy needs to know.
+    """Configuration common to all proxies.
 
     Attributes:
         domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
@@ -67,7 +66,7 @@ class ProxyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ClientProxyConfig(ProxyConfig):
-    """All that `fogft proxy` or `fogft gateway` needs to know; it passes `announcements` on.
+    """Configuration of `fogft proxy` and `fogft gateway`, which passes `announcements` on.
 
     Attributes:
         robot: Name of this robot, or gateway.
@@ -95,7 +94,7 @@ class ClientProxyConfig(ProxyConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class ServerProxyConfig(ProxyConfig):
-    """All that `fogft serve` needs to know. Its options override the file.
+    """Configuration of `fogft serve`, whose options override the file.
 
     Attributes:
         run: Command that starts the services in `workdir`; empty where they are started otherwise.
@@ -124,7 +123,7 @@ class ServerProxyConfig(ProxyConfig):
 
 @dataclass(frozen=True)
 class RendezvousConfig:
-    """All that `fogft rendezvous` needs to know."""
+    """Configuration of `fogft rendezvous`."""
 
     pool_uid: PoolUid
     credentials: CredentialPaths

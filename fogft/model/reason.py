@@ -1,4 +1,4 @@
-"""Why something happened or waits: a cause, and what it refers to.
+"""Reasons for events and delays: a cause with its data.
 
 Decisions compare causes. Words are made of a reason where people read it, by `reason_words`.
 """
@@ -11,7 +11,7 @@ from typing import ClassVar
 
 
 class Cause(str, Enum):
-    """What a reason says. The values stand in files and in JSON, and do not change."""
+    """The causes. Their values are used in files and in JSON and do not change."""
 
     # A launch was refused or has failed.
     CAPACITY = "capacity"  # full now: another place, or another time
@@ -33,6 +33,7 @@ class Cause(str, Enum):
     IGNORES = "ignores"  # it takes requests and never ends them
     AT_RISK = "at_risk"
     SERVICE_AWAY = "service_away"
+    NOT_LISTED = "not_listed"  # its cloud lists it no more, and gave no notice
 
     # Why a working replica is replaced.
     DRAINED = "drained"
@@ -123,7 +124,7 @@ class Cause(str, Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """A cause with its data. What does not belong to the cause keeps its default.
+    """A cause with its data. Fields that do not apply to the cause keep their defaults.
 
     Attributes:
         replica: ``slot.generation``.
@@ -156,12 +157,12 @@ class Reason:
 
     @property
     def place_at_fault(self) -> bool:
-        """Whether it speaks against the place: a replacement goes elsewhere."""
+        """Whether the location is at fault: a replacement goes elsewhere."""
         return self.cause not in _NOT_THE_PLACE
 
     @property
     def is_move(self) -> bool:
-        """Whether a replica that is well moves to a better place."""
+        """Whether a healthy replica moves to a better location."""
         return self.cause in _MOVES
 
 
@@ -172,5 +173,5 @@ _NOT_THE_PLACE = _MOVES | {Cause.OUTDATED}
 
 
 def because(reason: Reason | None) -> tuple[Reason, ...]:
-    """Return what `Reason.because` takes for a reason that may be missing."""
+    """Return the value of `Reason.because` for an optional reason."""
     return () if reason is None else (reason,)

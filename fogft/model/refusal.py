@@ -1,4 +1,4 @@
-"""Why a replica, or the link to it, did not answer a request, and what follows from each. Pure.
+"""Why a replica or its link refused a request, and the effect of each refusal. Pure.
 
 A new kind of refusal is a row here, the code that raises it, and a test. The comment above a row
 is published: `scripts/docs` writes it into docs/reference/diagnostics.md. Requests are refused
@@ -12,7 +12,7 @@ from enum import Enum, Flag, auto
 
 
 class Effect(Flag):
-    """What a refusal means at the robot, beside that another replica may be asked."""
+    """The effect of a refusal on the robot, besides asking another replica."""
 
     NONE = 0
     BLAMELESS = auto()  # the replica never began: no sign against the request itself
@@ -23,7 +23,7 @@ class Effect(Flag):
 
 
 class Refusal(str, Enum):
-    """The kinds of refusals: how each travels, and its effect."""
+    """The kinds of refusals: the text sent for each, and its effect."""
 
     effect: Effect
 
@@ -83,13 +83,13 @@ class Refusal(str, Enum):
         return str(self.value)
 
     def text(self, detail: str = "") -> str:
-        """Return the refusal as it travels: ASCII."""
+        """Return the refusal as sent over the link: ASCII."""
         said = f"{self.value}:{detail}" if detail else self.value
         return said.encode("ascii", "replace").decode()
 
 
 def read(said: str) -> tuple[Refusal, str]:
-    """Return the kind of a refusal that came, and its detail."""
+    """Return the kind and the detail of a received refusal."""
     kind, _, detail = said.partition(":")
     try:
         return Refusal(kind), detail

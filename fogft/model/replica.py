@@ -1,4 +1,4 @@
-"""The values that every part speaks of: replica, placement, machine, link report.
+"""Values used everywhere: replica, placement, machine, link report.
 
 Pure data, immutable, compared by value. The words are those of docs/reference/glossary.md.
 """
@@ -38,7 +38,7 @@ class ReplicaId:
 
     @property
     def short(self) -> str:
-        """Slot and generation, as people see it: ``2.1``."""
+        """Slot and generation, as shown to people: ``2.1``."""
         return f"{self.slot}.{self.generation}"
 
     @property
@@ -55,7 +55,7 @@ class ReplicaId:
 
 @dataclass(frozen=True, order=True)
 class Placement:
-    """Where and what: the thing that an offer sells and a launch asks for."""
+    """A location and an instance type: what an offer sells and a launch requests."""
 
     cloud: str
     region: str
@@ -70,12 +70,12 @@ class Placement:
 
     @cached_property
     def supply(self) -> str:
-        """What can run short by itself: a location's spot machines, or those on demand."""
+        """What can be out of capacity on its own: a location's spot or on-demand machines."""
         return supply(self.location, on_demand=not self.spot)
 
     @cached_property
     def domains(self) -> tuple[str, str, str]:
-        """The failure domains that it lies in, the widest first: cloud, region, location."""
+        """Its failure domains, the widest first: cloud, region, location."""
         return self.cloud, f"{self.cloud}/{self.region}", self.location
 
     def within(self, location: str) -> bool:
@@ -110,7 +110,7 @@ class Offer:
 
 
 class Phase(str, Enum):
-    """Where a replica stands in its life. It only ever moves forward."""
+    """The phases of a replica's life. It only moves forward."""
 
     PROVISIONING = "provisioning"  # asked of the cloud, not yet running
     STARTING = "starting"  # the machine runs; the service does not answer yet
@@ -120,7 +120,7 @@ class Phase(str, Enum):
 
 
 class MachinePhase(str, Enum):
-    """What a cloud says of a machine. Absence from its list means gone."""
+    """A machine's phase as reported by its cloud. Absence from the list means gone."""
 
     PROVISIONING = "provisioning"
     RUNNING = "running"
@@ -129,7 +129,7 @@ class MachinePhase(str, Enum):
 
 @dataclass(frozen=True)
 class Machine:
-    """One of our machines in a cloud's own list.
+    """One of fogft's machines in a cloud's list.
 
     Attributes:
         endpoint: ``host:port`` where the server proxy listens, once known.
@@ -161,13 +161,13 @@ class Machine:
 
 
 def by_id(machine: Machine) -> tuple[str, int, int]:
-    """Return what machines are sorted by. Plain values compare faster than ids do."""
+    """Return the sort key of machines. Plain values compare faster than ids."""
     id = machine.id
     return id.pool_uid, id.slot, id.generation
 
 
 class LinkState(str, Enum):
-    """What the client proxy knows of its link to a replica."""
+    """The state of a client proxy's link to a replica."""
 
     CONNECTING = "connecting"  # never answered a probe yet
     UP = "up"  # the last probe was answered in time
@@ -180,13 +180,13 @@ _DOUBTED_AFTER_ROUND_TRIPS = 3
 
 
 def doubted_after_s(rtt_s: float | None) -> float:
-    """Return when a silent replica is doubted: seconds after the first unanswered probe."""
+    """Return after how many seconds without a probe reply a replica is in doubt."""
     return max(DOUBTED_AFTER_S, _DOUBTED_AFTER_ROUND_TRIPS * (rtt_s or 0.0))
 
 
 @dataclass(frozen=True)
 class LinkReport:
-    """What the client proxy reports of one replica. Ages and durations in seconds.
+    """The client proxy's report of one replica. Ages and durations in seconds.
 
     Attributes:
         ready: Names of the services that this replica says it can answer now.
@@ -237,7 +237,7 @@ class LinkReport:
 
     @property
     def doubted(self) -> bool:
-        """Whether it was up and is silent for longer than answers take, suspect or not yet.
+        """Whether it was up and has been silent for longer than answers take.
 
         Nothing follows from it but a question to the cloud.
         """
@@ -248,7 +248,7 @@ class LinkReport:
 
 @dataclass(frozen=True)
 class Observed:
-    """All that a plan depends on besides the spec: the world as seen at `now`.
+    """All inputs of a plan besides the spec: the pool as observed at `now`.
 
     Attributes:
         machines: The cloud's own list; None when the cloud could not tell.
@@ -269,7 +269,7 @@ class Observed:
 
 @dataclass(frozen=True)
 class Member:
-    """A replica that the client proxy shall hold a link to.
+    """A replica that the client proxy should hold a link to.
 
     Attributes:
         endpoint: ``host:port``; empty where it is not known yet, or the replica dials out.
@@ -294,7 +294,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Membership:
-    """Who is where: written by the manager, read by proxies, never application data.
+    """The members of a pool and their endpoints; written by the manager, read by proxies.
 
     Attributes:
         epoch: The writing manager's lease; then `version` counts its writes. A lower

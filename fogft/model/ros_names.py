@@ -1,4 +1,4 @@
-"""ROS 2's rules for the names that stand in a pool file. Pure: nothing is looked up.
+"""ROS 2's rules for names in a pool file. Pure: nothing is looked up.
 
 Kept equal to what ROS itself accepts by tests/ros/test_service_names.
 
@@ -33,7 +33,7 @@ def absolute_service_name(name: str) -> str:
         raise ValueError(f"it is longer than {MAX_SERVICE_NAME} characters")
     for token in absolute[1:].split("/"):
         if not token:
-            raise ValueError("there is nothing between, or after, two slashes")
+            raise ValueError("the part between or after slashes is empty")
         if token[0].isdigit():
             raise ValueError("a part begins with a digit")
         if not _TOKEN.fullmatch(token):
@@ -94,7 +94,7 @@ def is_field_path(name: str) -> bool:
 
 
 def service_name(hint: str, what: str = "a service name") -> Text:
-    """Return the form of a key that holds a service's name, or what else is named like one."""
+    """Return the form of a key that holds the name of a service, topic or action."""
     return Text(what, hint, absolute_service_name)
 
 

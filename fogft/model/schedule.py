@@ -20,7 +20,7 @@ DAY_S = 86_400
 
 
 class Wish(NamedTuple):
-    """What is wanted at a moment; `ahead` where it is for a window that has not begun."""
+    """The wanted replicas and cap at a time; `ahead` if for a window that has not begun."""
 
     replicas: int
     max_usd_per_hour: float | None
@@ -42,7 +42,7 @@ def zone(name: str) -> datetime.tzinfo:
 
 
 def window_at(schedule: ScheduleSpec, moment: float) -> WindowSpec | None:
-    """Return the first window that holds a moment (seconds since the epoch)."""
+    """Return the first window that contains a time (seconds since the epoch)."""
     local = datetime.datetime.fromtimestamp(moment, zone(schedule.time_zone))
     second = local.hour * 3600 + local.minute * 60 + local.second
     today = local.weekday()
@@ -50,7 +50,7 @@ def window_at(schedule: ScheduleSpec, moment: float) -> WindowSpec | None:
 
 
 def wish(schedule: ScheduleSpec, now: float, usual: Wish) -> Wish:
-    """Return what is wanted now; `usual` is what is wanted outside of windows.
+    """Return the wanted replicas and cap now; `usual` applies outside windows.
 
     Within `prelaunch_s` before a window that wants more replicas, its number holds, and
     the higher of both caps. Every minute of that time is looked at: a window may be shorter.
@@ -86,7 +86,7 @@ def _holds(window: WindowSpec, today: int, second: int) -> bool:
 
 
 def next_change(schedule: ScheduleSpec, now: float) -> float:
-    """Return when `wish` can next say something else: a window begins, nears or ends.
+    """Return when `wish` can next change: a window begins, is near or ends.
 
     Where the clock on the wall is changed before that, it may come early; never late.
     """

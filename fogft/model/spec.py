@@ -1,4 +1,4 @@
-"""What a pool file asks for, as values. Each field made by `key` is a key of the file."""
+"""The contents of a pool file, as values. Each field made by `key` is a key of the file."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ from fogft.model.choices import (
     ScheduleSpec,
     Spread,
     TrafficSpec,
+    UplinkPolicy,
+    is_interface,
 )
 from fogft.model.keys import (
     DAY_S,
@@ -47,7 +49,6 @@ from fogft.model.ros_names import field_path, is_field_name, service_name, servi
 from fogft.model.state import StateSpec
 from fogft.model.topic import ActionSpec, TopicSpec
 from fogft.model.topology import Topology
-from fogft.model.uplinks import UplinkPolicy, is_interface
 
 CONCURRENCY_LIMIT = 512  # a replica holds no more requests
 MAX_HOURS = 8000  # the certificates last 365 days
@@ -56,7 +57,7 @@ _WHEREABOUTS = frozenset({"infra", "cloud", "region", "zone", "any_of", "ordered
 
 
 class OnTimeout(str, Enum):
-    """What the caller gets when no replica answered before the deadline."""
+    """What the caller gets if no replica answers before the deadline."""
 
     SILENT = "silent"  # no response: an empty list of obstacles is never mistaken for a clear road
     EMPTY = "empty"  # a default-constructed response, as in the paper
@@ -72,7 +73,7 @@ class HedgingMode(str, Enum):
 
 
 class Advertise(str, Enum):
-    """When the service is there on the robot: what `wait_for_service` tells."""
+    """When the service is offered on the robot, as seen by `wait_for_service`."""
 
     WHILE_READY = "while_ready"  # while some replica can answer
     ONCE_READY = "once_ready"  # from the first replica that can answer, to the pool's end
@@ -125,8 +126,8 @@ class ServiceSpec:
     )
     hedging: HedgingMode = key(
         OneOf(HedgingMode),
-        "How many replicas get a request: every one while they are idle and fewer as load rises "
-        "(`auto`), every one always (`all`), or one and another when that fails (`failover`).",
+        "How many replicas get a request: all of them while they are idle and fewer as load "
+        "rises (`auto`), always all (`all`), or one, and another if it fails (`failover`).",
         default=HedgingMode.AUTO,
         parameter=True,
     )
@@ -137,14 +138,14 @@ class ServiceSpec:
     )
     concurrency: int = key(
         Whole(1, CONCURRENCY_LIMIT, "requests"),
-        "Requests that a replica gives the service at once.",
+        "Requests that a replica passes to the service concurrently.",
         default=0,
         usual="learned",
     )
     cancel: str = key(
         service_name("write a service's name, such as `cancel: /detect_cancel`"),
-        "Service (`std_srvs/srv/Trigger`) that cancels the request at work, called when the robot "
-        "has its answer from elsewhere.",
+        "Service (`std_srvs/srv/Trigger`) that cancels the running request, called when the "
+        "robot has an answer from another replica.",
         default="",
     )
     quorum: int = key(
@@ -160,7 +161,7 @@ class ServiceSpec:
             field_path("write a path such as `plan.cost`"),
         ),
         "With `quorum`: how far apart two values of a float field may be, such as "
-        "`{plan.poses.pose.position.x: 0.01}`. All else must be equal.",
+        "`{plan.poses.pose.position.x: 0.01}`. All other fields must be equal.",
         default_factory=dict,
     )
     state: StateSpec | None = key(
@@ -177,7 +178,8 @@ class ServiceSpec:
     )
     freshness: Freshness = key(
         OneOf(Freshness),
-        "Which request goes first where several wait: the one with the nearest deadline (`every`), "
+        "Which of several waiting requests goes first: the one with the nearest deadline "
+        "(`every`), "
         "or the newest (`latest`), for services whose older requests are worth less.",
         default=Freshness.EVERY,
     )
@@ -215,13 +217,13 @@ class ServiceSpec:
 
     @property
     def needs_type(self) -> bool:
-        """Whether the policy looks into responses, or makes one: the type must be loadable."""
+        """Whether the policy reads or creates responses, so that the type must be loadable."""
         looks = bool(self.ok_field) or self.quorum > 1 or self.state is not None
         return looks or self.on_timeout is OnTimeout.EMPTY
 
     @property
     def advertised(self) -> Advertise:
-        """When it is offered: as told; else while it can be answered.
+        """When it is offered: as configured, else while it can be answered.
 
         One that is answered with no replica at all, or whose requests are kept in order, stays.
         """
@@ -233,12 +235,12 @@ class ServiceSpec:
 
 @dataclass(frozen=True)
 class HealthSpec:
-    """When a replica is doubted, and when it is replaced."""
+    """When a replica is suspected, and when it is replaced."""
 
     suspect_after_s: float = key(
         Number(3600, "seconds"),
         "Mark a replica suspect after this long without a probe reply; nothing more is sent "
-        "there. A slow service never counts.",
+        "there. A slow service does not count.",
         default=2.0,
     )
     replace_after_s: float = key(
@@ -250,14 +252,14 @@ class HealthSpec:
     start_limit_s: float = key(
         Number(DAY_S, "seconds"),
         "Give up on a launch that is not ready this long after its `setup`, or whose machine is "
-        "not running by then. `setup` itself has an hour.",
+        "not running within that time. `setup` itself may take an hour.",
         default=900.0,
     )
 
 
 @dataclass(frozen=True)
 class PoolSpec:
-    """A whole pool file.
+    """The contents of a pool file.
 
     Attributes:
         services: Names distinct; the services of actions are among them.
@@ -276,8 +278,8 @@ class PoolSpec:
             ServiceSpec,
             "write a list, such as `services: [{name: /detect, type: my_msgs/srv/Detect}]`",
         ),
-        "The services that the robot calls and the replicas run. Left out: what `run` advertises, "
-        "without the services of ROS itself.",
+        "The services that the robot calls and the replicas run. If omitted: what `run` "
+        "advertises, except the services of ROS itself.",
         default=(),
         usual="what `run` advertises",
     )
@@ -286,7 +288,7 @@ class PoolSpec:
             "write where the services are that may be offered, such as `namespace: /planner`",
             "a namespace",
         ),
-        "Where `services` is left out: only what is below this namespace is offered on the robot.",
+        "If `services` is omitted: offer only services below this namespace on the robot.",
         default="",
         usual="any",
     )
@@ -295,8 +297,8 @@ class PoolSpec:
     )
     max_surge: int = key(
         Whole(0, 4, "machines"),
-        "Additional machines while one replaces another. With 0, one that still serves is replaced "
-        "only where the file has changed, and ends before its successor begins.",
+        "Extra machines during a replacement. With 0, a machine that still serves is replaced "
+        "only if the file has changed, and ends before its successor starts.",
         default=1,
     )
     max_usd_per_hour: float | None = key(
@@ -317,19 +319,18 @@ class PoolSpec:
     )
     availability: AvailabilitySpec | None = key(
         Map(AvailabilitySpec, short=("target",)),
-        "How often a replica must answer; the number of replicas follows, and `replicas` is the "
-        "least. `0.9995` is short for `{target: 0.9995}`.",
+        "Fraction of time that at least one replica must answer; sets the number of replicas, with "
+        "`replicas` as the minimum. `0.9995` is short for `{target: 0.9995}`.",
         default=None,
     )
     placement: PlacementSpec = key(
         Map(PlacementSpec),
-        "How price and distance are weighed, and what is known of distances. Failure domains count "
-        "first.",
+        "How price and distance are weighed, and known distances. Failure domains take precedence.",
         default_factory=PlacementSpec,
     )
     on_demand: OnDemandSpec = key(
         Map(OnDemandSpec),
-        "How spot and on-demand machines are mixed; what is not on demand is then spot.",
+        "How spot and on-demand machines are mixed; the others are then spot.",
         default_factory=OnDemandSpec,
     )
     spread: Spread = key(
@@ -340,8 +341,8 @@ class PoolSpec:
     )
     groups: tuple[GroupSpec, ...] = key(
         Maps(GroupSpec, "write `groups: [{name: anchor, replicas: 1, ...}]`"),
-        "Replicas with machines of different kinds, at most eight groups, in place of `replicas` "
-        "and `on_demand`. Add new ones at the end: a group is known by its place in the list.",
+        "Replicas on different kinds of machines, at most eight groups, instead of `replicas` "
+        "and `on_demand`. Add new ones at the end: a group is identified by its position.",
         default=(),
     )
     schedule: ScheduleSpec | None = key(
@@ -358,7 +359,8 @@ class PoolSpec:
     )
     rendezvous: tuple[str, ...] = key(
         Listed(endpoint("write a list, such as `rendezvous: [meet.example.org:7450]`"), 4),
-        "Where `fogft rendezvous` runs, for pools with several robots, gateways, or replicas whose "
+        "Where `fogft rendezvous` runs, for pools with several robots, gateways, or replicas "
+        "whose "
         "address the cloud does not know.",
         default=(),
     )
@@ -366,12 +368,13 @@ class PoolSpec:
         endpoint(
             "write the robot's own address and a port, such as `dial_in: robot.example.org:7460`"
         ),
-        "Robot's own address, for replicas that cannot be reached: they dial the robot.",
+        "The robot's own address, for replicas that cannot be reached: they dial the robot.",
         default="",
     )
     link_port: int = key(
         Whole(1024, 65535),
-        "Port of a replica's VM that robots connect to. Not 7447, which is `rmw_zenoh`'s router's.",
+        "Port of a replica's VM that robots connect to. Not 7447, the port of `rmw_zenoh`'s "
+        "router.",
         default=LINK_PORT,
         advanced=True,
     )
@@ -385,7 +388,7 @@ class PoolSpec:
             20,
         ),
         "Who may connect to a replica's VM, to ssh's port too: the public addresses of the robots "
-        "and of the computer that SkyPilot's API server runs on. Held on AWS only.",
+        "and of the computer that SkyPilot's API server runs on. Enforced on AWS only.",
         default=(),
         usual="anyone",
     )
@@ -403,8 +406,8 @@ class PoolSpec:
             ),
             4,
         ),
-        "Network interfaces of this machine's robot to use at once, the preferred one first. Each "
-        "needs a route of its own to the replicas.",
+        "Network interfaces of this machine's robot to use at once, the preferred one first. "
+        "Each needs its own route to the replicas.",
         default=(),
         usual="by route",
     )
@@ -425,8 +428,8 @@ class PoolSpec:
     rmw: Middleware = key(
         Map(Middleware, short=("robot", "replica")),
         "How the proxies speak ROS: `rclpy`, by the ROS 2 that is installed where they run, or "
-        "`zenoh`, as nodes of `rmw_zenoh` do, with no ROS installed. One word for both sides, or a "
-        "map.",
+        "`zenoh`, as nodes of `rmw_zenoh` do, with no ROS installed. One value for both sides, "
+        "or a map.",
         default_factory=Middleware,
     )
     actions: tuple[ActionSpec, ...] = key(
@@ -439,15 +442,15 @@ class PoolSpec:
     )
     spare: bool = key(
         Flag(),
-        "Keep a second process of `run` on each replica, started and idle in a ROS domain of its "
-        "own, which takes over when the first dies. For services that take long to start; needs "
-        "their memory twice.",
+        "Keep a second process of `run` on each replica, started and idle in its own ROS domain, "
+        "which takes over when the first dies. For services that start slowly; doubles their "
+        "memory.",
         default=False,
     )
     unmanaged_max_hours: float = key(
         Number(MAX_HOURS, "hours"),
-        "How long replicas go on serving after the manager was last heard of. Then they shut their "
-        "machines down, and never later than `max_hours` has them.",
+        "How long replicas keep serving after they last heard from the manager. Then they shut "
+        "their machines down, at the latest when `max_hours` ends.",
         default=24.0,
     )
     task: Mapping[str, Any] = field(default_factory=dict)
@@ -456,17 +459,17 @@ class PoolSpec:
 
     @cached_property
     def derived(self) -> dict[Any, Any]:
-        """Where `groups` keeps what it worked out of this spec, which never changes."""
+        """A cache for values that `groups` derives from this spec, which never changes."""
         return {}
 
     @property
     def proxied(self) -> tuple[ServiceSpec, ...]:
-        """The services that robots are offered: the file's, or what was discovered."""
+        """The services offered on robots: the file's, or the discovered ones."""
         return self.services or self.discovered
 
     @cached_property
     def proxied_names(self) -> frozenset[str]:
-        """Their names: what makes a replica ready; none for never."""
+        """The names of the services that make a replica ready."""
         return frozenset(service.name for service in self.proxied)
 
     @cached_property

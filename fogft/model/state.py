@@ -1,4 +1,4 @@
-"""By which two services a service's state is taken and given."""
+"""The two services that save and restore a service's state."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class StateService:
 
 @dataclass(frozen=True)
 class StateSpec:
-    """How a service's state is taken and given."""
+    """How a service's state is saved and restored."""
 
     snapshot: StateService = key(
         Map(StateService, _HINT, short=("name",)),

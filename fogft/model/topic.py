@@ -13,14 +13,14 @@ DEPTH_LIMIT = 1000
 
 
 class Origin(str, Enum):
-    """Who publishes."""
+    """Which side publishes a topic."""
 
     ROBOT = "robot"  # each message goes to every replica
     REPLICAS = "replicas"  # what they publish comes to the robot, duplicates dropped
 
 
 class Select(str, Enum):
-    """Which of several replicas' messages the robot gets."""
+    """Which replicas' messages the robot gets."""
 
     LEADER = "leader"  # those of one replica at a time
     STAMP = "stamp"  # the first with each header stamp
@@ -86,7 +86,7 @@ class TopicSpec:
 
     @property
     def key_name(self) -> str:
-        """Its name on the wire, and in what a replica says is ready."""
+        """Its name on the link, and in a replica's list of what is ready."""
         return PREFIX + self.name
 
     @property

@@ -1,4 +1,4 @@
-"""Who talks through whom: gateways, what they go through themselves, and who uses them. Pure.
+"""Gateways: their upstream gateways, and the robots that use them. Pure.
 
 Whoever goes through gateways holds links to them and to no replica; all others hold links
 to the replicas. A gateway may go through others, so they form trees; a loop is refused
@@ -38,7 +38,7 @@ class Gateway:
     )
     through: tuple[str, ...] = key(
         _NAMES,
-        "Gateways that it forwards to itself; none for the replicas. A loop is an error.",
+        "Gateways that it forwards requests to; if empty, the replicas. A loop is an error.",
         name="upstream",
         default=(),
         usual="the replicas",
@@ -56,7 +56,7 @@ class RobotRoute:
 
 @dataclass(frozen=True)
 class Topology:
-    """Who talks through whom: gateways, those of some robots (`routes`), and of all others."""
+    """The gateways of a pool, and which of them each robot uses (`routes`, else the default)."""
 
     gateways: tuple[Gateway, ...] = key(
         Maps(
@@ -80,8 +80,8 @@ class Topology:
     )
     through: tuple[str, ...] = key(
         _NAMES,
-        "Gateways of every robot that `robots` does not name; none for the replicas themselves. "
-        "Of several, one gets a request, and another when that is late or lost.",
+        "Gateways of every robot not listed in `robots`; if empty, the replicas themselves. With "
+        "several, a request goes to one, and to another if it is late or lost.",
         name="default_gateways",
         default=(),
         usual="the replicas",
@@ -101,7 +101,7 @@ class Topology:
         return next((g for g in self.gateways if g.name == name), None)
 
     def neighbours(self, holder: Holder) -> tuple[Gateway, ...]:
-        """Return the gateways that somebody talks to; none for the replicas.
+        """Return the gateways that a robot or gateway connects to; none: the replicas.
 
         One without a certificate cannot be talked to.
         """
@@ -114,7 +114,7 @@ class Topology:
 
 
 def certified(topology: Topology, generations: Mapping[str, Iterable[int]]) -> Topology:
-    """Return a topology with the generations of each gateway's certificates that are good."""
+    """Return a topology with the generations of each gateway's valid certificates."""
     gateways = tuple(
         replace(g, generations=tuple(sorted(generations.get(g.name, ()))))
         for g in topology.gateways
@@ -123,10 +123,10 @@ def certified(topology: Topology, generations: Mapping[str, Iterable[int]]) -> T
 
 
 def trouble(topology: Topology) -> str:
-    """Return what is wrong with a topology, in words; empty when nothing is."""
+    """Return the problem of a topology, in words; empty without one."""
     known = {gateway.name for gateway in topology.gateways}
     if len(known) < len(topology.gateways):
-        return "a gateway stands there twice"
+        return "a gateway is defined twice"
     lists = [*(g.through for g in topology.gateways), *topology.robots.values(), topology.through]
     for listed in lists:
         if len(set(listed)) < len(listed):
@@ -139,7 +139,7 @@ def trouble(topology: Topology) -> str:
 
 
 def find_loop(through: Mapping[str, Iterable[str]]) -> list[str]:
-    """Return the names along a loop, the first one again at the end; none where there is none."""
+    """Return the names along a loop, the first one repeated at the end; none without a loop."""
     try:
         TopologicalSorter(through).prepare()
     except CycleError as error:

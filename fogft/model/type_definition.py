@@ -1,4 +1,4 @@
-"""Definitions of service types, and how two of one name differ. Pure.
+"""Definitions of service types, and the differences between two of one name. Pure.
 
 The robot and a replica load a type by its name, each from its own workspace. Where the two
 definitions are not the same, bytes of one are read as another message: numbers that look
@@ -24,7 +24,7 @@ Fields = tuple[tuple[Line, Line], ...]
 
 @dataclass(frozen=True)
 class Definition:
-    """What a service type is on one machine.
+    """The definition of a service type on one machine.
 
     Attributes:
         hash: Of request and response (``RIHS01_...+RIHS01_...``); empty where the distribution
@@ -42,7 +42,7 @@ class Definition:
 
     @property
     def known(self) -> bool:
-        """Whether it says anything."""
+        """Whether the definition is known."""
         return bool(self.hash or self.fields or self.trouble or self.service_hash)
 
 

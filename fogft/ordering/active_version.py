@@ -19,7 +19,11 @@ VACANCY_S = 3.0
 
 
 class ActiveVersion:
-    """The active version of one service."""
+    """The active version of one service.
+
+    Args:
+        version: It; None while there never was one.
+    """
 
     def __init__(self, version: str | None = None) -> None:
         self.version = version
@@ -35,7 +39,7 @@ class ActiveVersion:
         return self.version is None or self._is_gone or version == self.version
 
     def look(self, joined: Iterable[str], now: float) -> None:
-        """Note which versions the replicas have that apply what is sent to them."""
+        """Note the versions of the replicas that apply orders."""
         if self.version is None or self.version in set(joined):
             self._gone_since, self._is_gone = None, False
             return
@@ -44,11 +48,11 @@ class ActiveVersion:
         self._is_gone = now - self._gone_since >= VACANCY_S
 
     def successor(self, joined: Iterable[str]) -> str | None:
-        """Return which version follows one that is gone: most of those that stand by."""
+        """Return the version that follows one that is gone: that of most standbys."""
         return _most(joined) if self._is_gone else None
 
     def wanted(self, staying: Iterable[str]) -> str | None:
-        """Return which version of those `staying` is to take over; None for no change."""
+        """Return which version of those `staying` should take over; None for no change."""
         counted = Counter(staying)
         best = _most(counted.elements())
         if best is None or self.version is None or best == self.version:

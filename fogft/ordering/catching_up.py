@@ -1,4 +1,4 @@
-"""Bring every replica of a stateful service through one term's log. Pure.
+"""Replicate one term's log to all replicas of a stateful service. Pure.
 
 It holds what each replica still needs: requests by number while the log has them, else a
 checkpoint and what came after. What is to be sent collects until `take`.
@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from fogft.ordering import orders
 from fogft.ordering.log import Checkpoint, OrderedLog
-from fogft.ordering.orders import Op, Position
+from fogft.ordering.orders import START, Op, Position
 from fogft.ordering.peer import Order, Peer, Phase, far_behind
 
 CHECKPOINT_RETRY_S = 1.0
@@ -21,7 +21,7 @@ WINDOW = 128
 
 
 class CatchingUp:
-    """A term's log, and how far each replica has come in it.
+    """A term's log, and each replica's progress in it.
 
     Args:
         counts: Whether a replica's state may be given to others, and its answer to a caller.
@@ -34,8 +34,6 @@ class CatchingUp:
         counts: Callable[[int], bool],
         *,
         handed_over: bool,
-        log_entries: int,
-        log_bytes: int,
     ) -> None:
         self.base: Position | None = None  # None until the term has begun
         self.log: OrderedLog | None = None
@@ -44,41 +42,39 @@ class CatchingUp:
         self._epoch = epoch
         self._counts = counts
         self._handed_over = handed_over
-        self._bounds = (log_entries, log_bytes)
         self._out: list[Order] = []
         self._serial = 0
         self._checkpoint_at = 0.0
 
     @property
     def ready(self) -> bool:
-        """Whether a number given now is sent at once to somebody whose answer counts."""
+        """Whether a request numbered now is sent at once to a replica whose answer counts."""
         return any(peer.joined and self._counts(replica) for replica, peer in self.peers.items())
 
     @property
     def sends(self) -> bool:
-        """Whether `take` has something to send."""
+        """Whether `take` has orders to send."""
         return bool(self._out)
 
     def take(self) -> list[Order]:
-        """Return the orders to send, in this order, and forget them."""
+        """Remove and return the orders to send, in order."""
         out, self._out = self._out, []
         return out
 
     # -- numbers --------------------------------------------------------------------------
 
     def order(self, replica: int, op: Op) -> None:
-        """Send an order that is about no number: it is told apart by a serial."""
+        """Send an order without a number, identified by a serial."""
         self._serial += 1
         self._out.append(Order(replica, op, self._serial))
 
     def begin_at(self, position: Position) -> None:
         """Begin the term from a state."""
-        entries, size = self._bounds
         self.base = position
-        self.log = OrderedLog(position.index, entries_limit=entries, bytes_limit=size)
+        self.log = OrderedLog(position.index)
 
     def append(self, payload: bytes) -> int | None:
-        """Number some bytes and order them applied; None where there is no room."""
+        """Number a request and order it applied; None if the log is full."""
         log = self.log
         if log is None:
             return None
@@ -95,7 +91,7 @@ class CatchingUp:
         return index
 
     def feed(self, replica: int, peer: Peer) -> None:
-        """Send a replica that has joined what it lacks."""
+        """Send a joined replica the requests that it lacks."""
         log = self.log
         assert log is not None
         if not peer.joined or peer.lags:
@@ -122,7 +118,10 @@ class CatchingUp:
             self._out.append(Order(replica, Op.RECALL, index))
 
     def _make_room(self, log: OrderedLog, size: int) -> bool:
-        """No checkpoint came in time: drop what every member has applied, and no more."""
+        """No checkpoint came in time: drop what every member has applied, and no more.
+
+        Each of them alone can then go on; only if all are lost at once, the state is.
+        """
         members = [peer.acked for peer in self.peers.values() if peer.member]
         if members:
             log.drop(min(members))
@@ -131,7 +130,7 @@ class CatchingUp:
     # -- replicas that lack some ----------------------------------------------------------
 
     def bring(self, replica: int, peer: Peer, *, waited: bool = False) -> None:
-        """Let a claimed replica join, from its own state or from the checkpoint.
+        """Have a claimed replica join, from its own state or from the checkpoint.
 
         Where both are long ago it waits for a new checkpoint, if there is whom to ask; `waited`
         says that it has.
@@ -160,13 +159,13 @@ class CatchingUp:
         return at == self.base and not (self._handed_over and self._counts(replica))
 
     def bring_all(self, *, waited: bool = False) -> None:
-        """Do so for all that wait for it."""
+        """Have all waiting replicas join."""
         for replica, peer in self.peers.items():
             if peer.phase is Phase.CLAIMED:
                 self.bring(replica, peer, waited=waited)
 
     def look_at_lag(self, peer: Peer, now: float) -> None:
-        """Have a joined replica restored that falls behind, if another can give its state."""
+        """Restore a joined replica that falls behind, if another can provide its state."""
         log = self.log
         if log is None:
             return
@@ -184,13 +183,14 @@ class CatchingUp:
     # -- the checkpoint -------------------------------------------------------------------
 
     def see_to_checkpoint(self, now: float) -> None:
-        """Ask for a checkpoint where one is needed."""
+        """Request a checkpoint if one is needed."""
         log = self.log
         if log is None:
             return
         waits = any(peer.phase is Phase.CLAIMED for peer in self.peers.values())
-        # A log that begins with the service's first state needs none; nor does one just taken.
-        begins_later = log.checkpoint is None and log.start > 0
+        # A log that begins with the service's first state needs none; nor does one just taken. A
+        # later term's begins with a position that a fresh replica does not know, called or not.
+        begins_later = log.checkpoint is None and (log.start > 0 or self.base != START)
         if waits or begins_later or log.half_full:
             # Of one that seldom answers first: it pauses for the snapshot.
             self.ask_for_checkpoint(
@@ -203,14 +203,14 @@ class CatchingUp:
             )
 
     def ask_for_checkpoint(self, donors: list[tuple[bool, int, int]], now: float) -> None:
-        """Ask the best of these for one, unless one was asked lately; the replica stands last."""
+        """Request a checkpoint from the best of these replicas, unless one was requested lately."""
         if donors and self.donor is None and now >= self._checkpoint_at:
             self.donor = min(donors)[-1]
             self._checkpoint_at = now + CHECKPOINT_RETRY_S
             self.order(self.donor, Op.SNAPSHOT)
 
     def take_checkpoint(self, index: int, state: bytes) -> None:
-        """Keep a checkpoint, and bring those that wait for one."""
+        """Store a checkpoint, and have replicas that wait for one join."""
         if self.log is not None:
             self.log.keep(Checkpoint(index, state))
             self._checkpoint_at = 0.0

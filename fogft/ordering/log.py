@@ -19,17 +19,20 @@ class Checkpoint:
 
 
 class OrderedLog:
-    """Requests by number, consecutive, bounded by count and bytes."""
+    """Requests by number, consecutive, bounded by count and bytes.
 
-    def __init__(
-        self, start: int, *, entries_limit: int = 8192, bytes_limit: int = 64 << 20
-    ) -> None:
+    Args:
+        start: The number after which it begins: all before is part of a state.
+    """
+
+    entries_limit = 8192
+    bytes_limit = 64 << 20  # of all together; a larger single entry still gets in alone
+
+    def __init__(self, start: int) -> None:
         self.start = start
         self.checkpoint: Checkpoint | None = None
         self._entries: deque[bytes] = deque()
         self.held_bytes = 0  # bytes of all entries, without the checkpoint
-        self._entries_limit = entries_limit
-        self._bytes_limit = bytes_limit
 
     def __len__(self) -> int:
         return len(self._entries)
@@ -41,19 +44,23 @@ class OrderedLog:
 
     @property
     def half_full(self) -> bool:
-        """Whether it is time for a checkpoint."""
-        full = len(self._entries) / self._entries_limit, self.held_bytes / self._bytes_limit
+        """Whether the log is half full: time for a checkpoint."""
+        full = len(self._entries) / self.entries_limit, self.held_bytes / self.bytes_limit
         return max(full) >= 0.5
 
     def has_room(self, size: int) -> bool:
         """Whether a request of this size can be appended."""
         if not self._entries:
             return True
-        within = self.held_bytes + size <= self._bytes_limit
-        return within and len(self._entries) < self._entries_limit
+        within = self.held_bytes + size <= self.bytes_limit
+        return within and len(self._entries) < self.entries_limit
 
     def append(self, payload: bytes) -> int:
-        """Number a request; ask `has_room` before."""
+        """Number a request; ask `has_room` before.
+
+        Raises:
+            ValueError: There is no room.
+        """
         if not self.has_room(len(payload)):
             raise ValueError("the log is full")
         self._entries.append(payload)
@@ -61,7 +68,11 @@ class OrderedLog:
         return self.last
 
     def get(self, index: int) -> bytes:
-        """Return a request."""
+        """Return a request.
+
+        Raises:
+            IndexError: It is not in the log.
+        """
         if not self.start < index <= self.last:
             raise IndexError(f"the log has no number {index}")
         return self._entries[index - self.start - 1]
@@ -71,7 +82,7 @@ class OrderedLog:
         return self.start <= index <= self.last
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """Take a newer snapshot, and drop what it covers. An older one is ignored."""
+        """Store a newer snapshot, and drop what it covers. An older one is ignored."""
         old = self.checkpoint
         if not self.covers(checkpoint.index) or (old and old.index >= checkpoint.index):
             return
@@ -79,7 +90,7 @@ class OrderedLog:
         self.drop(checkpoint.index)
 
     def drop(self, index: int) -> None:
-        """Drop everything up to a number. A checkpoint before it is of no use any more."""
+        """Drop everything up to a number, with any checkpoint before it."""
         while self._entries and self.start < index:
             self.held_bytes -= len(self._entries.popleft())
             self.start += 1

@@ -21,14 +21,16 @@ _PROMISE = struct.Struct(">QQB")
 _INDEX = struct.Struct(">Q")
 INDEX_LIMIT = 1 << 56
 _EPOCH_LIMIT = 1 << 64
+# What replicas may claim: beyond, a lie would leave the sequencer no numbers.
+_CLAIMED_INDEX_LIMIT, _CLAIMED_EPOCH_LIMIT = INDEX_LIMIT >> 1, _EPOCH_LIMIT >> 1
 
 
 class OrderError(ValueError):
-    """These bytes are no order, or not the answer to one."""
+    """Bytes are not an order, or not the answer to one."""
 
 
 class Op(IntEnum):
-    """What a sequencer may order."""
+    """The operations that a sequencer may order."""
 
     CLAIM = 1
     JOIN = 2
@@ -43,7 +45,7 @@ OrderId = tuple[Op, int, int]  # operation, term, index
 
 @dataclass(frozen=True, order=True)
 class Position:
-    """A state: all requests up to `index` of the term `epoch`; by default, as a service starts."""
+    """A state: all requests up to `index` of term `epoch`; by default, the initial state."""
 
     epoch: int = 0
     index: int = 0
@@ -54,7 +56,11 @@ START = Position()
 
 @dataclass(frozen=True)
 class Promise:
-    """What a replica says of itself when it is claimed; unsound after a restore that failed."""
+    """A replica's answer when it is claimed; unsound after a failed restore.
+
+    Attributes:
+        sound: Whether its state is that of `position`; a restore that failed leaves it unsound.
+    """
 
     position: Position
     sound: bool
@@ -83,7 +89,7 @@ def decode(id: bytes) -> OrderId:
 
 
 def encode_join(at: Position, last: int) -> bytes:
-    """Return where a replica must be to join, and the last number given until now."""
+    """Encode the position that a replica must have to join, and the last number so far."""
     return _JOIN.pack(at.epoch, at.index, last)
 
 
@@ -101,6 +107,8 @@ def encode_promise(promise: Promise) -> bytes:
 def decode_promise(payload: bytes) -> Promise:
     """Read a promise. Raises OrderError."""
     epoch, index, sound = _unpack(_PROMISE, payload)
+    if index >= _CLAIMED_INDEX_LIMIT:
+        raise OrderError(f"a promise at the number {index}")
     return Promise(Position(epoch, index), bool(sound))
 
 
@@ -135,18 +143,18 @@ def _unpack(layout: struct.Struct, payload: bytes) -> tuple[int, ...]:
 
 
 def read_index(detail: str) -> int | None:
-    """Return the number that is expected next, of a `Refusal.GAP`."""
-    return _number(detail, 10)
+    """Return the next expected number from a `Refusal.GAP`."""
+    return _number(detail, 10, INDEX_LIMIT)
 
 
 def read_epoch(detail: str) -> int | None:
-    """Return the term that is obeyed, of a `Refusal.FENCED`."""
-    return _number(detail, 16)
+    """Return the current term from a `Refusal.FENCED`."""
+    return _number(detail, 16, _CLAIMED_EPOCH_LIMIT)
 
 
-def _number(detail: str, base: int) -> int | None:
+def _number(detail: str, base: int, limit: int) -> int | None:
     try:
         number = int(detail, base)
     except ValueError:
         return None
-    return number if 0 <= number < _EPOCH_LIMIT else None
+    return number if 0 <= number < limit else None

@@ -1,4 +1,4 @@
-"""A replica as one term of a sequencer knows it, and an order to it. Pure values.
+"""A sequencer's view of a replica in one term, and orders to it. Pure values.
 
 The first answer counts, so callers go as fast as the fastest replica. A slower one falls behind for
 as long as that lasts; should the faster ones die, every caller would wait until it has applied all
@@ -24,7 +24,7 @@ RESTORE_LONGEST_S = 16.0
 
 @dataclass(frozen=True)
 class Order:
-    """What to send to a replica: an operation of this term, with its bytes."""
+    """An order to a replica: an operation of this term, with its bytes."""
 
     replica: int
     op: Op
@@ -33,7 +33,7 @@ class Order:
 
 
 class Phase(Enum):
-    """How far a replica has come in this term."""
+    """A replica's phase in this term."""
 
     UNCLAIMED = "unclaimed"  # it is to be claimed, at once or after a pause
     ASKED = "asked"  # an order is on its way that changes its phase
@@ -42,19 +42,19 @@ class Phase(Enum):
 
 
 def far_behind(requests: int) -> bool:
-    """Whether a replica that lacks so many requests is to have a snapshot rather than them."""
+    """Whether a replica lacks so many requests that a snapshot is better."""
     return requests > LAG_LIMIT
 
 
 class Lag:
-    """How one replica keeps up. A snapshot costs its giver a pause: the next ones come rarer."""
+    """How far a replica is behind. Snapshots pause the sender, so they become rarer."""
 
     def __init__(self) -> None:
         self._wait_s = RESTORE_FIRST_S
         self._next_at = 0.0
 
     def too_far(self, behind: int, now: float) -> bool:
-        """Whether a replica is to be restored now that has not answered so many requests."""
+        """Whether a replica with this many unanswered requests should be restored now."""
         if not far_behind(behind):
             if now >= self._next_at + self._wait_s:
                 self._wait_s = RESTORE_FIRST_S  # it has kept up for as long again
@@ -68,7 +68,7 @@ class Lag:
 
 @dataclass
 class Peer:
-    """A replica as this term knows it."""
+    """A sequencer's view of a replica in this term."""
 
     phase: Phase = Phase.UNCLAIMED
     promise: Promise | None = None
@@ -87,22 +87,22 @@ class Peer:
 
     @property
     def joined(self) -> bool:
-        """Whether it applies what is sent to it."""
+        """Whether it applies requests."""
         return self.phase is Phase.JOINED
 
     def join(self, expected: int) -> None:
-        """It has joined, and expects this number next."""
+        """Note that it has joined and expects this number next."""
         self.phase, self.member = Phase.JOINED, True
         self.wait_s, self.rewind = RETRY_FIRST_S / 2, None
         self.next, self.acked = expected, expected - 1
 
     def go_back(self, expected: int) -> None:
-        """Send again from a number, once what is on its way has been answered."""
+        """Resend from a number, once orders in flight have been answered."""
         if self.joined and expected <= self.next:
             self.rewind = expected if self.rewind is None else min(self.rewind, expected)
 
     def pause(self, now: float) -> None:
-        """Claim it anew after a moment, longer each time: that tells where it stands."""
+        """Claim it again after a pause, longer each time, to learn its position."""
         if self.phase is Phase.UNCLAIMED:
             return
         self.phase = Phase.UNCLAIMED

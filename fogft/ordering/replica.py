@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Reply(Generic[T]):
-    """Answer whoever gave this order."""
+    """Answer the sender of this order."""
 
     to: T
     payload: bytes
@@ -31,7 +31,7 @@ class Reply(Generic[T]):
 
 @dataclass(frozen=True)
 class Refuse(Generic[T]):
-    """Refuse whoever gave this order."""
+    """Refuse the sender of this order."""
 
     to: T
     reason: Refusal
@@ -40,7 +40,11 @@ class Refuse(Generic[T]):
 
 @dataclass(frozen=True)
 class Begin:
-    """Let the service, or that of its state, do something; report its end by the serial."""
+    """Call the service, or its state service; its end is reported by the serial.
+
+    Attributes:
+        op: `APPLY`: call the service. `SNAPSHOT`, `RESTORE`: call those of the pool file.
+    """
 
     op: Op
     serial: int
@@ -70,21 +74,16 @@ class _Queued(Generic[T]):
 class OrderedReplica(Generic[T]):
     """One stateful service on one replica."""
 
-    def __init__(
-        self,
-        *,
-        queue_limit: int = 512,
-        queue_bytes: int = 64 << 20,
-        kept: int = 1024,
-        kept_bytes: int = 16 << 20,
-    ) -> None:
+    queue_limit, queue_bytes = 512, 64 << 20  # requests that wait for their turn; more are refused
+    kept_limit, kept_bytes = 1024, 16 << 20  # answers kept for copies; the oldest go first
+
+    def __init__(self) -> None:
         self.position = START
         self.sound, self.joined = True, False
         self.serving = False  # whether the service and its two state services are there
         self.promised, self.robot = 0, ""  # the term, and whose
         self.goal = 0  # with this number it has caught up with the time when it joined
         self.applied = 0  # how many requests were applied here
-        self._limits = (queue_limit, queue_bytes, kept, kept_bytes)
         self._serial = 0
         self._work: _Work[T] | None = None
         self._queue: OrderedDict[int, _Queued[T]] = OrderedDict()
@@ -97,12 +96,12 @@ class OrderedReplica(Generic[T]):
 
     @property
     def current(self) -> bool:
-        """Whether it has the present state: it joined, and has caught up since."""
+        """Whether it has the current state: it joined, and has caught up since."""
         return self.joined and self.serving and self.position.index >= self.goal
 
     @property
     def busy(self) -> bool:
-        """Whether the service works on something."""
+        """Whether the service is working on a request."""
         return self._work is not None
 
     @property
@@ -124,7 +123,7 @@ class OrderedReplica(Generic[T]):
     def order(  # noqa: PLR0911 - one line an operation reads better than nesting
         self, op: Op, epoch: int, index: int, payload: bytes, *, robot: str, to: T
     ) -> list[Effect[T]]:
-        """Take an order; `to` is who is to be answered."""
+        """Take an order; `to` identifies the sender to answer."""
         if op is Op.CLAIM:
             return self._claim(epoch, robot, to)
         if epoch != self.promised:
@@ -216,8 +215,8 @@ class OrderedReplica(Generic[T]):
             return known
         if index != self._expected:
             return [Refuse(to, Refusal.GAP, str(self._expected))]
-        limit, limit_bytes, _, _ = self._limits
-        full = len(self._queue) >= limit or self._queued_bytes + len(payload) > limit_bytes
+        held_bytes = self._queued_bytes + len(payload)
+        full = len(self._queue) >= self.queue_limit or held_bytes > self.queue_bytes
         if full and self._queue:
             return [Refuse(to, Refusal.GAP, str(index))]  # send it again, a little later
         self._queue[index] = _Queued(payload, [to])
@@ -264,7 +263,10 @@ class OrderedReplica(Generic[T]):
         return Begin(op, self._serial, payload)
 
     def done(self, serial: int, answer: bytes | None) -> list[Effect[T]]:
-        """The service has ended what began under this serial; None if it failed."""
+        """Note that the call with this serial has ended; None if it failed.
+
+        A request that it could not read counts as applied: it is the same on every replica.
+        """
         work = self._work
         if work is None or work.serial != serial:
             return []
@@ -297,10 +299,11 @@ class OrderedReplica(Generic[T]):
         return [self._has_joined(to) for to in work.waiting]
 
     def _keep(self, index: int, answer: bytes | None) -> None:
-        _, _, kept, kept_bytes = self._limits
         self.kept[index] = answer
         self._kept_size += len(answer or b"")
-        while len(self.kept) > kept or (self._kept_size > kept_bytes and len(self.kept) > 1):
+        while len(self.kept) > self.kept_limit or (
+            self._kept_size > self.kept_bytes and len(self.kept) > 1
+        ):
             _, oldest = self.kept.popitem(last=False)
             self._kept_size -= len(oldest or b"")
 
@@ -311,7 +314,7 @@ class OrderedReplica(Generic[T]):
     # -- what goes wrong ------------------------------------------------------------------
 
     def lost(self) -> list[Effect[T]]:
-        """The service has died, with its state: what starts next starts at the beginning."""
+        """Note that the service died with its state: it restarts from its initial state."""
         out = self._give_up(Refusal.CRASHED)
         if self._work is not None:
             out += [Refuse(to, Refusal.CRASHED) for to in self._work.waiting]

@@ -1,4 +1,4 @@
-"""One term of a stateful service's order: claim replicas, let them join, take what they say. Pure.
+"""One term of a stateful service: claim replicas, have them join, take their answers. Pure.
 
 A term claims the replicas and begins from the state of one of them, never from one before the mark;
 one replica is enough. From then on it numbers requests, and the first answer counts. When most of
@@ -22,7 +22,7 @@ from fogft.ordering import orders
 from fogft.ordering.active_version import ActiveVersion
 from fogft.ordering.catching_up import CatchingUp
 from fogft.ordering.log import OrderedLog
-from fogft.ordering.orders import START, Op, Position, Promise
+from fogft.ordering.orders import START, Op, OrderError, Position, Promise
 from fogft.ordering.peer import Peer, Phase
 
 CHECK_EVERY_S = 1.0
@@ -30,7 +30,12 @@ CHECK_EVERY_S = 1.0
 
 @dataclass(frozen=True)
 class Handover:
-    """From what a term begins in which another version is active: all before has been applied."""
+    """The start of a term with another active version: all earlier requests are applied.
+
+    Attributes:
+        version: The one that becomes active.
+        at: The state that it takes over: every number given before has been applied there.
+    """
 
     version: str
     at: Position
@@ -41,12 +46,14 @@ class Sequencer:
     """One term of a sequencer.
 
     Args:
+        epoch: This term, above every earlier one.
         mark: The position of the last answer that was returned, in whatever term.
         holder: The version that returned it; None where nobody knows.
         begin: What the term begins from, where a version takes over from another.
 
     Attributes:
-        deposed_by: A later term that replicas obey.
+        active: Whose answers count.
+        deposed_by: A later term that more replicas obey than this one.
         held_by: Another robot whose order they obey.
         handover: This term's end: the next begins from it.
     """
@@ -58,13 +65,12 @@ class Sequencer:
         mark: Position = START,
         holder: str | None = None,
         begin: Handover | None = None,
-        log_entries: int = 8192,
-        log_bytes: int = 64 << 20,
     ) -> None:
         self.epoch = epoch
         self.mark = mark
         self.active = ActiveVersion(begin.version if begin else holder)
         self.deposed_by: int | None = None
+        self._fenced: dict[int, int] = {}  # who says that it obeys a later term, and which
         self.held_by = ""
         self.handover: Handover | None = None
         self._versions: Mapping[int, str] = {}
@@ -75,8 +81,6 @@ class Sequencer:
             epoch,
             self._counts,
             handed_over=begin is not None,
-            log_entries=log_entries,
-            log_bytes=log_bytes,
         )
         self._peers = self._replicas.peers
         self.take = self._replicas.take  # the orders to send, in this order; they are forgotten
@@ -88,7 +92,7 @@ class Sequencer:
 
     @property
     def log(self) -> OrderedLog | None:
-        """The numbers given; None until the term has begun."""
+        """The numbered requests; None until the term has begun."""
         return self._replicas.log
 
     @property
@@ -98,18 +102,18 @@ class Sequencer:
 
     @property
     def joined(self) -> list[int]:
-        """The replicas that apply what is sent to them."""
+        """The replicas that apply requests."""
         return [replica for replica, peer in self._peers.items() if peer.joined]
 
     @property
     def stranded(self) -> bool:
-        """Whether replicas answer, and none of them can be brought to the present state."""
+        """Whether replicas answer, but none of them can reach the current state."""
         phases = [peer.phase for peer in self._peers.values()]
         return Phase.CLAIMED in phases and Phase.ASKED not in phases and not self.ready
 
     @property
     def due(self) -> bool:
-        """Whether the owner has something to do at once: to send, or to end the term."""
+        """Whether the owner must act at once: send orders, or end the term."""
         ends = self.deposed_by is not None or self.handover is not None
         return ends or self._replicas.sends or self._change_to is not None
 
@@ -123,7 +127,7 @@ class Sequencer:
         return index
 
     def abandon(self, index: int) -> None:
-        """Nobody waits for the answer to this number any more. It is applied all the same."""
+        """Note that nobody waits for this number's answer any more. It is still applied."""
         self._unanswered.pop(index, None)
 
     def reach(
@@ -134,11 +138,12 @@ class Sequencer:
         versions: Mapping[int, str] | None = None,
         leaving: Iterable[int] = (),
     ) -> None:
-        """Set which replicas can be sent to, and what each runs; new ones are claimed."""
+        """Set the reachable replicas and their versions; new ones are claimed."""
         wanted = set(replicas)
         self._versions, self._leaving = versions or {}, frozenset(leaving)
         for replica in [r for r in self._peers if r not in wanted]:
             del self._peers[replica]
+            self._fenced.pop(replica, None)
             self._gave_no_checkpoint(replica)
         for replica in sorted(wanted - self._peers.keys()):
             self._peers[replica] = Peer()
@@ -155,7 +160,8 @@ class Sequencer:
             self._replicas.donor = None
 
     def tick(self, now: float) -> None:
-        """Do what is due: claim again, send what is missing, ask for a checkpoint."""
+        """Do what is due: claim again, send missing requests, request a checkpoint."""
+        self._look_whom_most_obey()
         if self.deposed_by is not None:
             return
         for replica, peer in self._peers.items():
@@ -236,6 +242,9 @@ class Sequencer:
             self.handover = Handover(self._change_to, Position(self.epoch, index), state)
 
     def _promised(self, replica: int, peer: Peer, promise: Promise) -> None:
+        if promise.position.epoch > self.epoch:
+            raise OrderError(f"a promise in the later term {promise.position.epoch:x}")
+        self._fenced.pop(replica, None)
         if promise.position.epoch != self.epoch:
             peer.member = False
             if peer.joined:
@@ -281,12 +290,10 @@ class Sequencer:
     def refused(
         self, replica: int, op: Op, index: int, reason: Refusal, now: float, *, detail: str = ""
     ) -> None:
-        """Take a refusal, or the loss of an order: the replica may or may not have obeyed it."""
+        """Take a refusal or the loss of an order, which the replica may have carried out."""
         epoch = orders.read_epoch(detail) if reason is Refusal.FENCED else None
         if epoch is not None and epoch > self.epoch:
-            self.deposed_by = max(epoch, self.deposed_by or 0)
-            self._replicas.take()
-            return
+            self._fenced[replica] = epoch
         if reason is Refusal.HELD:
             self.held_by = detail
         peer = self._peers.get(replica)
@@ -306,9 +313,24 @@ class Sequencer:
                 peer.go_back(expected)
                 return
         peer.pause(now)
+        self._look_whom_most_obey()
+
+    def _look_whom_most_obey(self) -> None:
+        """End the term where more replicas obey a later one; one alone may lie.
+
+        Before the first number nothing is lost by it: as many are enough then.
+        """
+        others = [peer for replica, peer in self._peers.items() if replica not in self._fenced]
+        silent = any(one.phase is Phase.ASKED and one.promise is None for one in others)
+        if not self._fenced or silent:
+            return
+        obey = sum(one.promise is not None and one.phase is not Phase.UNCLAIMED for one in others)
+        if len(self._fenced) > obey or (len(self._fenced) == obey and self.log is None):
+            self.deposed_by = max(self._fenced.values())
+            self._replicas.take()
 
     def declined(self, replica: int, op: Op, index: int, now: float) -> None:
-        """An order was not taken by the link: it was not sent."""
+        """Note that the link did not accept an order, so it was not sent."""
         peer = self._peers.get(replica)
         if op is Op.SNAPSHOT:
             self._gave_no_checkpoint(replica)

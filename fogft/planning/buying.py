@@ -1,4 +1,4 @@
-"""Turn needs into launches, within surge, budget and what is offered. Pure.
+"""Turn needs into launches, within surge, budget and offers. Pure.
 
 Where a group mixes spot and on-demand, its first `base` replicas are on demand and the rest
 spot, besides on-demand ones that stand in (`fallback`).
@@ -21,10 +21,9 @@ from fogft.model.groups import Group, group_of, is_stand_in, replica_hash
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
-from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
 from fogft.planning.classification import Classification
-from fogft.planning.listing import Listing, catalogue
+from fogft.planning.listing import Listing, Scale, catalogue
 from fogft.planning.needs import Need
 from fogft.planning.observed.backoff import (
     EVERYWHERE,
@@ -52,7 +51,7 @@ class PlannedLaunch(NamedTuple):
 
 @dataclass
 class Buyer:
-    """Buys one launch after the other.
+    """Plans launches one by one.
 
     Args:
         groups: The pool's, as they are sized.
@@ -92,7 +91,7 @@ class Buyer:
             spent += launch.offer.usd_per_hour
         return spent
 
-    @property
+    @cached_property
     def _backing_off(self) -> Mapping[str, Backoff]:
         return backing_off(self.history, self.observed.now)
 
@@ -102,7 +101,7 @@ class Buyer:
 
     @property
     def budget(self) -> float | None:
-        """What one more machine may cost now; None for any price."""
+        """The most that one more machine may cost now; None for no limit."""
         return None if self.cap is None else self.cap - self._spent
 
     def buy(self, need: Need, room: int) -> bool:
@@ -144,7 +143,7 @@ class Buyer:
         return False
 
     def market(self, group: Group, spot: bool | None, *, at_leisure: bool = False) -> Market:
-        """Return what is sold to a group: of one kind only unless `spot` is None.
+        """Return the offers for a group, spot or on-demand only unless `spot` is None.
 
         Args:
             at_leisure: For one that need not be launched: nothing that refused lately is in it.
@@ -193,18 +192,18 @@ class Buyer:
         return hazards(self.history, self.observed.now)
 
     def losses_per_hour(self, placement: Placement) -> float:
-        """Return how often machines of a place are lost; on demand, never."""
+        """Return the loss rate of a placement's machines; 0 on demand."""
         return self.hazards.get(placement.location, UNKNOWN) if placement.spot else 0.0
 
     def score(self, placement: Placement, usd_per_hour: float) -> float:
-        """Return the score of a place: price, distance and losses. Lower is better."""
+        """Return the score of a placement: price, distance and losses. Lower is better."""
         found = self.scale.score_of(usd_per_hour, self.scale.latency(placement))
         if placement.spot:
             found += penalty(self.losses_per_hour(placement)) - penalty(UNKNOWN)
         return found
 
     def whole_market(self, group: Group, spot: bool | None) -> Market:
-        """Return what is sold to a group where nothing backs off."""
+        """Return the offers for a group as if no location were backing off."""
         key = (group.name, spot)
         if key not in self._whole:
             self._whole[key] = Market(self._listing(group, spot), hazards=self.hazards)
@@ -229,7 +228,7 @@ class Buyer:
         return self._market(group, spot, backing_off, self._full(group) if spot else ())
 
     def kind(self, group: Group, without: Assessment | None) -> bool | None:
-        """Return whether a group's next machine is spot (True); None where it does not matter.
+        """Return whether a group's next machine is spot (True); None if either will do.
 
         Args:
             group: Whose.
@@ -248,13 +247,13 @@ class Buyer:
         return on_demand >= group.on_demand.base
 
     def places(self, without: Assessment | None) -> list[Placement]:
-        """Return where our replicas are and will be."""
+        """Return the current and planned placements of the replicas."""
         stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
         taken = [s.placement for s in stay]
         return taken + [launch.offer.placement for launch in self.launches]
 
     def price(self, replica: Assessment) -> float:
-        """Return what a machine costs: today's price where that is known, else as ordered."""
+        """Return a machine's price: today's if known, else that of its order."""
         group = group_of(self.groups, replica.slot).name
         return self._catalogue.today.get((group, replica.placement), replica.machine.usd_per_hour)
 
@@ -278,11 +277,12 @@ class Buyer:
 
     def _make_room(self, need: Need, cap: float) -> None:
         """Under a cap, a silent machine that blocks its own replacement goes first."""
-        left = cap - self._spent + sum(self.price(s) for s in self.machines.ending)
+        going = [*self.machines.ending, *(s for s, _ in self.ended_for_room)]
+        left = cap - self._spent + sum(map(self.price, going))
         if self._choose(need, left)[0].offer is not None:
             return  # what is being ended already makes room enough
         for replica in self.machines.lost:
-            if replica.verdict is not Verdict.UNRESPONSIVE:
+            if replica.verdict is not Verdict.UNRESPONSIVE or replica in going:
                 continue
             if self._choose(need, left + self.price(replica))[0].offer is not None:
                 full = Reason(Cause.BUDGET_FULL, because=because(replica.why))

@@ -1,4 +1,4 @@
-"""Sort every machine into what it is to the pool: kept, to be replaced, or lost. Pure.
+"""Classify every machine of a pool: kept, to be replaced, or lost. Pure.
 
 Owns: why a working replica is not wanted as it is.
 Not here: health (`health`), and moving those that could be better placed (`migration`).
@@ -26,7 +26,7 @@ _DOUBTED = (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES)
 
 @dataclass
 class Classification:
-    """Every machine of the pool, by what it is to the pool.
+    """Every machine of the pool, by class.
 
     Attributes:
         good: Serve or will serve.
@@ -54,13 +54,13 @@ class Classification:
         return itertools.chain(*self._kinds)
 
     def without(self, others: Collection[Assessment]) -> Classification:
-        """Return the same without some of those that work."""
+        """Return a copy without some of the working machines."""
         good = [s for s in self.good if s not in others]
         replaced = [s for s in self.replaced if s not in others]
         return replace(self, good=good, replaced=replaced)
 
     def part(self, groups: Sequence[Group], group: Group) -> Classification:
-        """Return the part that counts for a group; it is not to be changed."""
+        """Return the part of a group; it must not be changed."""
         if len(groups) == 1:
             return self
         kinds = ([s for s in kind if group_of(groups, s.slot) is group] for kind in self._kinds)
@@ -85,7 +85,7 @@ def classify(
     health: Health,
     size: Size,
 ) -> Classification:
-    """Sort every machine of the pool."""
+    """Classify every machine of the pool."""
     machines = Classification()
     failed = Verdict.FAILED
     blocks = {group.block for group in size.groups}

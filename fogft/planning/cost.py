@@ -1,4 +1,4 @@
-"""What a pool costs an hour and a month, with what leaves the cloud. Pure arithmetic.
+"""The cost of a pool per hour and month, egress included. Pure arithmetic.
 
 Clouds charge for what leaves them, so for responses: one from each replica that is asked,
 the late ones included. Requests come in for nothing.
@@ -46,14 +46,14 @@ class Cost:
 
 
 def cost(offers: Sequence[Offer], services: Iterable[ServiceSpec]) -> Cost:
-    """Return what replicas cost that carry these services, an offer each."""
+    """Return the cost of replicas (an offer each) that run these services."""
     machines = sum(offer.usd_per_hour - offer.egress_usd_per_hour for offer in offers)
     each = egress_bytes_per_s(services, len(offers)) * 3600 / GB
     return Cost(machines, sum(each * egress_price(offer.placement.cloud) for offer in offers))
 
 
 def egress_bytes_per_s(services: Iterable[ServiceSpec], replicas: int) -> float:
-    """Return what leaves one of so many replicas."""
+    """Return the egress of one of this many replicas."""
     return sum(
         one.traffic.requests_per_s * one.traffic.response_bytes * _share(one, replicas)
         for one in services
@@ -61,7 +61,7 @@ def egress_bytes_per_s(services: Iterable[ServiceSpec], replicas: int) -> float:
 
 
 def egress_price(cloud: str) -> float:
-    """Return what a cloud charges for a GB that leaves it, in US dollars."""
+    """Return a cloud's egress price for a GB, in US dollars."""
     return EGRESS_USD_PER_GB.get(cloud, UNKNOWN_EGRESS_USD_PER_GB)
 
 

@@ -26,7 +26,7 @@ DRAIN_SETTLE_S = 2.0
 
 @dataclass
 class Endings:
-    """Who ends now, who is marked, and what is worth saying."""
+    """The machines to end and to mark now, with notes."""
 
     now: list[tuple[Assessment, Reason]] = field(default_factory=list)
     draining: list[Assessment] = field(default_factory=list)
@@ -34,11 +34,11 @@ class Endings:
 
     @property
     def ids(self) -> set[ReplicaId]:
-        """Those that end now."""
+        """The machines to end now."""
         return {s.id for s, _ in self.now}
 
     def add(self, other: Endings) -> None:
-        """Take in another group's."""
+        """Add another group's endings."""
         self.now += other.now
         self.draining += other.draining
         self.notes += other.notes
@@ -58,7 +58,7 @@ def choose_endings(
     standing_in: Sequence[Assessment] = (),
     spare: int = 0,
 ) -> Endings:
-    """Choose who ends of those that are lost, replaced or too many.
+    """Choose which lost, replaced and surplus machines end.
 
     Args:
         standing_in: On-demand machines that serve for others, and are not among `machines`.

@@ -1,4 +1,4 @@
-"""Explain a plan: what was considered, what was chosen, and why everything else was not. Pure.
+"""Explain a plan: the offers considered, those chosen, and why others were not. Pure.
 
 The pool is planned by the planner itself, from nothing; then each offer that was not chosen
 is held against each that was, and the comparison that it lost last is told: an offer that
@@ -19,12 +19,11 @@ from fogft.model.groups import group_of, groups_of
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, Offer, Placement
-from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
 from fogft.planning.availability import Expected, expected, full_together, unavailability_of
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
-from fogft.planning.listing import is_possible
+from fogft.planning.listing import Scale, is_possible
 from fogft.planning.observed.backoff import EVERYWHERE, backing_off
 from fogft.planning.observed.hazard import UNKNOWN, hazards
 from fogft.planning.observed.history import History
@@ -38,7 +37,7 @@ LATELY_S = 4 * 3600.0
 
 @dataclass(frozen=True)
 class Considered:
-    """An offer, and what became of it.
+    """An offer, and why it was chosen or not.
 
     Attributes:
         slots: The replicas that got it; none for not chosen.
@@ -60,7 +59,7 @@ class Considered:
 
 @dataclass(frozen=True)
 class Replica:
-    """One that would be launched."""
+    """A replica that would be launched."""
 
     slot: int
     group: str
@@ -99,7 +98,7 @@ class Explanation:
 
     @property
     def is_cheapest(self) -> bool | None:
-        """Whether the pool, and no single on-demand machine, is the cheapest that does.
+        """Whether the pool is cheaper than one on-demand machine for its target.
 
         What does reaches the target; where there is none, what the pool is expected to be. None
         where neither does, or a price is not known.
@@ -128,7 +127,7 @@ def explain(
     *,
     recovery_s: float | None = None,
 ) -> Explanation:
-    """Plan a pool from nothing, and say why.
+    """Plan a pool from scratch, and explain the plan.
 
     Args:
         spec: The pool file.

@@ -1,4 +1,4 @@
-"""On-demand machines beside the search for spot ones, while too few are ready. Pure.
+"""On-demand machines that fill in while too few spot machines are ready. Pure.
 
 What counts is readiness: whether enough replicas serve, not whether every location refused.
 Where a group has `fallback`, on-demand machines in slots of their own stand in. They are ordered
@@ -34,12 +34,12 @@ OFTEN_S = 3600.0
 
 
 def stand_ins(machines: Classification) -> list[Assessment]:
-    """Return the machines that stand in for others, and are not lost."""
+    """Return the stand-ins that are not lost."""
     return [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
 
 
 def held(group: Group, wanted: int, history: History, now: float) -> int:
-    """Return how many stand-ins serve in place of spot machines, which are then not looked for.
+    """Return how many stand-ins replace spot machines, for which no search is made then.
 
     One, where each spot machine beside it would be lost `OFTEN` within `OFTEN_S`. None in place of
     a lone one: that would be to give up spot machines.
@@ -51,7 +51,7 @@ def held(group: Group, wanted: int, history: History, now: float) -> int:
 
 
 def losses_of_late(history: History, now: float) -> list[float]:
-    """Return when machines were lost of which `held` speaks."""
+    """Return the times of the losses that `held` counts."""
     return [
         at
         for losses in history.losses.values()
@@ -60,12 +60,12 @@ def losses_of_late(history: History, now: float) -> list[float]:
 
 
 def is_safe(machines: Classification) -> bool:
-    """Whether somebody serves whom nobody takes away."""
+    """Whether a replica serves that cannot be preempted."""
     return any(s.serving and not s.placement.spot for s in (*machines.good, *machines.replaced))
 
 
 def is_first(slot: int, generation: int, history: History, *, safe: bool) -> bool:
-    """Whether a spot machine stands for itself: the first of its slot, or since it last served."""
+    """Whether a spot machine is the first of its slot, or the first since that last served."""
     return generation == (history.served(slot) if safe else 0) + 1
 
 
@@ -77,7 +77,7 @@ def missing(
     *,
     safe: bool,
 ) -> int:
-    """Return how many more stand-ins are called for.
+    """Return how many more stand-ins are needed.
 
     Args:
         wanted: How many replicas should be ready.
@@ -120,7 +120,7 @@ def _racing(wanted: int, standing_in: Sequence[Assessment]) -> int:
 
 
 def has_served(replica: Assessment, for_s: float, now: float) -> bool:
-    """Whether one serves, and was first ready so long ago."""
+    """Whether a replica serves, and was first ready at least this long ago."""
     record = replica.record
     if not replica.serving or record is None or record.first_ready_at is None:
         return False

@@ -1,4 +1,4 @@
-"""When a pool ends by itself, because its file says for how long it may run. Pure.
+"""When a pool shuts down because of `max_hours`. Pure.
 
 Nothing is written when the time has come: every tick finds it out anew, so no manager can
 forget it, and a file with a larger `max_hours` gives more time to one that still runs.
@@ -18,7 +18,7 @@ SOON_S = 600.0
 
 
 def begun_at(intent: Intent, created_at: float, history: History) -> float:
-    """Return when a pool's hours began, as the clock that may have been set since tells it.
+    """Return when a pool's `max_hours` began, by today's clock, which may have been set since.
 
     Args:
         intent: Says whether its hours began anew after its creation.
@@ -29,29 +29,29 @@ def begun_at(intent: Intent, created_at: float, history: History) -> float:
 
 
 def ends_at(spec: PoolSpec, begun_at: float) -> float | None:
-    """Return when a pool ends by itself, in seconds since the epoch; None for never."""
+    """Return when `max_hours` ends a pool, in seconds since the epoch; None for never."""
     return None if spec.max_hours is None else begun_at + spec.max_hours * HOUR_S
 
 
 def unmanaged_s(spec: PoolSpec, begun_at: float, now: float) -> float:
-    """Return for how long replicas may serve without a manager, beginning now, in seconds."""
+    """Return how long replicas may serve without a manager from now on, in seconds."""
     lasts_s, end = spec.unmanaged_max_hours * HOUR_S, ends_at(spec, begun_at)
     return lasts_s if end is None else max(0.0, min(lasts_s, end - now))
 
 
 def is_over(spec: PoolSpec, begun_at: float, now: float) -> bool:
-    """Whether a pool's hours are used up."""
+    """Whether a pool's `max_hours` have passed."""
     end = ends_at(spec, begun_at)
     return end is not None and now >= end
 
 
 def revived(spec: PoolSpec, intent: Intent, begun_at: float, now: float) -> Intent:
-    """Return the intent with which an `up` goes on: hours that are used up begin anew."""
+    """Return the intent after an `up`: hours that have passed start again."""
     return replace(intent, began_at=now) if is_over(spec, begun_at, now) else intent
 
 
 def notes(spec: PoolSpec, begun_at: float, now: float) -> list[Reason]:
-    """Return what to say about the end: nothing, that it is near, or that it has come."""
+    """Return notes on `max_hours`: nothing, that the end is near, or that it has come."""
     end = ends_at(spec, begun_at)
     if end is None or now < end - SOON_S:
         return []

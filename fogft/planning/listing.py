@@ -1,4 +1,10 @@
-"""Offers in the order in which they are preferred, worked out once for many plans. Pure.
+"""Offers in order of preference, computed once for many plans. Pure.
+
+    score = ln(usd_per_hour) + weight * ln(round trip)
+
+The lower the better. In logarithms only ratios count: with equal weights, half the price
+makes up for twice the round trip. So the order of two offers depends on those two alone,
+never on what else is offered, and a margin of hysteresis is a percentage.
 
 Thousands of offers take longer to sort than a whole plan takes, and they change with the prices,
 not with the plans. So the last tuple of offers keeps what was worked out of it, by question. The
@@ -12,20 +18,60 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
 from typing import NamedTuple
 
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement, supply
-from fogft.model.scoring import Scale
+
+# Below these, less no longer matters.
+PRICE_FLOOR_USD = 0.001
+LATENCY_FLOOR_S = 0.010
+# A region nobody has measured is taken for one on another continent.
+UNKNOWN_RTT_S = 0.150
+
+
+@dataclass(frozen=True)
+class Scale:
+    """The weight of round trips, and known ones by ``cloud/region``, in seconds."""
+
+    weight: float = 1.0
+    rtt_s: Mapping[str, float] = field(default_factory=dict)
+
+    def latency(self, placement: Placement) -> float | None:
+        """Return the round trip to a placement's region in seconds; None if it is not known."""
+        return self.rtt_s.get(f"{placement.cloud}/{placement.region}")
+
+    def score(self, offer: Offer) -> float:
+        """Return an offer's score; lower is better."""
+        return self.score_of(offer.usd_per_hour, self.latency(offer.placement))
+
+    def score_of(self, usd_per_hour: float, rtt_s: float | None) -> float:
+        """Return the score of a price and a round trip (None: not known)."""
+        return self.of_price(usd_per_hour) + self.of_distance(rtt_s)
+
+    def of_price(self, usd_per_hour: float) -> float:
+        """Return a price's part of the score."""
+        return math.log(max(usd_per_hour, PRICE_FLOOR_USD))
+
+    def of_distance(self, rtt_s: float | None) -> float:
+        """Return a round trip's part of the score."""
+        known = UNKNOWN_RTT_S if rtt_s is None else rtt_s
+        return self.weight * math.log(max(known, LATENCY_FLOOR_S))
+
+
+def gain(before: float, after: float) -> float:
+    """Return how much better a score is, as a fraction in (-inf, 1): 0.3 is 30 % less."""
+    return 1.0 - math.exp(after - before)
+
 
 without_offer = itemgetter(slice(0, 7))
 
 
 class Row(NamedTuple):
-    """An offer with what its rank is made of, in the order that decides between equals.
+    """An offer with its rank; fields are in tie-breaking order.
 
     Attributes:
         supply: See `Placement.supply`.
@@ -44,7 +90,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Listing:
-    """The cheapest offer of each supply, the best score first: no other one is ever chosen.
+    """The cheapest offer of each supply, best score first; no other is ever chosen.
 
     Attributes:
         trouble: Why there is no row; None where there is one.
@@ -65,7 +111,7 @@ class Listing:
 
 
 class Catalogue:
-    """What one tuple of offers says, by question."""
+    """An index of one tuple of offers."""
 
     def __init__(self, offers: Sequence[Offer]) -> None:
         self.offers = offers
@@ -82,7 +128,7 @@ class Catalogue:
 
     @cached_property
     def impossible(self) -> str:
-        """The location of an offer whose price cannot be; empty for none."""
+        """The location of an offer with an invalid price; empty for none."""
         wrong = (o.placement.location for o in self.offers if not is_possible(o))
         return next(wrong, "")
 
@@ -113,7 +159,7 @@ _latest = Catalogue(())
 
 
 def catalogue(offers: Sequence[Offer]) -> Catalogue:
-    """Return the catalogue of some offers: the one made last where it is of this very tuple."""
+    """Return the catalogue of some offers; the last one is cached."""
     global _latest  # noqa: PLW0603 - a memory of one pure result; see the module's header
     if _latest.offers is not offers or not isinstance(offers, tuple):
         _latest = Catalogue(offers)
@@ -121,7 +167,7 @@ def catalogue(offers: Sequence[Offer]) -> Catalogue:
 
 
 def is_possible(offer: Offer) -> bool:
-    """Whether an offer's price can be true: a finite number, not below zero."""
+    """Whether an offer's price is valid: a finite number, not below zero."""
     return math.isfinite(offer.usd_per_hour) and offer.usd_per_hour >= 0
 
 

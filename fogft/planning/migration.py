@@ -1,4 +1,4 @@
-"""Move a replica to where it would be launched today, if that is much better. Pure.
+"""Move a replica to where it would be launched today if that is much better. Pure.
 
 Only a pool that is whole and quiet moves anything, one replica at a time, the new one first.
 A replica moves when
@@ -25,9 +25,9 @@ from dataclasses import dataclass
 from fogft.model.groups import group_of
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
-from fogft.model.scoring import gain
 from fogft.planning.buying import Buyer
 from fogft.planning.classification import Classification
+from fogft.planning.listing import gain
 from fogft.planning.observed.health import Assessment, Health
 from fogft.planning.placement import Choice, Crowd, crowding
 
@@ -36,7 +36,7 @@ TOO_OFTEN = 1.0
 
 
 def is_quiet(machines: Classification, health: Health) -> bool:
-    """Whether nothing else is to be done: all are good and serve, and can be heard."""
+    """Whether nothing else is pending: all replicas are healthy, serve and can be reached."""
     busy = (
         machines.replaced or machines.lost or machines.failed or machines.aborted or machines.ending
     )
@@ -58,7 +58,7 @@ class Move:
 
 
 def restless(buyer: Buyer) -> frozenset[ReplicaId]:
-    """Return who would move if no location backed off, and all had stayed.
+    """Return the replicas that would move if no location backed off and none had moved lately.
 
     Nobody else moves before something happens, however long that takes: what a location that
     backs off no longer sells has been in question already. Neither time nor events come into it, so
@@ -93,7 +93,7 @@ def _would_move(buyer: Buyer, replica: Assessment) -> bool:
 
 
 def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | None:
-    """Return the replica that should move; None when all are well where they are.
+    """Return the replica that should move; None if none should.
 
     The pool is quiet. The one that gains most goes first.
     """

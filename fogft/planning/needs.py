@@ -1,4 +1,4 @@
-"""Which launches are called for: what is missing at once, replacements one at a time. Pure.
+"""Which launches are needed: missing replicas at once, replacements one at a time. Pure.
 
 Owns: slots and reasons of launches.
 Not here: where they go and whether they can be paid (`buying`).
@@ -18,7 +18,7 @@ from fogft.planning.observed.history import History
 
 
 class Need(NamedTuple):
-    """One launch that is called for.
+    """A launch that is needed.
 
     Attributes:
         replaces: Whom it replaces; None to fill an empty slot.
@@ -40,7 +40,7 @@ def needed_launches(
     *,
     settling: bool = False,
 ) -> list[Need]:
-    """Return the launches called for, over all groups.
+    """Return the launches needed, over all groups.
 
     Args:
         settling: A newcomer has yet to prove itself: no further one is replaced meanwhile.

@@ -6,7 +6,7 @@ the fewest of our replicas wins; among those the one with the lowest score; amon
 the cheaper one; among those the first by name.
 
 Owns: the rank of an offer and the reason when none is left.
-Not here: the order within a rank (`listing`, `model.scoring`), how long a location is avoided
+Not here: the order within a rank (`listing`), how long a location is avoided
 (`observed.backoff`) and how many are needed (`planner`).
 """
 
@@ -18,8 +18,7 @@ from typing import NamedTuple
 
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
-from fogft.model.scoring import Scale
-from fogft.planning.listing import Listing, Row, catalogue, without_offer
+from fogft.planning.listing import Listing, Row, Scale, catalogue, without_offer
 from fogft.planning.observed.backoff import EVERYWHERE, Backoff
 from fogft.planning.observed.hazard import UNKNOWN, penalty
 
@@ -29,7 +28,7 @@ Rank = tuple[bool, int, int, int]
 
 
 class Choice(NamedTuple):
-    """An offer, or none and why not.
+    """The chosen offer, or the reason for none.
 
     Attributes:
         rank: Of the offer: whether its location is avoided, then how many of our other
@@ -42,7 +41,7 @@ class Choice(NamedTuple):
 
 
 class Crowd(dict[str, int]):
-    """How many replicas each failure domain holds: none where it is not named."""
+    """The number of replicas in each failure domain; 0 if not listed."""
 
     def __missing__(self, domain: str) -> int:
         return 0
@@ -59,7 +58,7 @@ def crowding(taken: Iterable[Placement]) -> Crowd:
 
 
 class Market:
-    """What can be bought now, among which many choices are quick.
+    """The available offers, indexed for many choices.
 
     Args:
         listing: What is sold, in order.
@@ -114,7 +113,7 @@ class Market:
         avoid: Collection[str] = (),
         budget_usd_per_hour: float | None = None,
     ) -> Choice:
-        """Choose an offer, given where our other replicas are.
+        """Choose an offer, given the placements of the other replicas.
 
         Args:
             taken: Where the replicas that stay are, or how many are where.

@@ -47,7 +47,7 @@ class PlannedEnd(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What to do now, and what is worth knowing.
+    """A plan: launches, endings, marks and notes.
 
     Attributes:
         draining: Replicas to mark as draining in the membership; they end a little later.
@@ -80,7 +80,7 @@ def plan(
     drain_limit_s: float = DRAIN_LIMIT_S,
     health: Health | None = None,
 ) -> Plan:
-    """Return what brings the pool closer to what is wanted, within the safety laws.
+    """Plan changes that bring the pool closer to its spec, within the safety rules.
 
     It is planned again on the world as it is once a plan is under way, until nothing is added: a
     launch makes a replica superfluous, an ending leaves another one the last of its region.

@@ -1,4 +1,4 @@
-"""The world while a plan is carried out: ordered, marked and asked to end, not yet changed. Pure.
+"""The state of a pool with a plan's launches, endings and marks already applied. Pure.
 
 It is what the manager will observe at its next tick if nothing else happens. The planner plans on
 it again, so that one plan holds all that follows from itself.
@@ -29,7 +29,7 @@ def projected_state(
     ends: Collection[ReplicaId],
     draining: Collection[ReplicaId],
 ) -> tuple[Observed, History]:
-    """Return what is observed and remembered once launches, endings and marks are ordered."""
+    """Return the observation and history with launches, endings and marks applied."""
     now = observed.now
     ordered = [_ordered(pool_uid, spec, launch, now) for launch in launches]
     events = [

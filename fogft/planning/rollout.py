@@ -1,4 +1,4 @@
-"""Carry out a changed pool file replica by replica, or give it up. Pure.
+"""Roll out a changed pool file replica by replica, or roll it back. Pure.
 
 A *version* is what a replica runs: `replica_hash` names it. The *good* file is the last one with
 which the pool was wholly ready. While another version takes its place, this judges the new
@@ -39,7 +39,7 @@ _THE_CLOUDS = (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS)
 
 
 class UpdateState(str, Enum):
-    """How far an update has come. Only IN_PROGRESS can end well."""
+    """The state of an update. Only IN_PROGRESS can succeed."""
 
     IN_PROGRESS = "in progress"
     STOPPED = "stopped"  # given up; replicas of it are still there, or good ones are missing
@@ -55,7 +55,7 @@ _NOTES = {
 
 @dataclass(frozen=True)
 class Trial:
-    """What is remembered of the file that was applied last.
+    """The trial of the last applied file.
 
     Attributes:
         file: Its cache: what is remembered holds for no other.
@@ -70,7 +70,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Update:
-    """An update, for people and programs.
+    """An update's progress, for people and programs.
 
     Attributes:
         done: Replicas of the version that is wanted now which serve.
@@ -85,17 +85,17 @@ class Update:
 
     @property
     def reason(self) -> Reason:
-        """It, as a note on the pool."""
+        """The update as a note on the pool."""
         return Reason(_NOTES[self.state], count=self.done, of=self.of, because=because(self.fault))
 
 
 def differs(spec: PoolSpec, good: PoolSpec, slots: Iterable[int]) -> bool:
-    """Whether two files give another version to any of these slots."""
+    """Whether two files differ in the version of any of these slots."""
     return any(replica_hash(spec, slot) != replica_hash(good, slot) for slot in slots)
 
 
 def is_new(spec: PoolSpec, good: PoolSpec, machine: Machine) -> bool:
-    """Whether a machine runs the new version, and the good file has another one for its slot."""
+    """Whether a machine runs the new version, unlike the last good file's."""
     wanted = replica_hash(spec, machine.id.slot)
     return machine.spec_hash == wanted != replica_hash(good, machine.id.slot)
 
@@ -103,7 +103,7 @@ def is_new(spec: PoolSpec, good: PoolSpec, machine: Machine) -> bool:
 def fault(
     spec: PoolSpec, good: PoolSpec, health: Health, history: History, began_at: float
 ) -> Reason | None:
-    """Return what proves that the new version is no good; None when nothing does.
+    """Return the proof that the new version is bad; None without one.
 
     Args:
         spec: The file that is being applied.
@@ -186,7 +186,7 @@ def _launches_fail(history: History, began_at: float) -> Reason | None:
 def is_whole(
     spec: PoolSpec, health: Health, history: History, *, wanted: int, now: float, settle_s: float
 ) -> bool:
-    """Whether all replicas that are wanted, and no others, run this file's version and serve.
+    """Whether exactly the wanted replicas run this file's version and serve.
 
     Args:
         settle_s: Each must have come to serve so long ago.
@@ -214,7 +214,7 @@ def _settles(history: History, judged: Assessment, now: float, settle_s: float) 
 def describe(
     spec: PoolSpec, good: PoolSpec | None, trial: Trial, health: Health, wanted: int
 ) -> Update | None:
-    """Return the update under way, or the one that was given up; None where there is none.
+    """Return the update in progress, or the one given up; None without one.
 
     Args:
         spec: The file in force: after a rollback the good one.
@@ -249,7 +249,7 @@ def describe(
 
 
 def is_settling(machines: Classification, now: float) -> bool:
-    """Whether a newcomer has yet to prove itself before the update goes on."""
+    """Whether the update waits for a new replica to prove itself."""
     if not any(s.is_outdated for s in machines.replaced):
         return False
     return any(
@@ -260,7 +260,7 @@ def is_settling(machines: Classification, now: float) -> bool:
 
 
 def may_go_first(replica: Assessment, machines: Classification, wanted: int) -> bool:
-    """Whether an outdated one may end before its successor exists: all others serve.
+    """Whether an outdated replica may end before its successor exists: all others serve.
 
     So at least one always answers, and never more than one is missing.
     """
@@ -272,7 +272,7 @@ def may_go_first(replica: Assessment, machines: Classification, wanted: int) -> 
 
 
 def has_room(spec: PoolSpec, usd_per_hour: float, cheapest: float) -> bool:
-    """Whether a further replica may exist while one replaces another.
+    """Whether one more replica may exist during a replacement.
 
     Args:
         usd_per_hour: What the pool costs when it is whole.

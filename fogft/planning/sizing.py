@@ -22,19 +22,17 @@ from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.schedule import Wish, wish
-from fogft.model.scoring import Scale
 from fogft.model.spec import PoolSpec
-from fogft.planning.availability import expected, full_together, unavailability_of
-from fogft.planning.listing import catalogue
+from fogft.planning.availability import expected, full_together, replicas_needed, unavailability_of
+from fogft.planning.listing import Scale, catalogue
 from fogft.planning.placement import Market
-from fogft.planning.reliability import replicas_needed
 
 # Where a target is out of reach, no replica is had that would take away less of the outages.
 MUCH_THE_SAME = 1.1
 
 
 class Size(NamedTuple):
-    """What is wanted.
+    """The wanted number of replicas, and the cap.
 
     Attributes:
         groups: In the order of their slots.
@@ -50,12 +48,12 @@ class Size(NamedTuple):
 
     @property
     def total(self) -> int:
-        """How many replicas are wanted together."""
+        """The wanted number of replicas in all groups."""
         return sum(self.counts)
 
 
 def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -> Size:
-    """Return how many replicas are wanted of each group, and the cap.
+    """Return the wanted number of replicas of each group, and the cap.
 
     Args:
         spec: The pool file.
@@ -83,7 +81,7 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
 
 
 def spot_sold(spec: PoolSpec, intent: Intent, observed: Observed) -> list[Placement]:
-    """Return a placement of each location that sells spot machines, where nothing stands in."""
+    """Return a placement in each location with spot offers, if nothing fills in."""
     groups = groups_of(spec)
     if any(group.on_demand.fallback for group in groups):
         return []
@@ -103,7 +101,7 @@ def layout(
     markets: Markets,
     cap: float | None,
 ) -> list[tuple[Group, Offer]]:
-    """Return where a pool's replicas would go if it started from nothing, as far as offers go."""
+    """Return the placements of a pool started from scratch, as far as offers allow."""
     out: list[tuple[Group, Offer]] = []
     for group, count in zip(groups, counts, strict=True):
         for mine in range(count):
@@ -117,7 +115,7 @@ def layout(
 
 
 class Markets:
-    """The offers of each group, apart by spot and on-demand where the group tells them apart."""
+    """The offers of each group, split into spot and on-demand if the group distinguishes them."""
 
     def __init__(self, offers: Sequence[Offer], scale: Scale, excluded: Iterable[str]) -> None:
         self._catalogue = catalogue(offers)
@@ -133,7 +131,7 @@ class Markets:
         *,
         on_demand: bool,
     ) -> Offer | None:
-        """Return the offer that a group's next replica would get; None if there is none."""
+        """Return the offer for a group's next replica; None without one."""
         kinds: tuple[bool | None, ...] = (None,)
         if group.on_demand.base or group.on_demand.fallback:
             kinds = (False,) if on_demand else (True, False)

@@ -1,4 +1,4 @@
-"""A pool's life: the manager, the commands, its folder and its credentials.
+"""Pools: the manager, the commands, the folder and the credentials.
 
 Not here: what to launch or end (`fogft.planning`), requests (`fogft.proxy`).
 """

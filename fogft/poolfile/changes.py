@@ -1,4 +1,4 @@
-"""What a changed pool file changes, in words. Pure."""
+"""The differences between two pool files, in words. Pure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A process's configuration file: written and read by the table that describes it."""
+"""A process's configuration file, written and read by the table of its keys."""
 
 from __future__ import annotations
 

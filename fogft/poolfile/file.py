@@ -15,12 +15,12 @@ MAX_BYTES = 1 << 20
 
 
 def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
-    """Return what a pool file asks for. Its `workdir`, relative to its own folder, must exist."""
+    """Return the spec in a pool file. Its `workdir`, relative to its own folder, must exist."""
     return parse(read_text(path), str(path), checks, Path(path).parent)
 
 
 def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
-    """Return all that is wrong in a pool file, by line; only the first where it is not YAML."""
+    """Return all mistakes in a pool file, by line; only the first if it is not YAML."""
     checks = replace(checks, workdir=partial(_no_folder, path.parent))
     try:
         return mistakes_in(yaml_tree.tree(read_text(path), str(path)), str(path), checks)
@@ -31,7 +31,7 @@ def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
 def parse(
     source: str, file: str, checks: Checks = UNCHECKED, folder: Path | None = None
 ) -> PoolSpec:
-    """Return what the text of a pool file asks for.
+    """Return the spec in a pool file's text.
 
     Args:
         file: Its name, for messages; its stem names the pool where the text does not.
@@ -45,7 +45,7 @@ def parse(
 
 
 def read_text(path: Path | str) -> str:
-    """Return a pool file's text, as it stands on disk but for a byte order mark."""
+    """Return a pool file's text without a byte order mark."""
     try:
         with open(path, "rb") as file:
             raw = file.read(MAX_BYTES + 1)
@@ -77,7 +77,7 @@ def _no_folder(base: Path, workdir: str) -> str | None:
         if folder.is_dir():
             return None
     except (OSError, ValueError, RuntimeError) as error:
-        return f"`{workdir}` cannot be looked at: {error}"
+        return f"`{workdir}` cannot be read: {error}"
     return f"there is no folder `{folder}`; a relative path begins at the pool file's own folder"
 
 

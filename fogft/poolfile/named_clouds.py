@@ -1,4 +1,4 @@
-"""What the resources of a pool file say of clouds and places, and where in the file."""
+"""Clouds and places named in a pool file's resources, with their lines."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from fogft.poolfile.tree import below, nearest
 
 
 def located(error: SpecError, source: str, file: Path) -> SpecError:
-    """Return a cloud's complaint about a key with the file and the line that it is about."""
+    """Return a cloud's error about a key, with its file and line."""
     path = re.findall(r"[^.\[\]]+", error.key)
     root = yaml_tree.tree(source, str(file))
-    node = below(root, [int(part) if part.isdigit() else part for part in path])
+    node = below(root, [int(part) if part.isdecimal() else part for part in path])
     line = node.key_line
     message = f"{file}:{line}: {error.message}"
     return SpecError(message, error.hint, key=error.key, what=error.what, line=line)
 
 
 def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) -> str | None:
-    """Return the cloud adapter that a pool file's resources ask for; None where they name no cloud.
+    """Return the cloud adapter for a pool file's resources; None if they name no cloud.
 
     Args:
         spec: The pool file, which is read from `source`, the text of `file`.
@@ -41,7 +41,7 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
         listed = " and ".join(f"`{cloud}`" for cloud in sorted(by_adapter.values()))
         problem = SpecError.of_key(
             "resources",
-            f"{listed} cannot be in one pool",
+            f"{listed} cannot be combined in one pool",
             "name real clouds only; `--cloud local` tries their regions on this machine",
         )
         raise located(problem, source, file)
@@ -49,7 +49,7 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
 
 
 def clouds_named(spec: PoolSpec) -> list[str]:
-    """Return the clouds that a pool file's resources name, sorted; none where any will do."""
+    """Return the clouds that a pool file's resources name, sorted; none if any will do."""
     return sorted({cloud for cloud, _ in _named_in(spec)})
 
 
@@ -75,7 +75,7 @@ def _named(resources: Any, key: str) -> Iterator[tuple[str, str]]:
 
 
 def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield every alternative of a section, each whole, with its key."""
+    """Yield every alternative of a section, complete, with its key."""
     base = {k: v for k, v in resources.items() if k not in ("any_of", "ordered")}
     found = [
         (f"resources.{key}[{index}]", entry)
@@ -99,6 +99,6 @@ def place(entry: Mapping[str, Any]) -> tuple[str, str, str]:
 
 
 def sells(entry: Mapping[str, Any], cloud: str, region: str, zone: str) -> bool:
-    """Whether a place is one that an alternative names, or any."""
+    """Whether an alternative allows a place."""
     there = (cloud.lower(), region.lower(), zone.lower())
     return all(asked in ("", own) for asked, own in zip(place(entry), there, strict=True))

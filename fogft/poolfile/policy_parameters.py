@@ -1,4 +1,4 @@
-"""A service's policy as parameters, and what setting one makes of it. Pure.
+"""A service's policy as ROS parameters. Pure.
 
 A value is judged by the pool file's own reader, so a parameter can bring about nothing that a
 pool file could not.
@@ -26,12 +26,12 @@ _ADVANCED = frozenset(entry.name for entry in keys_of(ServiceSpec) if entry.key.
 
 
 def prefix(service: str) -> str:
-    """Return what a service's parameters begin with: ``/arm/plan`` has ``arm.plan``."""
+    """Return the prefix of a service's parameters: ``arm.plan`` for ``/arm/plan``."""
     return service.strip("/").replace("/", ".")
 
 
 def shown(spec: ServiceSpec) -> dict[str, Value]:
-    """Return a service's policy by key, as parameters show it."""
+    """Return a service's policy as parameters, by key."""
     if spec.part is not Part.NONE:
         return {"timeout_s": spec.timeout_s}
     unfit: Sequence[str] = NOT_WITH_QUORUM if spec.quorum > 1 else ()
@@ -79,7 +79,7 @@ def _timeout(spec: ServiceSpec, value: Value) -> float:
 
 
 class Policies:
-    """The pool file's services, with what was set by parameters over them.
+    """The pool file's services, overridden by parameters.
 
     A value that was set holds until the pool file has another value for that key.
     """
@@ -90,7 +90,7 @@ class Policies:
         self._set: dict[str, dict[str, Value]] = {}
 
     def follow(self, specs: Iterable[ServiceSpec]) -> None:
-        """Take the pool file's services."""
+        """Set the pool file's services."""
         new = {spec.name: spec for spec in specs}
         for name, values in list(self._set.items()):
             if name not in new:
@@ -124,7 +124,7 @@ class Policies:
         self._set.update(merged)
 
     def services(self) -> tuple[ServiceSpec, ...]:
-        """Return the services as they are to be proxied."""
+        """Return the services with parameters applied."""
         return tuple(changed(s, self._set.get(name, {})) for name, s in self._file.items())
 
     def parameters(self) -> dict[str, Value]:

@@ -1,4 +1,4 @@
-"""Judge a pool file and turn it into a `PoolSpec`. Pure: the tree and the type check come in.
+"""Check a pool file and turn it into a `PoolSpec`. Pure: tree and type checks are passed in.
 
 A pool file is a SkyPilot task with a `fogft` section. Ours is checked to the last key; of
 SkyPilot's keys only the names are, and what a pool cannot do. The rest passes untouched.
@@ -31,7 +31,7 @@ def _nothing(*_: object) -> None:
 
 @dataclass(frozen=True)
 class Checks:
-    """What only this machine can tell, asked when all else is right.
+    """Checks that depend on this machine, made when all else is valid.
 
     Each returns what is wrong, None if nothing is; what to do may follow after ``; ``.
 
@@ -52,12 +52,12 @@ UNCHECKED = Checks()
 
 
 def pool_spec(root: Node, file: str, checks: Checks = UNCHECKED) -> PoolSpec:
-    """Return what a pool file asks for."""
+    """Return the spec in a pool file."""
     return _judged(root, file, checks, Mistakes())
 
 
 def mistakes_in(root: Node, file: str, checks: Checks = UNCHECKED) -> list[SpecError]:
-    """Return all that is wrong in a pool file, by line.
+    """Return all mistakes in a pool file, by line.
 
     What depends on something that is wrong is not judged: that may still be wrong then.
     """
@@ -142,7 +142,7 @@ def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
         what = f"and topics have names of {size} bytes together; {NAMES_BYTES_LIMIT} are the most"
         raise ours.error("services", what, "use shorter names, or two pools", at_key=True)
     if spec.topics and Speaks.ZENOH in (spec.rmw.robot, spec.rmw.replica):
-        what = "does not go with `rmw: zenoh`: services only pass there"
+        what = "cannot be combined with `rmw: zenoh`, which passes only services"
         raise ours.error(_topics_key(ours), what, "remove one of the two")
     return spec
 
@@ -155,7 +155,7 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
         ("on_demand", "each group has its own `on_demand`"),
     ):
         if key in ours.children:
-            raise ours.error(key, "cannot stand beside `groups`", instead, at_key=True)
+            raise ours.error(key, "cannot be combined with `groups`", instead, at_key=True)
     shared: Any = made.task.get("resources") or {}
     for section, group in zip(ours.sections("groups", ""), made.groups, strict=True):
         rules.on_demand(section.section("on_demand"), group.on_demand, group.replicas)
@@ -175,8 +175,8 @@ def _check_topology(ours: Section, services: tuple[ServiceSpec, ...], spec: Pool
         if key:
             raise ours.error(
                 "topology",
-                f"does not go with service `{service.name}`, which has `{key}`",
-                "put that service into a pool of its own: the robot must ask each replica itself",
+                f"cannot be combined with service `{service.name}`, which has `{key}`",
+                "put that service into its own pool: the robot must ask each replica itself",
             )
     if not spec.rendezvous:
         raise ours.error(
@@ -185,7 +185,7 @@ def _check_topology(ours: Section, services: tuple[ServiceSpec, ...], spec: Pool
             "add one, such as `rendezvous: [meet.example.org:7450]`",
         )
     if spec.topics:
-        what = "does not go with `topology`: gateways pass services only"
+        what = "cannot be combined with `topology`: gateways pass only services"
         raise ours.error(_topics_key(ours), what, "remove one of the two")
 
 

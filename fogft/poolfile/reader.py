@@ -1,4 +1,4 @@
-"""Read a map of keys into the dataclass that says what they are. Pure.
+"""Read a map of keys into the dataclass that describes them. Pure.
 
 The same table (`fogft.model.keys`) reads the pool file and the proxies' configuration files. The
 first mistake ends it, as one `SpecError` that begins with ``file:line: key:``.
@@ -21,7 +21,7 @@ Rule = Callable[[Section, Any], Any]
 
 
 class Reader:
-    """Reads maps; a rule judges the dataclass that was read, and may return another."""
+    """Reads maps; a rule checks the resulting dataclass, and may return another."""
 
     def __init__(self, rules: Mapping[type, Rule], mistakes: Mistakes | None = None) -> None:
         self._rules = rules
@@ -53,19 +53,19 @@ class Reader:
         return made if rule is None else rule(section, made)
 
     def maps(self, form: keys.Maps, key: str, section: Section) -> tuple[Any, ...]:
-        """Return the dataclasses that a list of maps describes, each with a name of its own."""
+        """Return the dataclasses that a list of uniquely named maps describes."""
         found: list[Any] = []
         lines: dict[str, int] = {}
         sections = section.sections(key, form.hint)
         if len(sections) > form.most:
-            raise section.error(key, f"has {len(sections)} entries", f"list {form.most} at most")
+            raise section.error(key, f"has {len(sections)} entries", f"list at most {form.most}")
         for below in sections:
             with self._mistakes.step():
                 made: Any = self.map(form.of, below)
                 name = getattr(made, "name", None)
                 if name in lines:
-                    what = f"`{name}` stands here twice (first in line {lines[name]})"
-                    raise below.error("name", what, "give each one entry")
+                    what = f"`{name}` is listed twice (first in line {lines[name]})"
+                    raise below.error("name", what, "give each only one entry")
                 if name is not None:
                     lines[name] = below.children["name"].line
                 found.append(made)
@@ -137,7 +137,7 @@ def _listed(form: keys.Listed, section: Section, key: str) -> tuple[str, ...]:
             raise section.error(key, f"has `{text}` twice", "list each of them once")
         found.append(text)
     if len(found) > form.most:
-        raise section.error(key, f"has {len(found)} entries", f"list {form.most} at most")
+        raise section.error(key, f"has {len(found)} entries", f"list at most {form.most}")
     return tuple(found)
 
 

@@ -1,4 +1,4 @@
-"""Keys that stand elsewhere, have another name, or are gone: what to write instead. Pure."""
+"""Hints for keys that were moved, renamed or removed. Pure."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _AUTOSCALE = {
         "remove it: `fogft scale` or `schedule` say how many replicas there are",
     )
 }
-_DEFAULT_IS_RIGHT = "is no key any more", "remove it: the default is right"
-_OWN_POOL = "is no key of a service", "put this service into a pool of its own, with as many"
+_DEFAULT_IS_RIGHT = "is no longer a key", "remove it: the default is right"
+_OWN_POOL = "is not a key of a service", "put this service into its own pool, with that many"
 
 
 def _renamed(name: str, instead: str = "") -> Hint:
-    return f"is called `{name}` now", f"write {instead or 'that'}"
+    return f"is now called `{name}`", f"write {instead or 'that'}"
 
 
 _HINTS: dict[type, dict[str, Hint]] = {
@@ -51,11 +51,11 @@ _HINTS: dict[type, dict[str, Hint]] = {
         "limit_s": _DEFAULT_IS_RIGHT,
     },
     AvailabilitySpec: {"correlation": _DEFAULT_IS_RIGHT},
-    PlacementSpec: {"price_weight": ("is no key any more", "set `latency_weight` in proportion")},
+    PlacementSpec: {"price_weight": ("is no longer a key", "set `latency_weight` in proportion")},
     ScheduleSpec: {"prelaunch_s": _DEFAULT_IS_RIGHT},
     StateSpec: {
         "shared": (
-            "is no key any more: a service with `state` is for one robot",
+            "is no longer a key: a service with `state` is for one robot",
             "for several robots remove `state` and let the service keep its state in a replicated "
             "store, such as etcd; docs/how-to/state.md shows how",
         )
@@ -67,22 +67,22 @@ _HINTS: dict[type, dict[str, Hint]] = {
 
 
 _VALUES: dict[tuple[type, str], str] = {
-    (HedgingMode, "adaptive"): "is called `auto` now, and is the default; write that"
+    (HedgingMode, "adaptive"): "is now called `auto`, and is the default; write that"
 }
 
 
 def value_hint(kind: type, text: str) -> str:
-    """Return what is to be said of a value that an enumeration does not have any more."""
+    """Return the hint for a removed value of an enumeration."""
     return _VALUES.get((kind, text), "")
 
 
 def hints(cls: type) -> Mapping[str, Hint]:
-    """Return what is to be said of keys that a map does not have any more, or not yet."""
+    """Return the hints for removed and future keys of a map."""
     return _HINTS.get(cls, {})
 
 
 def places(cls: type | None) -> dict[str, str]:
-    """Return where the keys are at home that do not stand in a map of this kind."""
+    """Return where keys belong that are not allowed in a map of this kind."""
     here = {entry.name for entry in keys_of(cls) if not entry.key.advanced} if cls else set()
     found: dict[str, str] = {}
     for home, where in (

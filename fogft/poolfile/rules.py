@@ -1,4 +1,4 @@
-"""What does not go with what in a pool file. Pure.
+"""Rules for combinations of keys in a pool file. Pure.
 
 Each rule judges one map after its keys were read, and may return another value for it.
 """
@@ -31,7 +31,7 @@ _LAST_REPLICA_PORT = 65535 - FIRST_BY_HAND
 
 
 def service(section: Section, made: ServiceSpec) -> ServiceSpec:
-    """Judge one of `services`."""
+    """Check one of `services`."""
     _stateful(section, made)
     _with_quorum(section, made)
     if made.cancel == made.name:
@@ -40,7 +40,7 @@ def service(section: Section, made: ServiceSpec) -> ServiceSpec:
     if made.concurrency > 1 and made.cancel:
         raise section.error(
             "concurrency",
-            "must be 1 where there is a `cancel` service: that names no request",
+            "must be 1 with a `cancel` service, which cannot name a request",
             "remove one of the two",
         )
     _fallback(section, made)
@@ -51,7 +51,7 @@ def _stateful(section: Section, made: ServiceSpec) -> None:
     """A stateful service is asked of every replica, and its first answer is the answer."""
     if made.state is None:
         return
-    what = "does not go with `state`: every replica applies every request"
+    what = "cannot be combined with `state`: every replica applies every request"
     _apart(section, made, NOT_WITH_STATE, what)
     for key, value in (("freshness", "latest"), ("advertise", Advertise.WHILE_READY.value)):
         chosen = getattr(made, key)
@@ -59,16 +59,16 @@ def _stateful(section: Section, made: ServiceSpec) -> None:
             what = f"cannot be `{value}` for a service with `state`: its requests are kept in order"
             raise section.error(key, what, "remove it")
     if made.on_timeout is OnTimeout.FALLBACK:
-        what = "cannot be `fallback` for a service with `state`: it knows none of it"
+        what = "cannot be `fallback` for a service with `state`: the fallback does not have it"
         raise section.error("on_timeout", what, "write `silent` or `empty`")
 
 
 def _with_quorum(section: Section, made: ServiceSpec) -> None:
     if made.tolerance and not section.has("quorum"):
-        what = "has no meaning here: answers are compared only with a `quorum`"
+        what = "has no effect here: answers are compared only with a `quorum`"
         raise section.error("tolerance", what, "write `quorum: 2`, or remove it")
     if section.has("quorum"):
-        what = "does not go with `quorum`: every replica is asked, and every answer counts"
+        what = "cannot be combined with `quorum`: every replica is asked, and every answer counts"
         _apart(section, made, NOT_WITH_QUORUM, what)
 
 
@@ -102,7 +102,7 @@ def _fallback(section: Section, made: ServiceSpec) -> None:
 
 
 def state_services(section: Section, made: StateSpec) -> StateSpec:
-    """Judge `state`, and give its services the types that a name alone stands for."""
+    """Check `state`, and complete the types of services given by name alone."""
     return StateSpec(
         _state_service(section, "snapshot", made.snapshot, state.SNAPSHOT_TYPE),
         _state_service(section, "restore", made.restore, state.RESTORE_TYPE),
@@ -119,30 +119,30 @@ def _state_service(section: Section, key: str, made: StateService, usual: str) -
 
 
 def topic(section: Section, made: TopicSpec) -> TopicSpec:
-    """Judge one of `topics`."""
+    """Check one of `topics`."""
     if made.origin is Origin.ROBOT and section.has("select"):
-        what = "has no meaning here: what the robot publishes comes from one place"
+        what = "has no effect here: what the robot publishes comes from one place"
         raise section.error("select", what, "remove it")
     return made
 
 
 def metrics(section: Section, made: MetricsSpec) -> MetricsSpec:
-    """Judge `metrics`."""
+    """Check `metrics`."""
     seen: set[str] = set()
     for key, endpoint in vars(made).items():
         if not endpoint:
             continue
         if endpoint in seen:
-            raise section.error(key, f"`{endpoint}` stands here twice", "give each its own port")
+            raise section.error(key, f"`{endpoint}` is used twice", "give each its own port")
         seen.add(endpoint)
     if made.replica and int(made.replica.rpartition(":")[2]) > _LAST_REPLICA_PORT:
-        what = "leaves no room: replica SLOT has this port plus SLOT, which would be above 65535"
+        what = "is too high: replica SLOT uses this port plus SLOT, which would be above 65535"
         raise section.error("replica", what, f"write a port up to {_LAST_REPLICA_PORT}")
     return made
 
 
 def schedule_zone(section: Section, made: ScheduleSpec) -> ScheduleSpec:
-    """Judge `schedule`."""
+    """Check `schedule`."""
     try:
         schedule.zone(made.time_zone)
     except ValueError:
@@ -150,13 +150,13 @@ def schedule_zone(section: Section, made: ScheduleSpec) -> ScheduleSpec:
             "time_zone",
             f"there is no time zone {shown(made.time_zone)} on this machine",
             "write a name of the IANA database, such as `America/Los_Angeles`, or `UTC`; the "
-            "Debian package `tzdata` holds the database",
+            "Debian package `tzdata` contains the database",
         ) from None
     return made
 
 
 def window(section: Section, made: WindowSpec) -> WindowSpec:
-    """Judge one of a schedule's `windows`."""
+    """Check one of a schedule's `windows`."""
     if made.replicas is None and made.max_usd_per_hour is None:
         raise section.error("replicas", "is missing, and so is `max_usd_per_hour`", "write one")
     if made.begins_s == DAY_END_S:
@@ -167,14 +167,14 @@ def window(section: Section, made: WindowSpec) -> WindowSpec:
 
 
 def on_demand(section: Section, made: OnDemandSpec, replicas: int) -> None:
-    """Judge `on_demand` among so many replicas."""
+    """Check `on_demand` against the number of replicas."""
     if made.base > replicas:
         what = f"must not be above the {replicas} replicas that there are, and is {made.base}"
         raise section.error("base", what, "write fewer, or ask for more replicas")
 
 
 def topology(section: Section, made: Topology) -> Topology:
-    """Judge `topology`: names that are known, no loop of gateways."""
+    """Check `topology`: known names, no loop of gateways."""
     if not made.gateways:
         hint = "write a list, such as `gateways: [{name: edge, endpoint: edge.example.org:7470}]`"
         raise section.error("gateways", "is missing", hint)

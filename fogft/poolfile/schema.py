@@ -1,4 +1,4 @@
-"""The pool file as a JSON Schema (draft 2020-12), by which editors complete and check. Pure.
+"""The JSON Schema (draft 2020-12) of the pool file, for completion in editors. Pure.
 
 It comes from the same table as the reader. Rules between keys are the reader's alone.
 """

@@ -1,4 +1,4 @@
-"""Judge the SkyPilot part of a pool file. Ours to check: names of keys, and what no pool can do.
+"""Check the SkyPilot part of a pool file: names of keys, and what no pool can do.
 
 Not here: what stands in SkyPilot's own keys (SkyPilot judges that).
 """
@@ -42,7 +42,7 @@ _ENV_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 def check_task(top: Section, mistakes: Mistakes) -> None:
     """Check the top level of a pool file."""
     mistakes.add(
-        top.error(key, "cannot stand in a pool file", reason, at_key=True)
+        top.error(key, "is not allowed in a pool file", reason, at_key=True)
         for key, reason in REFUSED_TASK_KEYS.items()
         if key in top.children
     )
@@ -110,4 +110,4 @@ def _envs(envs: Section) -> None:
                 at_key=True,
             )
         if node.value is None or isinstance(node.value, (tuple, dict)):
-            raise envs.error(key, "must have a text for a value", f'write `{key}: "..."`')
+            raise envs.error(key, "must have a text as its value", f'write `{key}: "..."`')

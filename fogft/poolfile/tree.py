@@ -46,7 +46,7 @@ def plain(node: Node) -> Any:
 
 
 def below(node: Node, path: Iterable[str | int]) -> Node:
-    """Return what stands at keys and indices below a node, or as far down as there is something."""
+    """Return the node at a path of keys and indices, or the deepest one that exists."""
     for part in path:
         value: Any = node.value
         known = dict(enumerate(value)) if isinstance(value, tuple) else value
@@ -57,7 +57,7 @@ def below(node: Node, path: Iterable[str | int]) -> Node:
 
 
 def tree(value: Any, line: int = 1) -> Node:
-    """Return plain lists and dictionaries as a tree: the way back of `plain`, all in one line."""
+    """Return plain lists and dictionaries as a tree, all on one line; the inverse of `plain`."""
     if isinstance(value, Mapping):
         below: Any = {str(key): tree(child, line) for key, child in value.items()}
     elif isinstance(value, (list, tuple)):
@@ -75,7 +75,7 @@ def shown(value: object, limit: int = 60) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return the hint for a word that is not one of those known."""
+    """Return the hint for an unknown word."""
     words = sorted(known)
     close = difflib.get_close_matches(word[:60], words, n=1)
     if close:
@@ -98,7 +98,7 @@ class Section:
         self.children: Mapping[str, Node] = node.value
 
     def error(self, key: str, what: str, hint: str = "", *, at_key: bool = False) -> SpecError:
-        """Return the error that a key of this section deserves, at its line or at ours."""
+        """Return the error about a key of this section, with the best known line."""
         if key not in self.children and self.has(key):
             return self.section("advanced").error(key, what, hint, at_key=at_key)
         node = self.children.get(key)
@@ -212,7 +212,7 @@ class Section:
         return by_value[text]
 
     def below(self, key: str, children: Mapping[str, Node]) -> Section:
-        """Return a map below that something shorter stands for."""
+        """Return a map below, given in a short form."""
         node = self.children[key]
         path = f"{self.path}.{key}" if self.path else key
         return Section(self.file, path, Node(children, node.line, node.key_line))
@@ -252,11 +252,11 @@ def _got(node: Node) -> str:
 
 
 class Incomplete(Exception):
-    """A value cannot be made, for something in it is wrong."""
+    """A value is incomplete because of mistakes in it."""
 
 
 class Mistakes:
-    """What is wrong in a file; with `keep` the reading goes on after each."""
+    """The mistakes in a file; with `keep`, reading continues after each."""
 
     def __init__(self, *, keep: bool = False) -> None:
         self._keep = keep
@@ -264,7 +264,7 @@ class Mistakes:
 
     @contextmanager
     def step(self) -> Iterator[None]:
-        """Judge something that does not depend on other steps."""
+        """Run a check that does not depend on others."""
         try:
             yield
         except SpecError as error:
@@ -275,14 +275,14 @@ class Mistakes:
             pass
 
     def add(self, errors: Iterable[SpecError]) -> None:
-        """Take mistakes one by one: the first is raised unless all are kept."""
+        """Add mistakes: the first is raised unless all are kept."""
         for error in errors:
             with self.step():
                 raise error
 
     @contextmanager
     def whole(self) -> Iterator[None]:
-        """Judge all parts of one value; where one is wrong there is no value.
+        """Check all parts of one value; with a mistake there is no value.
 
         Raises:
             Incomplete: Something was found within.

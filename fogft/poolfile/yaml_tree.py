@@ -1,4 +1,4 @@
-"""Turn YAML into a tree that keeps the line of every key and value, or say what is wrong.
+"""Parse YAML into a tree with the line of every key and value.
 
 PyYAML's own loader forgets lines, keeps the last of two equal keys, and expands aliases
 without end. So its composer is used, and the nodes are converted here, with limits. What
@@ -125,7 +125,7 @@ class _Converter:
             if key in own:
                 first = own[key].key_line
                 raise _RefusedError(
-                    line, full, f"stands here twice (first in line {first})", "keep one"
+                    line, full, f"is given twice (first in line {first})", "keep one"
                 )
             own[key] = self.node(value_node, full, line)
         return {**merged, **own}
@@ -143,7 +143,7 @@ class _Converter:
     def _key(self, node: yaml.Node, path: str) -> str:
         line = node.start_mark.line + 1
         if not isinstance(node, yaml.ScalarNode):
-            raise _RefusedError(line, path, "a list or a map cannot be a key", "write a text")
+            raise _RefusedError(line, path, "a list or a map cannot be a key", "write text")
         value = self._scalar(node, path)
         if not isinstance(value, str):
             raise _RefusedError(

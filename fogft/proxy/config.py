@@ -1,4 +1,4 @@
-"""Read the proxies' configuration files; options of a command line replace what they say.
+"""Read the proxies' configuration files, overridden by command-line options.
 
 Each raises StateError where a file cannot be read, or a key is missing or of the wrong type.
 """
@@ -18,7 +18,7 @@ DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
 
 
 def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
-    """Read a client proxy's configuration; `metrics` replaces what it says."""
+    """Read a client proxy's configuration; `metrics` overrides it."""
     config = config_file.read(ClientProxyConfig, path, {"metrics": metrics})
     _check(path, config)
     return config
@@ -27,13 +27,13 @@ def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
 def read_gateway(
     path: Path, listen: str | None = None, metrics: str | None = None
 ) -> ClientProxyConfig:
-    """Read a gateway's configuration; `listen` and `metrics` replace what it says."""
+    """Read a gateway's configuration; `listen` and `metrics` override it."""
     config = read_client(path, metrics)
     return replace(config, listen=listen or config.listen or DEFAULT_GATEWAY_LISTEN)
 
 
 def read_server(path: Path, **override: Any) -> ServerProxyConfig:
-    """Read a server proxy's configuration; options that are not None replace what it says."""
+    """Read a server proxy's configuration; options that are not None override it."""
     config = config_file.read(ServerProxyConfig, path, override)
     _check(path, config)
     kind, _, file = config.notice.partition(":")

@@ -1,4 +1,4 @@
-"""The node of a proxy and what types are there, by how the proxy speaks ROS.
+"""A proxy's ROS node and type support, through rclpy or rmw_zenoh.
 
 With rclpy a type is what its installed package says. Over Zenoh it is known by the hash that
 nodes write into their names; where its package is installed too, its fields are known besides.
@@ -19,12 +19,12 @@ from fogft.errors import RosError
 from fogft.model.cdr import Shape
 from fogft.model.choices import Speaks
 from fogft.model.type_definition import Definition
-from fogft.proxy import start
+from fogft.process import load_numpy
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
 
 if TYPE_CHECKING:
-    from fogft.ros.participant.joining import EarlyJoin
+    from fogft.ros.joining import EarlyJoin
     from fogft.ros.visible import VisibleNode
 
 Told = Callable[[], Mapping[str, Definition]]
@@ -34,7 +34,7 @@ Judge = Callable[[Mapping[str, Any]], str]
 
 
 class Joined(NamedTuple):
-    """A node, what defines types for it, and what makes the node that people see.
+    """A node, its type definitions, and a factory of the node visible to people.
 
     Over Zenoh there is none to see: `/diagnostics` and parameters need types.
 
@@ -50,24 +50,24 @@ class Joined(NamedTuple):
 
 
 def prepare(speaks: Speaks) -> None:
-    """Prepare this process for ROS. Before anything else of it."""
+    """Prepare this process for ROS. Call it before anything else."""
     if speaks is Speaks.RCLPY:
         environment.prepare(os.environ)
-        start.load_numpy()
+        load_numpy()
     memory_tuning.tune()
 
 
 def join_early(speaks: Speaks, name: str, domain_id: int | None) -> EarlyJoin | None:
-    """Have this process known in its ROS domain before it offers anything. Raises RosError."""
+    """Join the ROS domain before anything is offered. Raises RosError."""
     if speaks is not Speaks.RCLPY:
         return None
-    from fogft.ros.participant.joining import EarlyJoin
+    from fogft.ros.joining import EarlyJoin
 
     return EarlyJoin(f"_{name}_standby", domain_id)
 
 
 def load_types(type_names: Sequence[str]) -> None:
-    """Load what of these service types can be had here; what is wrong, their user tells."""
+    """Load those of these service types that are available; their users report problems."""
     from fogft.ros import messages, types
     from fogft.ros.serialised import self_test
 
@@ -79,8 +79,8 @@ def load_types(type_names: Sequence[str]) -> None:
 
 
 def declare_gone(participant: str, domain_id: int | None) -> None:
-    """Tell everybody that the process of this `Joined.participant` was killed."""
-    from fogft.ros.participant import farewell
+    """Tell the ROS domain that the process of this `Joined.participant` was killed."""
+    from fogft.ros import farewell
 
     with contextlib.suppress(ValueError):  # what a file says
         farewell.declare_gone(bytes.fromhex(participant), domain_id)
@@ -96,11 +96,13 @@ def join(
     noticed: Callable[[], None] = lambda: None,
     environ: Mapping[str, str] = os.environ,
 ) -> Joined:
-    """Make a node.
+    """Create a node.
 
     Args:
+        domain_id: The ROS domain; None for what the environment says.
         told: Returns the definitions of types as replicas tell them.
         noticed: Called, from any thread, when a type may be known that was not.
+        environ: Where the variables of ROS and Zenoh are, for Zenoh.
 
     Raises:
         RosError: ROS, or Zenoh, is not usable here.
@@ -133,14 +135,14 @@ def join(
 
 
 def fault_of(type_name: str, part: str) -> Callable[[bytes], str]:
-    """Return what says why bytes are no request, or response; without the type, its header only."""
+    """Return a check of a type's serialised requests or responses; without the type, of headers."""
     from fogft.ros.types import definition
 
     return Shape(part, definition(type_name).fields).fault
 
 
 def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | None:
-    """Return a type's default response; None where it is not needed. Raises RosError."""
+    """Return a type's default response; None if it is not needed. Raises RosError."""
     try:
         from fogft.ros import messages
 

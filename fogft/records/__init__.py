@@ -1,4 +1,4 @@
-"""Signed records of who is where, and the rendezvous that passes them on.
+"""Signed membership records, and the rendezvous that passes them on.
 
 Not here: application data, which goes over links only (`fogft.link`).
 """

@@ -1,4 +1,4 @@
-"""The last records on disk, so that a process can start while nobody can be reached.
+"""A cache of records on disk, so that a process can start while no peer can be reached.
 
 The file is written whole, has a version and a checksum, and each record in it keeps its
 signature, which is checked again. A damaged file is told and costs only itself.
@@ -42,7 +42,7 @@ def write(path: Path, records: Sequence[SignedRecord], *, durable: bool = True) 
 
 
 def read(path: Path) -> list[SignedRecord]:
-    """Return the records of the file, none where there is no file."""
+    """Return the records of the file; none if there is no file."""
     raw = disk.read_json(path)
     if raw is None:
         return []
@@ -58,7 +58,7 @@ def read(path: Path) -> list[SignedRecord]:
 
 
 def restore(path: Path, records: RecordSet, ca: Path) -> bool:
-    """Take in what is on disk, certificates that have expired since included.
+    """Restore the records on disk, also those whose certificates have expired since.
 
     A damaged file is told; then false is returned.
     """

@@ -39,7 +39,7 @@ _END_WAIT_S = 2.0
 
 @dataclass(frozen=True)
 class Known:
-    """What is known at one moment. Immutable, so any thread may read it.
+    """The records known at one moment. Immutable, so any thread may read it.
 
     Attributes:
         seen_host: Our own address, as a rendezvous saw it; empty if none did.
@@ -96,7 +96,7 @@ class RendezvousClient:
         self._thread = threading.Thread(target=self._run, name="fogft-rendezvous", daemon=True)
 
     def start(self) -> None:
-        """Begin to dial; return at once."""
+        """Start dialling; return at once."""
         self._thread.start()
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ class RendezvousClient:
         *,
         sequence: int | None = None,
     ) -> None:
-        """Say something of our own, to everybody, from now on. From any thread.
+        """Publish a record of our own from now on. Any thread.
 
         Args:
             sequence: Its number; None for one above all that were said before.
@@ -125,7 +125,7 @@ class RendezvousClient:
         self._loop.call_soon_threadsafe(self._say, kind, subject, own)
 
     def status(self) -> dict[str, Any]:
-        """Return for people: each rendezvous with what is wrong, and what was counted."""
+        """Return each rendezvous' problem and the counters, for people."""
         return {
             "rendezvous": [
                 {"endpoint": endpoint, "connected": not detail, "detail": detail}

@@ -1,6 +1,6 @@
-"""Open a connection to a rendezvous: soon after it can be reached, and to nobody else.
+"""Open a connection to a rendezvous, soon after it becomes reachable, and verify it.
 
-A new attempt begins every 0.4 s while earlier ones are still under way. One that was sent
+A new attempt begins every 0.25 s while earlier ones are still under way. One that was sent
 into a black hole would be repeated by TCP after 1, 3, 7 seconds; one that crosses a slow
 link needs seconds. Overlapping attempts serve both.
 
@@ -29,7 +29,7 @@ _GREETING_TIMEOUT_S = 5.0
 
 
 class Caller:
-    """Connects one process to one rendezvous of its pool; a name is looked up with each attempt."""
+    """Connects one process to one rendezvous of its pool; looks the name up on each attempt."""
 
     def __init__(
         self, endpoint: str, credentials: CredentialPaths, signer: Signer, pool_uid: str
@@ -41,7 +41,7 @@ class Caller:
         self._pool_uid = pool_uid
 
     async def connect(self) -> tuple[Connection, str]:
-        """Return a connection on which both sides know each other, and our host as seen there.
+        """Return an authenticated connection, and our address as seen there.
 
         Raises:
             WireError: Somebody else is there, or it does not let us in.

@@ -1,4 +1,4 @@
-"""Keep one set of records the same as everybody's who is connected. On one event loop.
+"""Keep a set of records in sync with all connected peers. On one event loop.
 
 Both ends of a connection do the same: tell what they have, send what the other lacks, pass
 on at once what is new. So a rendezvous that comes back empty is filled by whoever connects.
@@ -24,12 +24,13 @@ log = logging.getLogger(__name__)
 SILENCE_S = 3.0  # TCP alone would wait for minutes behind a black hole
 PING_EVERY_S = 1.0
 HAVE_EVERY = 5  # pings: heals whatever was missed
+OF_ONE_LIMIT = 8  # connections of one certificate; a newer one ends the oldest
 _WAITING_LIMIT = 4 << 20
 _READ_BYTES = 64 << 10
 
 
 class Connection:
-    """One open connection whose other end is known."""
+    """One open connection with an authenticated peer."""
 
     def __init__(
         self,
@@ -44,7 +45,7 @@ class Connection:
         self._unframer = unframer
 
     def send(self, data: bytes) -> None:
-        """Queue bytes; who takes nothing for long is let go."""
+        """Queue bytes; a peer that stops reading is disconnected."""
         if self._writer.transport.get_write_buffer_size() > _WAITING_LIMIT:
             self.abort()
             return
@@ -66,35 +67,40 @@ class Connection:
         return found
 
     def abort(self) -> None:
-        """End it at once."""
+        """Close it at once."""
         self._writer.transport.abort()
 
 
 class Exchange:
-    """A record set and the connections over which it is kept the same."""
+    """A record set and the connections over which it is kept in sync."""
 
     def __init__(self, records: RecordSet, changed: Callable[[], None] = lambda: None) -> None:
         self.records = records
         self.counts: Counter[str] = Counter()
         self._changed = changed
-        self._connections: set[Connection] = set()
+        self._connections: dict[Connection, None] = {}  # oldest first
 
     def __len__(self) -> int:
         return len(self._connections)
 
     def take(self, offered: list[SignedRecord], source: Connection | None = None) -> int:
-        """Offer records to the set and pass on what was accepted; return how many were."""
+        """Offer records to the set and pass on accepted ones; return their number."""
         accepted = [one for one in offered if self.records.offer(one) is Verdict.ACCEPTED]
         if accepted:
             for message in frames.records(accepted):
-                for connection in self._connections - {source}:
+                for connection in self._connections.keys() - {source}:
                     connection.send(message)
             self._changed()
         return len(accepted)
 
     async def keep(self, connection: Connection) -> None:
         """Exchange records over a connection until it ends. Raises nothing but cancellation."""
-        self._connections.add(connection)
+        own = [one for one in self._connections if one.name == connection.name]
+        if len(own) >= OF_ONE_LIMIT:
+            self.counts["surplus"] += 1
+            del self._connections[own[0]]
+            own[0].abort()
+        self._connections[connection] = None
         pings = asyncio.get_running_loop().create_task(self._ping(connection))
         try:
             while messages := await connection.messages():
@@ -110,7 +116,7 @@ class Exchange:
             log.info("connection_lost peer=%s reason=%r", connection.name, str(error))
         finally:
             pings.cancel()
-            self._connections.discard(connection)
+            self._connections.pop(connection, None)
             connection.abort()
 
     async def _ping(self, connection: Connection) -> None:

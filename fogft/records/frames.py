@@ -1,4 +1,4 @@
-"""What a rendezvous and its callers say to each other, as bytes. Pure.
+"""The messages between a rendezvous and its callers, as bytes. Pure.
 
 Each message is a JSON object behind its length. Whatever bytes come in, and however they are
 cut, a reader gives messages or raises `RecordError`, and holds no more than one frame.
@@ -45,7 +45,7 @@ class Unframer:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[dict[str, Any]]:
-        """Yield the messages that are complete now; what is not taken stays for the next call."""
+        """Yield the messages that are complete now; the rest stays for the next call."""
         self._buffer += data
         while len(self._buffer) >= _LENGTH.size:
             (length,) = _LENGTH.unpack_from(self._buffer)
@@ -69,7 +69,7 @@ def frame(message: dict[str, Any]) -> bytes:
 
 
 def challenge(nonce: bytes, seen_host: str) -> bytes:
-    """Return the first message of who is called: what to sign, and where the caller is seen."""
+    """Return the rendezvous' first message: a nonce to sign, and the caller's host as seen."""
     return frame({"type": "challenge", "v": VERSION, "nonce": nonce.hex(), "seen": seen_host})
 
 
@@ -83,12 +83,12 @@ def read_challenge(message: dict[str, Any]) -> tuple[bytes, str]:
 
 
 def proof_bytes(purpose: str, nonce: bytes, binding: bytes) -> bytes:
-    """Return what a caller signs: good for one purpose, once, and to nobody else."""
+    """Return the bytes that a caller signs, valid once and for one rendezvous."""
     return _GREETING_PREFIX + purpose.encode() + b"\n" + nonce + binding
 
 
 def greeting(certificate: bytes, signature: bytes) -> bytes:
-    """Return the caller's first message: who it is, and the proof."""
+    """Return the caller's first message: its certificate and the proof."""
     return frame(
         {
             "type": "greeting",
@@ -112,7 +112,7 @@ def read_greeting(message: dict[str, Any]) -> tuple[bytes, bytes]:
 
 
 def ping() -> bytes:
-    """Return a sign of life."""
+    """Return a keep-alive message."""
     return frame({"type": "ping"})
 
 
@@ -122,7 +122,7 @@ class _Have:
 
 
 def have(digest: Digest) -> bytes:
-    """Return what is held, for the other side to send what is lacking."""
+    """Return a digest of our records, so that the other side can send missing ones."""
     return frame({"type": "have", "digest": [[*key, *order] for key, order in digest.items()]})
 
 
@@ -159,7 +159,7 @@ def read_records(message: dict[str, Any]) -> list[SignedRecord]:
 
 
 def pack(all: Sequence[SignedRecord]) -> bytes:
-    """Return records as one message of its own, for a link."""
+    """Return records as a single message, for a link."""
     return json.dumps({"v": VERSION, "records": [to_plain(one) for one in all]}).encode()
 
 

@@ -1,4 +1,4 @@
-"""Membership records: who is where, said by the one who may say it, and signed. Pure.
+"""Membership records, each signed by its only allowed writer. Pure.
 
 A record has one key (kind and subject), one writer, and an order (generation, sequence).
 What travels is its body as bytes, with the writer's certificate and signature over exactly
@@ -39,7 +39,7 @@ Order = tuple[int, int]
 
 
 class RecordError(ValueError):
-    """This is no record, or not one that its writer may write.
+    """Not a record, or not one that its writer may write.
 
     Args:
         reason: One word for counters: ``malformed``, ``version``, ``pool``, ``forged``,
@@ -91,18 +91,18 @@ class Record:
 
     @property
     def key(self) -> Key:
-        """What this record replaces: an older one of the same key."""
+        """The key of the record; it replaces an older one with the same key."""
         return (self.kind.value, self.subject)
 
     @property
     def order(self) -> Order:
-        """A lower one never replaces a higher one."""
+        """The order of the record; a lower one never replaces a higher one."""
         return (self.generation, self.sequence)
 
 
 @dataclass(frozen=True)
 class SignedRecord:
-    """A record as it travels and is kept.
+    """A record in its signed form, as sent and stored.
 
     Attributes:
         signature: Over `signed_bytes(body)`, with that certificate's key (DER).
@@ -115,7 +115,7 @@ class SignedRecord:
 
 @dataclass(frozen=True)
 class Writer:
-    """Who signed something, by a certificate that was found to be good.
+    """The writer of a record, by a verified certificate.
 
     Attributes:
         serial: The certificate's serial number, lower-case hexadecimal.
@@ -133,12 +133,12 @@ Sign = Callable[[bytes], tuple[bytes, bytes]]
 
 
 def signed_bytes(body: bytes) -> bytes:
-    """Return what a record's signature covers."""
+    """Return the bytes that a record's signature covers."""
     return _SIGNED_PREFIX + body
 
 
 def sign_record(record: Record, sign: Sign) -> SignedRecord:
-    """Return a record as it travels.
+    """Sign a record.
 
     Raises:
         ValueError: It could not be read back: too large, or not JSON data.
@@ -152,14 +152,14 @@ def sign_record(record: Record, sign: Sign) -> SignedRecord:
 
 
 def read_body(signed: SignedRecord) -> Record:
-    """Return what a record says, whoever wrote it: nothing is verified."""
+    """Read a record's body; nothing is verified."""
     if len(signed.certificate) > CERTIFICATE_LIMIT or len(signed.signature) > SIGNATURE_LIMIT:
         raise RecordError("malformed", "a certificate or signature that is too long")
     return _decode(signed.body)
 
 
 def verified_writer(record: Record, signed: SignedRecord, verify: Verify) -> Writer:
-    """Return who wrote a record, once signature, certificate and right to write are checked."""
+    """Return a record's writer after checking signature, certificate and right to write."""
     writer = verify(signed.certificate, signed.signature, signed_bytes(signed.body))
     expected = expected_writer(record)
     if (writer.role, writer.common_name) != (expected.role.value, expected.common_name):
@@ -197,7 +197,7 @@ def _decode(body: bytes) -> Record:
 
 
 def check_version(raw: Mapping[str, Any]) -> None:
-    """See that a message or a record is of this version."""
+    """Check that a message or record has this version."""
     if raw.get("v") is True or raw.get("v") != VERSION:
         raise RecordError("version", f"version {raw.get('v')!r:.20} is not spoken here")
 
@@ -211,7 +211,7 @@ def read(cls: type[T], raw: Any) -> T:
 
 
 def read_json(text: bytes, limit: int) -> dict[str, Any]:
-    """Return a JSON object of limited size, without numbers that are none."""
+    """Return a JSON object of limited size, without NaN and infinities."""
     if len(text) > limit:
         raise RecordError("malformed", f"{len(text)} bytes, where {limit} are the limit")
     try:
@@ -237,7 +237,7 @@ def to_plain(signed: SignedRecord) -> dict[str, str]:
 
 
 def from_plain(raw: Any) -> SignedRecord:
-    """Read a signed record from JSON data; its body is not looked at."""
+    """Read a signed record from JSON data; its body is not read."""
     try:
         body, certificate, signature = (raw[k] for k in ("body", "certificate", "signature"))
         signed = SignedRecord(

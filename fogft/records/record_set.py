@@ -35,7 +35,7 @@ Digest = Mapping[Key, Order]
 
 
 class Verdict(str, Enum):
-    """What became of an offered record."""
+    """The verdict on an offered record."""
 
     ACCEPTED = "accepted"
     KNOWN = "known"  # the very same stands already
@@ -51,7 +51,7 @@ class _Held:
 
 
 class RecordSet:
-    """The records of one pool, up to a limit of keys. Not thread-safe: its owner sees to that."""
+    """The records of one pool, up to a limit of keys. Not thread-safe."""
 
     def __init__(self, pool_uid: str, verify: Verify, *, limit: int = KEYS_LIMIT) -> None:
         self.pool_uid = pool_uid
@@ -65,7 +65,7 @@ class RecordSet:
     # -- merging ----------------------------------------------------------------------------
 
     def offer(self, signed: SignedRecord) -> Verdict:
-        """Take a record in if it is good and newer than what stands for its key."""
+        """Add a record if it is valid and newer than the current one of its key."""
         try:
             verdict = self._judge(signed)
         except RecordError as error:
@@ -76,7 +76,7 @@ class RecordSet:
         return verdict
 
     def restore(self, signed: SignedRecord, verify: Verify) -> Verdict:
-        """Take in what was accepted once before, judged by another `verify`: time has passed."""
+        """Add records that were accepted before, checked by another `verify`."""
         usual, self._verify = self._verify, verify
         try:
             return self.offer(signed)
@@ -114,11 +114,11 @@ class RecordSet:
     # -- exchange ---------------------------------------------------------------------------
 
     def digest(self) -> dict[Key, Order]:
-        """Return the order that stands for each key."""
+        """Return the current order of each key."""
         return {key: held.record.order for key, held in self._held.items()}
 
     def lacking(self, digest: Digest) -> list[SignedRecord]:
-        """Return what somebody with that digest lacks; the manager's records first."""
+        """Return the records missing from a digest; the manager's first."""
         return [
             held.signed
             for key, held in sorted(self._held.items(), key=lambda item: _urgency(item[0]))
@@ -129,12 +129,12 @@ class RecordSet:
         return len(self._held)
 
     def get(self, kind: RecordKind, subject: str = "") -> Record | None:
-        """Return the record that stands for a key."""
+        """Return the current record of a key."""
         held = self._held.get((kind.value, subject))
         return None if held is None else held.record
 
     def signed(self, kind: RecordKind, subject: str = "") -> SignedRecord | None:
-        """Return the same as it travels."""
+        """Return the current record of a key in its signed form."""
         held = self._held.get((kind.value, subject))
         return None if held is None else held.signed
 
@@ -144,7 +144,7 @@ class RecordSet:
 
     @property
     def revoked(self) -> frozenset[str]:
-        """Common names of the certificates that are good no more."""
+        """The common names of revoked certificates."""
         return self._revoked
 
 

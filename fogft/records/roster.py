@@ -1,4 +1,4 @@
-"""What records say, put together: whom a proxy shall talk to, and where. Pure.
+"""Combine records into a membership: the replicas and their endpoints. Pure.
 
 The manager's admission says which generation of which slot is in. A replica's own record
 says where it is: it counts only while its generation is the one admitted. A content that is
@@ -27,7 +27,7 @@ LEASE_LIMIT_S = 366 * 86_400.0
 
 @dataclass(frozen=True)
 class SlotState:
-    """What a replica says of itself.
+    """A replica's own record.
 
     Attributes:
         endpoint: ``host:port`` where it can be reached, as it was told; empty if it was not.
@@ -44,7 +44,7 @@ class SlotState:
 
 @dataclass(frozen=True)
 class ServingLease:
-    """For how long replicas go on serving without hearing of the manager again.
+    """How long replicas keep serving without hearing from the manager again.
 
     Attributes:
         at: When it was signed, in seconds since the epoch by the manager's clock.
@@ -93,7 +93,7 @@ def admission(record: Record) -> Membership:
 
 
 def revoked_names(record: Record) -> frozenset[str]:
-    """Return the common names of certificates that a revocation record takes back."""
+    """Return the common names that a revocation record revokes."""
     holders = [holder_of(name) for name in read(_Revoked, record.content).names]
     if any(holder.pool_uid != record.pool_uid for holder in holders):
         raise RecordError("malformed", "names of another pool")
@@ -106,7 +106,7 @@ def lease(record: Record) -> ServingLease:
 
 
 def check_content(record: Record) -> None:
-    """See that a record's content can be used."""
+    """Check that a record's content is valid."""
     _READERS[record.kind](record)
 
 
@@ -121,7 +121,7 @@ _READERS: dict[RecordKind, Callable[[Record], object]] = {
 
 
 def located(membership: Membership, slots: Iterable[Record]) -> Membership:
-    """Return a membership with what admitted replicas say of themselves.
+    """Return a membership completed with admitted replicas' own records.
 
     A replica that was told its address knows best, then the manager's word counts, then what
     a rendezvous saw. One that dials out has no endpoint: it is waited for.
@@ -136,7 +136,7 @@ def located(membership: Membership, slots: Iterable[Record]) -> Membership:
 
 
 def gateways_of(membership: Membership, holder: Holder) -> tuple[Member, ...] | None:
-    """Return the gateways that somebody talks to, as members; None for the replicas.
+    """Return the gateways of a robot or gateway, as members; None for the replicas.
 
     While a gateway's certificate is being replaced there are two of it, one of which answers.
     """

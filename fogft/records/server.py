@@ -1,4 +1,4 @@
-"""A rendezvous: a place that everybody of a pool can reach, which keeps and passes on records.
+"""The rendezvous server, which stores and passes on a pool's records.
 
 TLS proves the rendezvous to its callers; a caller proves itself by signing a challenge. What
 comes from anybody else, or is no message, ends that connection, is counted by reason, and
@@ -19,7 +19,7 @@ import socket
 import ssl
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 from fogft import disk
 from fogft.errors import CredentialError, WireError
@@ -27,6 +27,7 @@ from fogft.log_limits import worth_logging
 from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
 from fogft.records.exchange import Connection, Exchange
+from fogft.records.greetings import oldest_of_most
 from fogft.records.record import RecordError, Verify, Writer
 
 log = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ class RendezvousServer:
         self._socket: socket.socket | None = None
         self._endpoint = listen
         self._tasks: set[asyncio.Task[None]] = set()
-        self._greeting = 0
+        self._greeting: dict[asyncio.Task[None], str] = {}  # oldest first, with their hosts
 
     @property
     def endpoint(self) -> str:
@@ -67,7 +68,7 @@ class RendezvousServer:
         return self._endpoint
 
     def bind(self) -> None:
-        """Take the port."""
+        """Bind the port."""
         self._renew_context()
         host, _, port = self._listen.rpartition(":")
         try:
@@ -95,14 +96,20 @@ class RendezvousServer:
                     self._count("accept_failed", str(error))
                     await asyncio.sleep(0.1)
                     continue
-                if self._greeting >= HANDSHAKES_LIMIT or len(self._exchange) >= CONNECTIONS_LIMIT:
-                    self._count("refused_full", str(address[0]))
+                host = str(address[0])
+                if len(self._exchange) >= CONNECTIONS_LIMIT:
+                    self._count("refused_full", host)
                     raw.close()
                     continue
-                self._greeting += 1
-                task = loop.create_task(self._attend(raw, str(address[0])))
+                if len(self._greeting) >= HANDSHAKES_LIMIT:
+                    crowd = oldest_of_most(self._greeting)
+                    self._count("greeting_crowded", self._greeting.pop(crowd))
+                    crowd.cancel()
+                task = loop.create_task(self._attend(raw, host))
+                self._greeting[task] = host
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
+                await asyncio.sleep(0)  # where many wait to be accepted, `sock_accept` never waits
         finally:
             self.close()
 
@@ -111,7 +118,7 @@ class RendezvousServer:
             try:
                 connection = await asyncio.wait_for(self._greet(raw, host), GREETING_TIMEOUT_S)
             finally:
-                self._greeting -= 1
+                self._greeting.pop(cast(asyncio.Task[None], asyncio.current_task()), None)
         except RecordError as error:
             self._count(f"greeting_{error.reason}", f"{host}: {error}")
         except asyncio.TimeoutError:
@@ -161,7 +168,7 @@ class RendezvousServer:
         if caller.role not in CALLERS or not caller.common_name.endswith(
             f".{self._exchange.records.pool_uid}"
         ):
-            raise RecordError("role", f"`{caller.common_name}` may not call")
+            raise RecordError("role", f"`{caller.common_name}` may not connect")
         if caller.common_name in self._exchange.records.revoked:
             raise RecordError("revoked", f"the certificate of `{caller.common_name}` is revoked")
 
@@ -194,7 +201,7 @@ class RendezvousServer:
             log.warning("caller_refused event=%s count=%d detail=%r", event, count, detail[:200])
 
     def report(self) -> Mapping[str, Any]:
-        """Return what was counted, for people."""
+        """Return the counters, for people."""
         exchange = self._exchange
         return {
             "callers": len(exchange),
@@ -205,7 +212,7 @@ class RendezvousServer:
         }
 
     def close(self) -> None:
-        """Give the port back and end all connections."""
+        """Release the port and close all connections."""
         for task in list(self._tasks):
             task.cancel()
         self._exchange.abort()
@@ -215,12 +222,12 @@ class RendezvousServer:
 
 
 def binding_of(certificate: bytes) -> bytes:
-    """Return what ties a greeting to the rendezvous that has this certificate (DER)."""
+    """Return the value that binds a greeting to the rendezvous with this certificate (DER)."""
     return hashlib.sha256(certificate).digest()
 
 
 async def first_message(reader: asyncio.StreamReader, unframer: frames.Unframer) -> dict[str, Any]:
-    """Return the first message; what came along with it stays in the unframer."""
+    """Return the first message; bytes received after it stay in the unframer."""
     while data := await reader.read(16 << 10):
         for message in unframer.feed(data):
             return message

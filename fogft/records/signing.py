@@ -1,4 +1,4 @@
-"""Sign with a certificate's key, and tell who signed: for records and for greetings.
+"""Sign with a certificate's key, and verify signatures: for records and greetings.
 
 Every process of a pool has a key and a certificate of the pool's CA for TLS; the same pair
 signs what it says of itself. So no further keys have to be handed out, and whoever may not
@@ -27,7 +27,7 @@ _KNOWN_LIMIT = 4096
 
 
 class Signer:
-    """Signs with a key on disk; reads it again when its certificate was replaced."""
+    """Signs with a key on disk; reloads it when its certificate was replaced."""
 
     def __init__(self, certificate: Path, key: Path) -> None:
         self._certificate_path = certificate
@@ -89,7 +89,7 @@ class Signer:
 
 
 class Verifier:
-    """Tells who signed something: a certificate of the pool's CA, in its time, with its key.
+    """Verifies signatures by currently valid certificates of the pool's CA.
 
     Args:
         any_time: Accept certificates out of their time: for what was verified before.
@@ -161,7 +161,7 @@ class Verifier:
 
 
 class LazyVerifier:
-    """A `Verifier` that reads the CA when it is first asked: who never is loads nothing."""
+    """A `Verifier` that reads the CA on first use."""
 
     def __init__(self, ca: Path) -> None:
         self._ca = ca

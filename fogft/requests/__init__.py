@@ -1,4 +1,4 @@
-"""What becomes of one request: hedging, the first success, votes, fallback, admission. Pure.
+"""The life of a request: hedging, first success, votes, fallback, admission. Pure.
 
 Moments called `now` are seconds on one monotonic clock, the caller's.
 

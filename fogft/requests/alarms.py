@@ -1,4 +1,4 @@
-"""Which replicas are believed when they say that a service died over a request. Pure.
+"""Which replicas are believed when they report that a request crashed a service. Pure.
 
 One that is broken, or lies, says so of requests that others answer. Were it believed, the others
 would run each of those alone.
@@ -17,7 +17,7 @@ ALARM_S = 1.0  # what is said within it, counted from the first time, is about o
 
 
 class Alarms:
-    """Which replicas are believed when they say that a service died over a request.
+    """Which replicas are believed when they report that a request crashed a service.
 
     A service that dies ends all that it has at once, so what one says in the same moment is one
     alarm, however many requests it names. It is false where another replica answered one of them,
@@ -30,7 +30,7 @@ class Alarms:
         self._false: dict[int, list[float]] = {}
 
     def believed(self, replica: int, now: float) -> bool:
-        """Take an alarm; return whether it counts."""
+        """Take a crash report; return whether it counts."""
         if now - self._said_at.get(replica, -ALARM_S) >= ALARM_S:
             self._said_at[replica] = now
             self._judged.discard(replica)
@@ -39,12 +39,12 @@ class Alarms:
         return len(lately) < FALSE_ALARMS
 
     def was_false(self, replica: int, now: float) -> None:
-        """Another replica has answered a request over which this one's service is said to die."""
+        """Note a false report: another replica has answered the request."""
         if replica not in self._judged:
             self._judged.add(replica)
             self._false.setdefault(replica, []).append(now)
 
     def were_right(self, replicas: Iterable[int]) -> None:
-        """A request that these replicas have named does kill services."""
+        """Note correct reports: the request does crash services."""
         for replica in replicas:
             self._false.pop(replica, None)

@@ -14,7 +14,7 @@
 
 Laws: a request always has a copy that is no spare; late hedges <= capacity + share * requests.
 
-Owns: the choice, the budget, how many requests get spare copies; which policy a service has.
+Owns: the choice, the budget, how many requests get spare copies.
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 
@@ -23,8 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from fogft.model.spec import HedgingMode, Part, ServiceSpec
-from fogft.requests.choose import All, Choose, Failover, Learning
+from fogft.requests.choose import Learning
 from fogft.requests.load import Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
@@ -41,12 +40,16 @@ _RETRY_S = 0.02
 
 
 class TokenBucket:
-    """Tokens for extra copies: a share of what was asked for, and a little to begin with.
+    """Tokens for extra copies: a share of the requests, and a few to begin with.
 
     Tokens come with requests, not with time: a service that is asked once a minute and one that is
     asked a thousand times a second both send the same share of extra copies.
 
     Law: after n requests at most ``capacity + share * n`` copies were taken.
+
+    Args:
+        share: Tokens that each request brings, above 0 and at most 1.
+        capacity: The most that are kept, and how many there are at first.
     """
 
     def __init__(self, share: float, capacity: float) -> None:
@@ -59,7 +62,7 @@ class TokenBucket:
         self.tokens = min(self._capacity, self.tokens + self._share)
 
     def take(self) -> bool:
-        """Take a token, if there is one."""
+        """Take a token if there is one."""
         if self.tokens < 1.0:
             return False
         self.tokens -= 1.0
@@ -67,7 +70,11 @@ class TokenBucket:
 
 
 class Spares:
-    """Which requests get spare copies: all, unless these cost more waiting than they save."""
+    """Which requests get spare copies: all, unless those cost more waiting than they save.
+
+    Attributes:
+        share: Of requests that get them.
+    """
 
     def __init__(self) -> None:
         self.share = 1.0
@@ -77,7 +84,7 @@ class Spares:
         self.open: dict[tuple[bytes, int], float] = {}  # when each was sent that has not ended
 
     def request(self, service_s: float, now: float) -> None:
-        """A request comes: let the share recover, and the past fade."""
+        """Note a request: let the share recover, and old data decay."""
         self._saved_s *= _MEMORY
         self._cost_s *= _MEMORY
         if self._at is not None and self.share < 1.0:
@@ -86,15 +93,15 @@ class Spares:
         self._at = now
 
     def chosen(self, request: bytes) -> bool:
-        """Whether a request gets spares. By its id, which is random."""
+        """Whether a request gets spares, by its random id."""
         return int.from_bytes(request[:2], "big") < self.share * 65536
 
     def saved(self, seconds: float) -> None:
-        """A spare was first, by so much."""
+        """Note that a spare was first, and by how much."""
         self._saved_s += seconds
 
     def made_wait(self, seconds: float) -> None:
-        """A request has to wait for a spare, for about so long."""
+        """Note that a request has to wait for a spare, and for about how long."""
         self._cost_s += seconds
         if self._cost_s > self._saved_s:
             self.share = max(FEWEST_SPARES, self.share * _CUT)
@@ -117,7 +124,7 @@ class Auto(Learning):
     # -- choices --------------------------------------------------------------------------
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return who will answer first, and those besides that have nothing to do."""
+        """Return the replica expected to answer first, and other idle ones."""
         self._budget.request()
         self._demand.asked(now)
         if not able:
@@ -159,7 +166,7 @@ class Auto(Learning):
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return the next best when those at work take unusually long, or there are none."""
+        """Return the next best replica if those at work are unusually slow, or there are none."""
         if not candidates:
             return ()
         if open:
@@ -197,7 +204,7 @@ class Auto(Learning):
         )[-1]
 
     def is_spare(self, request: bytes, replica: int) -> bool:
-        """Whether the replica is to drop it unless it has nothing else to do."""
+        """Whether the replica should drop it unless idle."""
         return (request, replica) in self._spares.open
 
     def _look(self, at: float) -> None:
@@ -206,20 +213,20 @@ class Auto(Learning):
     # -- what became of them --------------------------------------------------------------
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
-        """It was not asked. With a full window it is left alone, so that others are tried."""
+        """Note that it was not asked. With a full window it is avoided: others are tried."""
         self._spares.open.pop((request, replica), None)
         known = self._replicas[replica]
         known.dropped(request)
         known.doubted = known.doubted or full
 
     def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
-        """Take a replica's word."""
+        """Take a replica's reported load."""
         self._replicas[replica].heard(request, load, now)
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
-        """Learn, too, whether a spare copy has won, and who is free now."""
+        """Also learn whether a spare copy was first, and which replica is free now."""
         self._wanting.pop(request, None)
         if self._spares.open.pop((request, replica), None) is not None:
             for other in open:
@@ -230,7 +237,7 @@ class Auto(Learning):
         return losers
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
-        """An attempt ended without an answer."""
+        """Note that an attempt ended without an answer."""
         self._wanting.pop(request, None)
         self._spares.open.pop((request, replica), None)
         if fault:
@@ -239,7 +246,7 @@ class Auto(Learning):
             self._replicas[replica].dropped(request)
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """Learn from a copy that was not the first."""
+        """Learn from a late copy."""
         self._spares.open.pop((request, replica), None)
         beaten = self._beaten.pop((request, replica), now)
         if answered:
@@ -257,7 +264,7 @@ class Auto(Learning):
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
-        """Learn that these would have taken longer than until now."""
+        """Learn that these attempts would have taken longer than until now."""
         self._wanting.pop(request, None)
         for replica, begun in open.items():
             known = self._replicas[replica]
@@ -266,14 +273,14 @@ class Auto(Learning):
                 known.doubt(begun, now)
 
     def forget(self, replica: int) -> None:
-        """Forget what was on the way there."""
+        """Forget attempts in flight to it."""
         super().forget(replica)
         for copies in (self._spares.open, self._beaten):
             for key in [key for key in copies if key[1] == replica]:
                 del copies[key]
 
     def needed(self, able: int, now: float) -> int:
-        """Return how many replicas would do, where those able are too few; else 0."""
+        """Return how many replicas would be enough if there are too few; else 0."""
         times_s = sorted(known.service_s for known in self._replicas.values())
         return self._demand.replicas(able, times_s[len(times_s) // 2], now) if times_s else 0
 
@@ -292,12 +299,3 @@ class Auto(Learning):
                 for replica, known in sorted(self._replicas.items())
             },
         }
-
-
-def policy(spec: ServiceSpec) -> Choose:
-    """Return what chooses for a service, as its `hedging` says."""
-    if spec.hedging is HedgingMode.FAILOVER:
-        return Failover()
-    # Where every answer counts, or every replica applies every request, all are asked.
-    counts_all = spec.quorum > 1 or spec.state is not None or spec.part is not Part.NONE
-    return All() if counts_all or spec.hedging is HedgingMode.ALL else Auto()

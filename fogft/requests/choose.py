@@ -1,12 +1,12 @@
-"""Choose which replicas a request goes to first, which next, and when. Pure: time comes in.
+"""Hedging policies: which replicas get a request first, which next, and when. Pure.
 
 A policy is asked when a request comes (`first`) and again while it is open (`more`), and is
 told how each attempt ended. It never sends anything; the dispatcher does as it says, but for
 replicas that may not be asked, and requests that may have ended a service (`pending`).
 
 Owns: `all` and `failover`; the interface of every policy.
-Not here: `auto`, and which policy a service has (`fogft.requests.auto`), which answer wins
-(`fogft.requests.decide`).
+Not here: `auto` (`fogft.requests.auto`), which answer wins (`fogft.requests.decide`), which policy
+a service has (`fogft.proxy.robot.dispatcher`).
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from fogft.requests.load import NEVER, Load, ReplicaLoad
 
 
 class Choose:
-    """Decides which replicas work on a request. Not thread-safe: its owner holds a lock.
+    """A hedging policy. Not thread-safe: its owner holds a lock.
 
     Replicas are numbers, `open` maps each that works on a request to the moment it was asked.
     What a policy does not say here it does not care for.
 
     Attributes:
+        moves_on: Whether another replica is asked at once when nobody works on a request.
         look_at: When `more` wants to be asked next, though nothing else has happened.
         news: What it has learned concerns requests that it did not want to be asked about yet.
     """
@@ -34,50 +35,50 @@ class Choose:
     news = False
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return which of the able replicas a new request goes to at once."""
+        """Return the replicas, of those able, that a new request goes to at once."""
         raise NotImplementedError
 
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return which of those that may be asked, and are not, an open request goes to now."""
+        """Return the further replicas that an open request goes to now."""
         raise NotImplementedError
 
     def is_spare(self, request: bytes, replica: int) -> bool:
-        """Whether an attempt is one that the replica drops unless it has nothing else to do."""
+        """Whether the replica drops an attempt unless idle."""
         return False
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
-        """A replica that was returned was not asked: its window was full, or no need was left."""
+        """Note that a chosen replica was not asked: its window was full, or there was no need."""
 
     def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
-        """A replica has told its load, with the end of this attempt, which is told next."""
+        """Take a replica's load, reported with the end of an attempt, which is reported next."""
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
-        """A replica has answered a request; return who shall stop working on it."""
+        """Note that a replica has answered; return the replicas that should stop working on it."""
         return [other for other in open if other != replica] if len(open) > 1 else ()
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
-        """An attempt ended without an answer that counts, by the replica's fault or without."""
+        """Note that an attempt ended without a valid answer, by the replica's fault or not."""
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """An attempt ended after its request had: the replica has worked on it, or it has not."""
+        """Note that an attempt ended after its request, with or without work on it."""
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
-        """A request ended without these: its deadline came, or it was answered otherwise."""
+        """Note that a request ended without these attempts, by deadline or otherwise."""
 
     def hangs(self, replica: int) -> None:
-        """A replica has told that its service answers nothing of what it has."""
+        """Note that a replica reports its service as hanging."""
 
     def forget(self, replica: int) -> None:
-        """A replica's link is new, or gone: of what was on the way there nothing more is heard."""
+        """Note that a replica's link is new or gone: attempts in flight end without a report."""
 
     def needed(self, able: int, now: float) -> int:
-        """Return how many replicas would do, where those able are too few; else 0."""
+        """Return how many replicas would be enough if there are too few; else 0."""
         return 0
 
     def report(self) -> dict[str, Any]:
@@ -86,7 +87,7 @@ class Choose:
 
 
 class All(Choose):
-    """Every request goes to every replica at once, and to all that come later. Learns nothing."""
+    """The policy `all`: every request goes to every replica, later ones included."""
 
     moves_on = False  # all were asked already
 
@@ -97,12 +98,12 @@ class All(Choose):
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return all of them: whoever works on the request may be frozen."""
+        """Return all of them: a replica at work on the request may be frozen."""
         return candidates
 
 
 class Learning(Choose):
-    """A policy that learns how busy each replica is, by what it answers."""
+    """A policy that learns how busy each replica is."""
 
     def __init__(self) -> None:
         self._replicas: defaultdict[int, ReplicaLoad] = defaultdict(ReplicaLoad)
@@ -110,7 +111,7 @@ class Learning(Choose):
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> Iterable[int]:
-        """Learn from the winner; the others stop, and are learned from when they end."""
+        """Learn from the first response; the others stop, and are learned from when they end."""
         self._replicas[replica].answered(request, load, now)
         return super().answered(request, open, replica, load, now)
 
@@ -123,16 +124,16 @@ class Learning(Choose):
         return known.doubted
 
     def hangs(self, replica: int) -> None:
-        """Doubt it: what it has goes to others at once."""
+        """Doubt it: its requests go to others at once."""
         self._replicas[replica].doubted = self.news = True
 
     def forget(self, replica: int) -> None:
-        """Forget what was on the way there."""
+        """Forget attempts in flight to it."""
         self._replicas[replica].forget()
 
 
 class Failover(Learning):
-    """One replica gets every request. Another one takes its place when it fails.
+    """The policy `failover`: one replica gets every request until it fails.
 
     It fails when it is no longer able to answer (suspected, not ready, drained), when an
     attempt of its ends without an answer, and when it lets a deadline pass. A request that takes
@@ -148,13 +149,13 @@ class Failover(Learning):
         self.hedges = 0
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return the one."""
+        """Return the current replica."""
         return self._asked(request, self._one_of(able), now)
 
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return one when nobody works on the request, or nobody seems to."""
+        """Return another replica if none works on the request, or seems to."""
         if not candidates:
             return ()
         for replica, begun in open.items():
@@ -188,17 +189,17 @@ class Failover(Learning):
         return (self._current,)
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
-        """Stay: a full window is no failure."""
+        """Keep the current replica: a full window is not a failure."""
         self._replicas[replica].dropped(request)
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
-        """Move on from a replica that failed."""
+        """Switch away from a replica that failed."""
         self._replicas[replica].dropped(request)
         if replica == self._current:
             self._failed = True
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """Learn that it works again."""
+        """Note that it works again."""
         if answered:
             self._replicas[replica].answered(request, None, now)
         else:
@@ -207,12 +208,12 @@ class Failover(Learning):
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
-        """Move on from a replica that let a deadline pass: its service may hang."""
+        """Switch away from a replica that missed a deadline: its service may hang."""
         if expired and self._current in open:
             self._failed = True
 
     def hangs(self, replica: int) -> None:
-        """Move on from it, with all that it has."""
+        """Switch away from it, with all its requests."""
         super().hangs(replica)
         if replica == self._current:
             self._failed = True

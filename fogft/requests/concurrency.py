@@ -1,4 +1,4 @@
-"""How many requests a service may have at once, given or learned from its latency. Pure.
+"""How many requests a service may have concurrently, given or learned from latency. Pure.
 
 A service that works on one request after the other answers no more in an hour when it has ten
 of them instead of one: the others only wait inside it, where nobody can take them back or put
@@ -11,7 +11,7 @@ stays near what it was. Once in a while the double is tried, and kept if it gain
 Without demand nothing is learned and nothing limited. A service that answers every 3 ms or
 more often is not limited: what waits in it is over before it matters.
 
-Owns: the limit of one service. Not here: who waits (`admission`).
+Owns: the limit of one service. Not here: who waits (`fair_queue`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,12 @@ _WEIGHT = 0.1  # of a sample in the mean
 class ConcurrencyLimit:
     """The limit of one service.
 
+    Args:
+        most: The highest limit that may be learned; what the service's own queue holds.
+        given: The limit, where it is not to be learned.
+
     Attributes:
+        takes_s: Recent service time of a request, in seconds; 0 before the first.
         service_s: What a request took lately, divided by how many were at work, seconds; 0
             before the first.
     """
@@ -36,8 +41,7 @@ class ConcurrencyLimit:
         self._most = most
         self._given = given
         self.limit = most if given is None else given
-        self._mean_s: float | None = None
-        self.service_s = 0.0
+        self.takes_s = self.service_s = 0.0
         # Of the limit in force, while as many as it allows were at work:
         self._samples = 0
         self._sum_s = 0.0
@@ -45,19 +49,14 @@ class ConcurrencyLimit:
         self._tried: dict[int, float] = {}  # when each limit was last found not to be better
 
     @property
-    def takes_s(self) -> float:
-        """How long a request was lately at work, seconds; 0 before the first."""
-        return self._mean_s or 0.0
-
-    @property
     def known(self) -> int:
-        """How many may be at work, where that was given or found out; 0 where it was not."""
+        """The limit, if given or learned; else 0."""
         return self.limit if self._given is not None or self._tried else 0
 
     def finished(self, level: int, took_s: float, now: float) -> None:
-        """Learn from an answer; at its beginning `level` were at work, itself included."""
-        weight = 1.0 if self._mean_s is None else _WEIGHT
-        self._mean_s = (self._mean_s or 0.0) * (1 - weight) + weight * took_s
+        """Learn from an answer; at its start `level` requests were running, itself included."""
+        weight = _WEIGHT if self.takes_s else 1.0
+        self.takes_s = self.takes_s * (1 - weight) + weight * took_s
         self.service_s = self.service_s * (1 - weight) + weight * took_s / max(1, level)
         if self._given is not None or level != self.limit:
             return
@@ -101,7 +100,5 @@ class ConcurrencyLimit:
         self._sum_s = 0.0
 
     def wait_s(self, ahead: int, at_work: int) -> float:
-        """Return how long one waits behind those `ahead` and `at_work`, if known."""
-        if self._mean_s is None:
-            return 0.0
-        return max(0, ahead + at_work + 1 - self.limit) * self._mean_s / self.limit
+        """Return the expected wait behind those `ahead` and `at_work`, if known."""
+        return max(0, ahead + at_work + 1 - self.limit) * self.takes_s / self.limit

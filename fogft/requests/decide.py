@@ -8,23 +8,55 @@ cancellations, an order. What decides for those says what else is to be sent, to
 
 Owns: the interface of every decision; the first success, and the first that is ok.
 Not here: votes (`fogft.requests.votes`), actions (`fogft.proxy.robot.actions`), stateful services
-(`fogft.proxy.robot.service_order`); which requests await an answer (`first_response`).
+(`fogft.proxy.robot.service_order`); which requests await an answer (`pending`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from fogft.model.refusal import Refusal
-from fogft.requests.first_response import Pending
 
 Accepts = Callable[[bytes], bool]
+T = TypeVar("T")
+
+
+@dataclass
+class Pending(Generic[T]):
+    """A request that awaits its answer.
+
+    Attributes:
+        item: What the caller keeps with it (payload, handle).
+        open: Replicas that work on it now, each with the moment when it was asked.
+        barred: Replicas that must not be asked again.
+        failures: How often an attempt at each replica has failed, those that count.
+        waits: Until when a replica that failed it is left alone, and that wait, in seconds.
+        rejection: The last response that was real but not ok.
+        deaths: How often a service died while it worked on this: those that died together over
+            copies of it, and of other requests, count as one.
+        alone_at: The replicas that got it with nothing beside it, since a service has died.
+        alone_until: When another one is asked, if none of these has answered: half of the time left
+            is over then.
+    """
+
+    deadline: float
+    item: T
+    open: dict[int, float] = field(default_factory=dict)
+    barred: set[int] = field(default_factory=set)
+    failures: dict[int, int] = field(default_factory=dict)
+    waits: dict[int, tuple[float, float]] = field(default_factory=dict)
+    rejection: bytes | None = None
+    deaths: int = 0
+    alone_at: set[int] = field(default_factory=set)
+    alone_until: float = 0.0
+    died_at: set[int] = field(default_factory=set)
 
 
 class Means(Enum):
-    """What an answer means for its request."""
+    """The effect of an answer on its request."""
 
     SUCCESS = "success"  # return it, unless another one was first
     REJECTION = "rejection"  # the service says no: returned only when nothing better can come
@@ -38,7 +70,12 @@ Judgement = Means | Refusal  # a refusal: as if the replica had refused the requ
 
 
 class Send(NamedTuple):
-    """Something to be sent to a replica; a copy of a caller's request counts as one."""
+    """Something to send to a replica, such as a copy of a caller's request.
+
+    Attributes:
+        timeout_s: How long it is good for.
+        is_copy: It is a copy of a caller's request, and counted as one.
+    """
 
     replica: int
     id: bytes
@@ -48,7 +85,7 @@ class Send(NamedTuple):
 
 
 class Reachable(NamedTuple):
-    """The replicas that can be sent to: those that could not be before, all, those to go soon."""
+    """The reachable replicas: new ones, all, and those that leave soon."""
 
     come: Collection[int]
     versions: Mapping[int, str]  # what each runs
@@ -56,7 +93,7 @@ class Reachable(NamedTuple):
 
 
 class Decide:
-    """Says what answers mean: the first response is the answer; with `accepts`, the first ok one.
+    """Judges answers: the first response counts; with `accepts`, the first ok one.
 
     All but `read` is called under the dispatcher's lock. What differs is overridden.
 
@@ -78,10 +115,10 @@ class Decide:
         self.accepts = accepts
 
     def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
-        """Note a new request, and which replicas are able to answer it."""
+        """Note a new request, and the replicas that can answer it."""
 
     def read(self, payload: bytes) -> Any:
-        """Look into an answer; here, whether it is ok. Raises RosError: it is none of this type."""
+        """Read an answer; here, whether it is ok. Raises RosError: it is not of this type."""
         return self.accepts is None or self.accepts(payload)
 
     def judge(
@@ -93,50 +130,50 @@ class Decide:
     def refused(
         self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
     ) -> None:
-        """An attempt was refused, or lost."""
+        """Note that an attempt was refused or lost."""
 
     def closed(self, request: bytes, pending: Pending[Any]) -> None:
-        """A request has ended, in whatever way."""
+        """Note that a request has ended in any way."""
 
     def hears_out(self, request: bytes) -> bool:
-        """Whether replicas go on working on a request that has ended."""
+        """Whether replicas keep working on a request that has ended."""
         return False
 
     def report(self) -> dict[str, Any]:
-        """Return what people should know."""
+        """Return counters and state, for people."""
         return {}
 
     # -- what replicas must have ----------------------------------------------------------
 
     def hold(self) -> None:
-        """Order no more: another proxy does."""
+        """Stop ordering: another proxy does."""
 
     def take_over(self, now: float) -> None:
-        """Order from now on, where that was held: another proxy has given it up."""
+        """Start ordering, after another proxy has stopped."""
 
     @property
     def held(self) -> Collection[bytes]:
-        """Return the requests that wait for that."""
+        """Return the requests held until then."""
         return ()
 
     @property
     def ready(self) -> bool:
-        """Whether a request that is taken now can be answered, where `sends_requests`."""
+        """Whether a request taken now can be answered, if `sends_requests`."""
         return True
 
     def request_of(self, id: bytes) -> bytes | None:
-        """Return the request that an attempt is about, None for none. Without the lock, too."""
+        """Return the request of an attempt; None for none. Needs no lock."""
         return id
 
     def reach(self, replicas: Reachable, now: float) -> None:
-        """Note which replicas can be sent to."""
+        """Set the reachable replicas."""
 
     def take(self, now: float, timeout_s: float) -> Sequence[Send]:
-        """Return what is to be sent now, in this order; requests have `timeout_s`."""
+        """Return what to send now, in order; requests have `timeout_s`."""
         return ()
 
     def declined(self, id: bytes, replica: int, now: float) -> None:
-        """A replica's link did not take an attempt."""
+        """Note that a link did not accept an attempt."""
 
     def close(self) -> None:
-        """The service is not proxied any more."""
+        """Close: the service is no longer proxied."""

@@ -1,4 +1,4 @@
-"""When the fallback service is asked, and for how long its answer is awaited. Pure.
+"""When the fallback service is called, and how long its answer is awaited. Pure.
 
 A fallback is a service on the robot itself, cheaper than the replicas'. It is asked for a
 request once: at the deadline, or after a delay beside the replicas, or at once while no
@@ -40,7 +40,7 @@ class FallbackTimer(Generic[T]):
         self._arrived[request] = now
 
     def look_at(self, *, able: bool) -> float:
-        """Return when `due` has something to say next; `able` if a replica is ready."""
+        """Return when `due` can next return requests; `able` if a replica is ready."""
         for arrived in self._arrived.values():  # the oldest
             if not able and self.spec.while_none_ready:
                 return arrived
@@ -48,7 +48,7 @@ class FallbackTimer(Generic[T]):
         return NEVER
 
     def due(self, now: float, *, able: bool) -> list[bytes]:
-        """Return the requests that the fallback is to be asked for now, and hand them over."""
+        """Remove and return the requests to pass to the fallback now."""
         found = list(self._due(now, able=able))
         for request in found:
             del self._arrived[request]
@@ -66,12 +66,12 @@ class FallbackTimer(Generic[T]):
             yield request
 
     def ended(self, request: bytes) -> None:
-        """The request was answered by a replica."""
+        """Note that a replica has answered the request."""
         self._arrived.pop(request, None)
         self._handed.discard(request)
 
     def expired(self, request: bytes, item: T, now: float) -> bool:
-        """The deadline came: await the fallback from now on; whether it must be asked first."""
+        """Note the deadline: only the fallback counts now; return whether it is still needed."""
         must_ask = request not in self._handed
         self._arrived.pop(request, None)
         self._handed.discard(request)
@@ -79,13 +79,13 @@ class FallbackTimer(Generic[T]):
         return must_ask
 
     def answered(self, request: bytes) -> T | None:
-        """The fallback has answered; return the item of a request past its deadline, once."""
+        """Note the fallback's answer; return the item of a request past its deadline, once."""
         self._handed.discard(request)
         found = self._awaited.pop(request, None)
         return None if found is None else found[1]
 
     def given_up(self, now: float) -> list[tuple[bytes, T]]:
-        """Return the requests whose fallback took too long as well; they are over."""
+        """Remove and return the requests whose fallback was too slow as well."""
         over = [(r, item) for r, (until, item) in self._awaited.items() if until <= now]
         for request, _ in over:
             del self._awaited[request]

@@ -1,4 +1,4 @@
-"""How long answers take, as far as lately seen: quantiles of a decayed histogram. Pure.
+"""Recent latencies: quantiles of a decaying histogram. Pure.
 
 Buckets grow by 10 % from 0.1 ms to over a day, so a quantile is right to about 5 %. A sample
 weighs less the more samples, or the more time, came after it.
@@ -23,30 +23,29 @@ _RESCALE_AT = 1e100
 class Latencies:
     """Recent latencies of one replica's answers to one service."""
 
-    def __init__(self, half_life: float = 200.0, half_life_s: float = 60.0) -> None:
-        self._per_sample = 2.0 ** (1.0 / half_life)
-        self._half_life_s = half_life_s
+    per_sample = 2.0 ** (1.0 / 200.0)  # heavier than the one before: after 200 it weighs half
+    half_life_s = 60.0  # after so much time, too
+
+    def __init__(self) -> None:
         self._weights = [0.0] * _BUCKETS
         self._weight = 1.0  # of the next sample: grows, instead of all others shrinking
         self._total = 0.0
         self._sum = 0.0
         self._newest: float | None = None
-        self._cached: dict[float, tuple[float, float]] = {}
         self.samples = 0
 
     def add(self, took_s: float, now: float) -> None:
         """Count a latency, in seconds."""
         if self._newest is not None and now > self._newest:
-            self._weight *= 2.0 ** min((now - self._newest) / self._half_life_s, 60.0)
+            self._weight *= 2.0 ** min((now - self._newest) / self.half_life_s, 60.0)
         self._newest = now
-        self._weight *= self._per_sample
+        self._weight *= self.per_sample
         if self._weight > _RESCALE_AT:
             self._rescale()
         self._weights[_bucket(took_s)] += self._weight
         self._total += self._weight
         self._sum += self._weight * took_s
         self.samples += 1
-        self._cached.clear()
 
     def _rescale(self) -> None:
         scale = 1.0 / self._weight
@@ -57,17 +56,11 @@ class Latencies:
 
     def quantile_s(self, share: float) -> float | None:
         """Return the time within which this share of answers came; None before the first."""
-        return self._found(share)[0] if self.samples else None
+        return self._scan(share)[0] if self.samples else None
 
     def mean_below_s(self, share: float) -> float | None:
         """Return the mean of this share of answers, the fastest; None before the first."""
-        return self._found(share)[1] if self.samples else None
-
-    def _found(self, share: float) -> tuple[float, float]:
-        found = self._cached.get(share)
-        if found is None:
-            found = self._cached[share] = self._scan(share)
-        return found
+        return self._scan(share)[1] if self.samples else None
 
     def _scan(self, share: float) -> tuple[float, float]:
         """Return a quantile and the mean below it. From the top: interesting ones are high."""

@@ -1,4 +1,4 @@
-"""How busy a replica is, by its own words and by what one robot has sent there. Pure.
+"""A replica's load, by its own report and by what one robot has sent. Pure.
 
 A replica says with each answer and refusal how much it has to do (`Load`). Between two of them
 the robot counts what it sent itself. Several robots need no coordination: each sees the others
@@ -38,7 +38,7 @@ _TOO_FULL, _FULL = 0.95, 0.8  # a share of what replicas can do: from when on it
 
 
 class Handling(IntFlag):
-    """What a replica is asked to do with a request, beside running it."""
+    """How a replica should handle a request, besides running it."""
 
     NORMAL = 0
     DROP_IF_BUSY = 0x08  # a spare copy: drop it where it would have to wait
@@ -46,9 +46,11 @@ class Handling(IntFlag):
 
 
 class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
-    """What a replica says of one service with each answer and refusal.
+    """The load of one service, reported by a replica with each answer and refusal.
 
     Attributes:
+        waiting: Requests that wait for their turn.
+        running: Requests that the service has now.
         slots: How many it works on at once; 0 where that is not known yet.
         service_s: What it lately took for a request, divided by how many it had at once.
         spent_s: How long the request of this answer was at the replica.
@@ -62,7 +64,7 @@ class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice
 
 
 class Demand:
-    """How often a service was lately asked."""
+    """The recent request rate of a service."""
 
     def __init__(self) -> None:
         self._asked = 0.0
@@ -76,13 +78,13 @@ class Demand:
         return self._asked * math.exp((self._at - now) / _DEMAND_OVER_S)
 
     def replicas(self, able: int, service_s: float, now: float) -> int:
-        """Return how many would do, each taking `service_s`, if those able do not; else 0."""
+        """Return how many replicas would be enough at `service_s` each, if too few; else 0."""
         work = self._lately(now) / _DEMAND_OVER_S * service_s
         return math.ceil(work / _FULL) if work > _TOO_FULL * max(1, able) else 0
 
 
 class ReplicaLoad:
-    """What one robot knows of how busy a replica is. Not thread-safe: its owner holds a lock.
+    """One robot's estimate of a replica's load. Not thread-safe: its owner holds a lock.
 
     Attributes:
         service_s: How long it works on a request, as far as is known.
@@ -110,11 +112,11 @@ class ReplicaLoad:
     # -- what is believed -----------------------------------------------------------------
 
     def ahead(self, now: float) -> int:
-        """Return how many requests are believed to be there."""
+        """Return the estimated number of requests at the replica."""
         return len(self._at_work) + (self._others if now < self._others_until else 0)
 
     def free(self, now: float) -> bool:
-        """Whether a request that comes now is believed to begin at once, or nearly."""
+        """Whether a request that arrives now is expected to start (almost) at once."""
         if self.doubted:
             return False
         ahead = self.ahead(now)
@@ -127,7 +129,7 @@ class ReplicaLoad:
 
     @property
     def oldest_begun(self) -> float:
-        """When the oldest of ours began that it has not ended; infinite for none."""
+        """When the oldest of our open requests there began; infinity for none."""
         for begun, _ in self._at_work.values():
             return begun
         return NEVER
@@ -137,11 +139,11 @@ class ReplicaLoad:
         return now - max(self.oldest_begun, self.ended_at) if self._at_work else 0.0
 
     def avoided(self, now: float) -> bool:
-        """Whether others are to be asked, where there are any: it is doubted, or has failed."""
+        """Whether to prefer others: it is in doubt, or has failed."""
         return self.doubted or now < self._avoided_until
 
     def expected_s(self, now: float, typical_s: float) -> float:
-        """Return how long an answer to a request that is sent now is believed to take.
+        """Return the expected latency of a request sent now.
 
         Round trip, and one service time for it and for each request before it, less what the one at
         work has had; one that takes far too long is taken to go on for as long again. 0 for a
@@ -173,7 +175,7 @@ class ReplicaLoad:
         return self._delay_s
 
     def overdue_at(self, request: bytes, begun: float) -> float:
-        """Return when an attempt takes longer than nearly all do, and than it was to wait there."""
+        """Return when an attempt is slower than nearly all others and than its expected wait."""
         return self._at_work.get(request, (0.0, begun + self.delay_s()))[1]
 
     def doubtful_at(self, begun: float) -> float:
@@ -189,13 +191,13 @@ class ReplicaLoad:
     # -- what happens ---------------------------------------------------------------------
 
     def asked(self, request: bytes, now: float) -> None:
-        """Note an attempt that is about to be sent."""
+        """Note an attempt about to be sent."""
         expected_s = (self._rtt_s or 0.0) + self.service_s * (1 + self.ahead(now))
         self._at_work[request] = now, now + _LATE * max(self.delay_s(), expected_s)
         self.asked_at = now
 
     def heard(self, request: bytes, load: Load, now: float) -> None:
-        """Take its word; what was sent within the last round trip it had not seen then."""
+        """Take its reported load, plus what was sent within the last round trip."""
         since = now - (self._rtt_s or 0.0)
         seen = [id for id, (begun, _) in self._at_work.items() if begun <= since and id != request]
         there = load.waiting + load.running
@@ -224,17 +226,17 @@ class ReplicaLoad:
         self._took(took_s, now)
 
     def dropped(self, request: bytes) -> None:
-        """Note that an attempt has ended, and that it never worked on it."""
+        """Note that an attempt has ended without the replica working on it."""
         self._at_work.pop(request, None)
 
     def failed(self, request: bytes, now: float) -> None:
-        """Note that an attempt failed by its fault: one that fails at once is not quick."""
+        """Note that an attempt failed by its fault: failing at once is not being quick."""
         self._at_work.pop(request, None)
         self._avoided_s = min(_AVOIDED_LIMIT_S, max(_AVOIDED_S, 2 * self._avoided_s))
         self._avoided_until = now + self._avoided_s
 
     def overtaken(self, begun: float, now: float) -> None:
-        """Learn from an attempt that was stopped, if it took unusually long already."""
+        """Learn from a stopped attempt, if it was already unusually slow."""
         if now - begun >= self.delay_s():
             self._took(now - begun, now)
 
@@ -244,12 +246,12 @@ class ReplicaLoad:
             self.service_s = self.latencies.mean_below_s(LATE_SHARE) or 0.0
 
     def doubt(self, begun: float, now: float) -> bool:
-        """Doubt it where an attempt is long overdue and it has ended none since; whether it is."""
+        """Doubt it if an attempt is long overdue and none has ended since; return whether it is."""
         if self.ended_at < begun and now >= self.doubtful_at(begun):
             self.doubted = True
         return self.doubted
 
     def forget(self) -> None:
-        """Its link is new, or gone: nothing is on the way, and what was doubted is over."""
+        """Note that its link is new or gone: nothing is in flight, and doubts are over."""
         self._at_work.clear()
         self.doubted = False

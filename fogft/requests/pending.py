@@ -1,97 +1,134 @@
-"""One service's requests that await an answer, with what chooses and what decides. Pure.
+"""One service's unanswered requests, with its hedging and decision policies. Pure.
 
 Every step of a request's life is one method: it is begun, sent on, answered, refused, and
 closed. Each keeps the table, the policy and the decision in step, and returns what is to be
 done. Called under its owner's lock; the time is an argument.
 
-Owns: bringing `first_response`, `choose`, `decide` and `fallback` together.
-Not here: sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
+Every request has the replicas that work on it (its open attempts). The first success takes the
+request out of the table, so that whatever comes later is LATE by construction: a late answer can
+never reach another request, and no request is answered twice.
+
+An attempt ends as a success, a failure (refusal, crash, lost link) or a rejection: a real
+response that the service itself marks as not ok. A rejection is kept, and is returned only when
+nothing better can come. A replica that declined a request, failed it or came after it may be
+asked (again) even while others work on it, because those others may be frozen. Whether it is, is
+the policy's to say.
+
+Owns: which answer is returned, who may be asked, and when a request has nobody working on it.
+Not here: what an answer means (`decide`), who is asked (`choose`), when the fallback is
+(`fallback`), sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from enum import Enum
 from typing import Any, Generic, Protocol, TypeVar
 
 from fogft.model.refusal import Effect, Refusal
 from fogft.requests.alarms import Alarms
 from fogft.requests.choose import Choose
-from fogft.requests.decide import Decide, Judgement, Means
+from fogft.requests.decide import Decide, Judgement, Means, Pending
 from fogft.requests.fallback import FallbackTimer
-from fogft.requests.first_response import FirstResponse, Pending, Verdict
 from fogft.requests.load import NEVER, Load
 
 
 class Item(Protocol):
-    """What must be known of what is kept with a request."""
+    """The interface of an item kept with a request."""
 
     payload: bytes
+
+
+class Verdict(Enum):
+    """The verdict on the end of an attempt."""
+
+    WON = "won"  # return this answer; the request is closed
+    WAIT = "wait"  # another attempt is still open
+    IDLE = "idle"  # nobody works on it any more: try again, or return the rejection
+    LATE = "late"  # already answered, expired or never known: drop it
+    POISON = "poison"  # services died over it: it is not to be sent again
 
 
 T = TypeVar("T", bound=Item)
 Judged = tuple[Judgement, Pending[T] | None, Iterable[int], Verdict]
 
-
+ATTEMPTS = 3  # that one replica may fail of one request, before it is barred from it
+RETRY_FIRST_S = 0.02
+RETRY_LIMIT_S = 0.32
 POISON_DEATHS = 2  # once beside others, and then alone: that is no chance
 # So long after a death no request is at all replicas at once: another that kills would end them.
 CAUTIOUS_S = 60.0
 _SPREADS_AFTER_S = 1.0
 _LOOK_AGAIN_S = 0.02  # at a request for which nobody says when
+_NO_WAIT = (0.0, RETRY_FIRST_S / 2)
 
 
 class PendingRequests(Generic[T]):
-    """The requests of one service that await an answer.
+    """The unanswered requests of one service.
 
     Args:
         counts_deaths: Whether a request may be blamed for the death of a service that has it.
 
     Attributes:
         fallback: When the fallback is asked; None where there never was one.
+        held_bytes: Of all payloads together.
+        soonest_deadline: Of the requests, or sooner.
     """
 
     def __init__(self, choose: Choose, decide: Decide, *, counts_deaths: bool = False) -> None:
-        self.table: FirstResponse[T] = FirstResponse()
         self.held_bytes = 0
         self.choose = choose
         self.decide = decide
         self.fallback: FallbackTimer[Pending[T]] | None = None
+        self.soonest_deadline = NEVER
+        self._pending: dict[bytes, Pending[T]] = {}
+        # Those that some replica may have to be asked for, as far as is known, and from when on.
+        self._short: dict[bytes, float] = {}
         self._counts_deaths = counts_deaths
         self._cautious_until = -NEVER
         self._alarms = Alarms()
 
+    def __len__(self) -> int:
+        return len(self._pending)
+
+    def __contains__(self, request: bytes) -> bool:
+        return request in self._pending
+
     def get(self, request: bytes | None) -> Pending[T] | None:
-        """Return a request that still awaits its answer."""
-        return None if request is None else self.table.get(request)
+        """Return an unanswered request."""
+        return None if request is None else self._pending.get(request)
 
     def use(self, choose: Choose) -> None:
-        """Have another policy choose from now on; each request is put before it."""
+        """Switch to another hedging policy, which is asked about each request."""
         self.choose = choose
-        self.table.reconsider()
+        self._short = dict.fromkeys(self._pending, 0.0)
 
     # -- a request begins, and is sent to replicas ----------------------------------------
 
     def begin(
         self, request: bytes, item: T, able: Sequence[int], *, deadline: float, now: float
     ) -> Sequence[int]:
-        """Enter a request; return which replicas it goes to at once."""
+        """Add a request; return the replicas it goes to at once.
+
+        Raises:
+            ValueError: The id is under way already.
+        """
+        if request in self._pending:
+            raise ValueError("a request with this id is under way already")
         chosen = self.choose.first(request, able, now)
         if len(chosen) == len(able) > 1 and now < self._cautious_until:
             *chosen, spared = chosen
             self.choose.declined(request, spared, full=False)
-        pending = self.table.register(
-            request,
-            deadline=deadline,
-            item=item,
-            replicas=chosen,
-            now=now,
-            complete=len(chosen) == len(able),
-        )
+        pending = self._pending[request] = Pending(deadline, item, dict.fromkeys(chosen, now))
+        self.soonest_deadline = min(self.soonest_deadline, deadline)
+        if not chosen or len(chosen) < len(able):
+            self._short[request] = 0.0
         self.held_bytes += len(item.payload)
         self.decide.began(request, pending, able)
         return chosen
 
     def fallback_from(self, request: bytes, now: float, *, able: bool) -> float:
-        """Note a request for the fallback; return when that may have to be asked next."""
+        """Register a request with the fallback; return when that may have to be called next."""
         assert self.fallback is not None
         self.fallback.submitted(request, now)
         return self.fallback.look_at(able=able)
@@ -99,18 +136,19 @@ class PendingRequests(Generic[T]):
     def more(
         self, able: Sequence[int], now: float, *, newest_first: bool
     ) -> list[tuple[bytes, int]]:
-        """Return which requests go to which further replicas now."""
+        """Return the requests to send to further replicas now."""
         choose, steps = self.choose, []
         if choose.news:
             choose.news = False
-            self.table.reconsider()
-        short, soonest = self.table.short(now)
-        for request, pending in short[::-1] if newest_first else short:
+            self.use(choose)
+        due = [request for request, at in self._short.items() if at <= now]
+        soonest = min((at for at in self._short.values() if at > now), default=NEVER)
+        for request in due[::-1] if newest_first else due:
             choose.look_at = NEVER
-            chosen, again_at = self._next_for(request, pending, able, now)
+            chosen, again_at = self._next_for(request, able, now)
             steps += [(request, replica) for replica in chosen]
             if again_at > now:
-                self.table.look_at(request, again_at)
+                self._short[request] = again_at  # unless something happens to it
                 soonest = min(soonest, again_at)
             else:
                 soonest = min(soonest, now + _LOOK_AGAIN_S)
@@ -118,48 +156,74 @@ class PendingRequests(Generic[T]):
         return steps
 
     def _next_for(
-        self, request: bytes, pending: Pending[T], able: Sequence[int], now: float
+        self, request: bytes, able: Sequence[int], now: float
     ) -> tuple[Sequence[int], float]:
         """Return whom a request goes to now, and when to look at it again if nothing happens."""
-        candidates, rests_until = self.table.candidates(pending, able, now)
+        pending = self._pending[request]
+        rests_until = {
+            replica: pending.waits.get(replica, _NO_WAIT)[0]
+            for replica in able
+            if replica not in pending.open and replica not in pending.barred
+        }
+        candidates = [replica for replica, at in rests_until.items() if at <= now]
         room = len(able)
         if pending.deaths:  # alone
-            room = 0 if pending.open else 1
+            if pending.open and now < pending.alone_until:
+                return (), pending.alone_until
+            room = 1
         elif now < self._cautious_until and pending.open:
             waited = now >= max(pending.open.values()) + _SPREADS_AFTER_S
             room -= len(pending.open) + (0 if waited else 1)
             candidates = candidates[: max(0, room)]
         elif not candidates:
-            return (), rests_until
+            return (), min(rests_until.values(), default=NEVER)
         if room <= 0:
             return (), now
         chosen = self.choose.more(request, pending.open, candidates, now)[:room]
         return chosen, self.choose.look_at if self.choose.look_at < NEVER else now
 
     def attempt(self, request: bytes, replica: int, now: float) -> Pending[T] | None:
-        """Enter a further attempt; None where it is not wanted any more."""
-        pending = self.table.attempt(request, replica, now)
-        if pending is None:
+        """Add a further attempt; None if it is no longer wanted."""
+        pending = self._pending.get(request)
+        if pending is None or replica in pending.open or replica in pending.barred:
             self.choose.declined(request, replica, full=False)
-        elif pending.deaths:
-            pending.alone_at = replica
+            return None
+        pending.open[replica] = now
+        if pending.deaths:
+            pending.alone_at.add(replica)
+            pending.alone_until = (now + pending.deadline) / 2
         return pending
 
     def declined(self, request: bytes, replica: int) -> None:
-        """A replica's link did not take an attempt."""
-        self.table.declined(request, replica)
+        """Note that a link did not accept an attempt."""
+        pending = self._pending.get(request)
+        if pending is not None and replica in pending.open:
+            self._ended(request, pending, replica)
         self.choose.declined(request, replica, full=True)
 
     def came(self, replicas: Iterable[int]) -> None:
-        """These replicas can be asked (again)."""
+        """Note that these replicas can be asked (again)."""
         for replica in replicas:
-            self.table.came(replica)
+            for request, pending in self._pending.items():
+                pending.waits.pop(replica, None)
+                if replica not in pending.open and replica not in pending.barred:
+                    self._short[request] = 0.0
             self.choose.forget(replica)
 
     def left(self, replicas: Iterable[int]) -> None:
-        """These replicas cannot be asked for now."""
+        """Note that these replicas cannot be asked for now."""
         for replica in replicas:
             self.choose.forget(replica)
+
+    def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
+        """Note that a replica restarted the subject of some requests: its answers are void."""
+        for request, pending in self._pending.items():
+            if about(pending.item):
+                pending.barred.discard(replica)
+                pending.failures.pop(replica, None)
+                pending.waits.pop(replica, None)
+                if replica not in pending.open:
+                    self._short[request] = 0.0
 
     # -- how its attempts end -------------------------------------------------------------
 
@@ -175,129 +239,163 @@ class PendingRequests(Generic[T]):
     ) -> Judged[T]:
         """Take an answer.
 
+        Args:
+            request: What it is about; None for no request.
+            load: What the replica has to do, if it says so.
+
         Returns:
             What it means; the request that it answers, None where it comes too late or is no
             success; who else is to stop working on that; what is to be done where it goes on.
         """
         if load is not None and request is not None:
             self.choose.heard(request, replica, load, now)
-        pending = None if request is None else self.table.get(request)
+        pending = None if request is None else self._pending.get(request)
         means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
             return means, None, (), Verdict.LATE
         if means is Means.SUCCESS:
-            pending = self.table.succeeded(request, now)
-            if pending is None:
+            if pending is None or now >= pending.deadline:
                 self.choose.late(request, replica, now, answered=True)
                 return means, None, (), Verdict.LATE
             for other in pending.died_at - {replica}:
                 self._alarms.was_false(other, now)
             losers = self.choose.answered(request, pending.open, replica, load, now)
-            self._closed(request, pending)
+            self._close(request, pending)
             return means, pending, losers, Verdict.WON
         verdict = Verdict.LATE
         if means is Means.UNDECIDED:
-            verdict = self.table.failed(request, replica, now, counts=False, bar=True)
-            verdict = verdict if pending is None else Verdict.WAIT
+            self._failed(request, pending, replica, now, counts=False, bar=True)
+            verdict = Verdict.LATE if pending is None else Verdict.WAIT
         elif means is Means.REJECTION or means is Means.WEAKER_REJECTION:
-            weaker = means is Means.WEAKER_REJECTION
-            kept = pending.rejection if weaker and pending is not None else None
-            verdict = self.table.rejected(request, replica, payload if kept is None else kept)
-            if verdict is Verdict.LATE:
+            if pending is None or replica not in pending.open:
                 self.choose.late(request, replica, now, answered=True)
             else:
+                if means is Means.REJECTION or pending.rejection is None:
+                    pending.rejection = payload
+                pending.barred.add(replica)
+                verdict = self._ended(request, pending, replica)
                 self.choose.failed(request, replica, now, fault=False)
             means = Means.REJECTION
         return means, None, (), verdict
 
     def refused(self, request: bytes, replica: int, refusal: Refusal, now: float) -> Verdict:
-        """Take a refusal; return POISON where so many services died that it is sent no more."""
-        pending = self.table.get(request)
+        """Take a refusal; return POISON if the request crashed too many services."""
+        pending = self._pending.get(request)
         crashed = refusal is Refusal.CRASHED and self._counts_deaths
         if crashed and self._alarms.believed(replica, now):
             self._cautious_until = now + CAUTIOUS_S
             if pending is not None and replica in pending.open:
                 # Beside others it is but suspected: any of them may have been the cause.
-                alone = replica == pending.alone_at
+                alone = replica in pending.alone_at
                 pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
+                pending.alone_until = (now + pending.deadline) / 2
                 pending.died_at.add(replica)
-        verdict = self.table.failed(
-            request,
-            replica,
-            now,
-            counts=Effect.BLAMELESS not in refusal.effect,
-            bar=Effect.FINAL in refusal.effect,
-        )
+        effect = refusal.effect  # of a lost link: the replica may never have seen the request
+        counts, bar = Effect.BLAMELESS not in effect, Effect.FINAL in effect
+        verdict = self._failed(request, pending, replica, now, counts=counts, bar=bar)
         if verdict is Verdict.LATE:
             self.choose.late(request, replica, now, answered=False)
         else:
-            self.choose.failed(request, replica, now, fault=Effect.FAULT in refusal.effect)
+            self.choose.failed(request, replica, now, fault=Effect.FAULT in effect)
         poison = pending is not None and pending.deaths >= POISON_DEATHS
         return Verdict.POISON if poison else verdict
 
+    def _failed(
+        self,
+        request: bytes,
+        pending: Pending[T] | None,
+        replica: int,
+        now: float,
+        *,
+        counts: bool,
+        bar: bool,
+    ) -> Verdict:
+        """Note a failed attempt. The replica is avoided for a moment, longer each time.
+
+        Args:
+            counts: Whether it counts towards the limit of attempts.
+            bar: Never ask this replica for this request again.
+        """
+        if pending is None or replica not in pending.open:
+            return Verdict.LATE
+        failures = pending.failures[replica] = pending.failures.get(replica, 0) + counts
+        wait_s = min(2 * pending.waits.get(replica, _NO_WAIT)[1], RETRY_LIMIT_S)
+        pending.waits[replica] = (now + wait_s, wait_s)
+        if bar or failures >= ATTEMPTS:
+            pending.barred.add(replica)
+        return self._ended(request, pending, replica)
+
+    def _ended(self, request: bytes, pending: Pending[T], replica: int) -> Verdict:
+        del pending.open[replica]
+        self._short[request] = 0.0
+        return Verdict.WAIT if pending.open else Verdict.IDLE
+
     # -- a request ends -------------------------------------------------------------------
 
+    def idle(self) -> list[bytes]:
+        """Return the requests that no replica works on and that have a rejected answer."""
+        found = ((request, self._pending[request]) for request in self._short)
+        return [r for r, pending in found if pending.rejection is not None and not pending.open]
+
     def settle(self, request: bytes, able: Iterable[int]) -> Pending[T] | None:
-        """Take a request out whose rejection is the answer: nobody else can be asked."""
-        pending = self.table.get(request)
+        """Remove a request that is answered by its rejection, as no other replica can be asked."""
+        pending = self._pending.get(request)
         if pending is None or pending.open or pending.rejection is None:
             return None
         if any(replica not in pending.barred for replica in able):
             return None
-        self.table.close(request)
-        self._closed(request, pending)
+        self._close(request, pending)
         return pending
 
-    def idle(self) -> list[bytes]:
-        """Return the requests that nobody works on, where some were answered, if not well."""
-        return self.table.idle() if self.table.has_rejected else []
-
     def stop(self, request: bytes, now: float) -> Pending[T] | None:
-        """Take a request out that its caller does not want any more."""
-        pending = self.table.close(request)
+        """Remove a request that its caller cancelled."""
+        pending = self._pending.get(request)
         if pending is not None:
-            self._stopped(request, pending, now)
+            self.choose.stopped(request, pending.open, now)
+            self._close(request, pending)
         return pending
 
     def expire(self, now: float) -> list[tuple[bytes, Pending[T]]]:
-        """Take out every request whose deadline has come, oldest first."""
-        expired = self.table.expire(now)
+        """Remove and return every request past its deadline, oldest first."""
+        if now < self.soonest_deadline:
+            return []
+        expired = [entry for entry in self._pending.items() if entry[1].deadline <= now]
         for request, pending in expired:
-            self._given_up(request, pending, now, expired=True)
+            self.choose.stopped(request, pending.open, now, expired=True)
+            self._take_out(request, pending)
+        left = (pending.deadline for pending in self._pending.values())
+        self.soonest_deadline = min(left, default=NEVER)
         return expired
 
     def give_up(self, request: bytes, now: float) -> Pending[T] | None:
-        """Take a request out that no replica is to have any more; the fallback still may."""
-        pending = self.table.close(request)
+        """Remove a request that no replica may get any more; the fallback still may."""
+        pending = self._pending.get(request)
         if pending is not None:
             self._alarms.were_right(pending.died_at)
-            self._given_up(request, pending, now, expired=False)
+            self.choose.stopped(request, pending.open, now)
+            self._take_out(request, pending)
         return pending
-
-    def _given_up(self, request: bytes, pending: Pending[T], now: float, *, expired: bool) -> None:
-        self.choose.stopped(request, pending.open, now, expired=expired)
-        self.held_bytes -= len(pending.item.payload)
-        self.decide.closed(request, pending)
 
     def fallback_answered(
         self, request: bytes, now: float, *, ok: bool
     ) -> tuple[Pending[T] | None, bool]:
-        """Take the fallback's answer; return the request that ends, and if it was overdue."""
+        """Take the fallback's answer; return the request it ends, and whether that was overdue."""
         assert self.fallback is not None
         overdue = self.fallback.answered(request)
         if overdue is not None or not ok:
             return overdue, True
-        pending = self.table.succeeded(request, now)
-        if pending is not None:
-            self._stopped(request, pending, now)
-        return pending, False
+        pending = self._pending.get(request)
+        if pending is None or now >= pending.deadline:
+            return None, False
+        return self.stop(request, now), False
 
-    def _stopped(self, request: bytes, pending: Pending[T], now: float) -> None:
-        self.choose.stopped(request, pending.open, now)
-        self._closed(request, pending)
-
-    def _closed(self, request: bytes, pending: Pending[T]) -> None:
-        self.held_bytes -= len(pending.item.payload)
-        self.decide.closed(request, pending)
+    def _close(self, request: bytes, pending: Pending[T]) -> None:
+        self._take_out(request, pending)
         if self.fallback is not None:
             self.fallback.ended(request)
+
+    def _take_out(self, request: bytes, pending: Pending[T]) -> None:
+        del self._pending[request]
+        self._short.pop(request, None)
+        self.held_bytes -= len(pending.item.payload)
+        self.decide.closed(request, pending)

@@ -1,4 +1,4 @@
-"""The answer that k replicas agree on, and who keeps disagreeing. Pure.
+"""Quorum: the answer that k replicas agree on, and replicas that keep disagreeing. Pure.
 
 Every answer to a request is a ballot. An answer with which `quorum` ballots agree, its own
 included, is final; every ballot is then judged by it, also those that come later. A minority
@@ -6,7 +6,7 @@ is never returned, and without a final answer nobody is blamed: two that differ 
 who is wrong.
 
 Owns: ballots, final answers (for a while), each replica's record.
-Not here: what agreeing means (`fogft.ros.comparison`), requests and deadlines (`first_response`).
+Not here: what agreeing means (`fogft.ros.comparison`), requests and deadlines (`pending`).
 """
 
 from __future__ import annotations
@@ -15,8 +15,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
-from fogft.requests.decide import Decide, Judgement, Means
-from fogft.requests.first_response import Pending
+from fogft.requests.decide import Decide, Judgement, Means, Pending
 
 WINDOW = 20  # judged answers of a replica that count
 LIMIT = 3  # disagreements among them that make it flagged
@@ -33,10 +32,10 @@ class Comparison(Protocol):
     """Reads responses and compares them."""
 
     def read(self, payload: bytes) -> Any:
-        """Return what a response says. Raises RosError for bytes that are none."""
+        """Read a response. Raises RosError for invalid bytes."""
 
     def agree(self, one: Any, other: Any) -> bool:
-        """Whether two responses say the same, within what is tolerated. Symmetric."""
+        """Whether two responses agree, within the tolerances. Symmetric."""
 
 
 class Quorum(Decide):
@@ -44,15 +43,18 @@ class Quorum(Decide):
 
     Replicas go on working on a request that has its answer: what they would have said is what
     tells a wrong one.
+
+    Args:
+        newly_flagged: Called with a replica that has disagreed once too often, and how often.
     """
+
+    kept = 256  # final answers, to judge late ballots by
 
     def __init__(
         self,
         quorum: int,
         comparison: Comparison,
         newly_flagged: Callable[[int, int], None] = lambda replica, count: None,
-        *,
-        kept: int = 256,
     ) -> None:
         super().__init__()
         self.flagged: set[int] = set()
@@ -61,25 +63,24 @@ class Quorum(Decide):
         self._agree = comparison.agree
         self._read = comparison.read
         self._newly_flagged = newly_flagged
-        self._kept = kept
         self._open: dict[bytes, list[Ballot]] = {}
         self._final: OrderedDict[bytes, Any] = OrderedDict()
         self._record: dict[int, deque[bool]] = {}
 
     def read(self, payload: bytes) -> Any:
-        """Return what it says."""
+        """Read a response."""
         return self._read(payload)
 
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
-        """Take a vote; it is a success if it decides."""
+        """Take a vote; it is a success if it completes a quorum."""
         if pending is None and id not in self._final:
             return Means.UNDECIDED  # it has expired
         return Means.SUCCESS if self.vote(id, Ballot(replica, reading)) else Means.UNDECIDED
 
     def vote(self, request: bytes, ballot: Ballot) -> bool:
-        """Take an answer; whether its ballot decides. One of a flagged replica is only judged."""
+        """Take an answer; return whether it decides. Answers of flagged replicas do not count."""
         if request in self._final:
             self._judge(ballot, self._final[request])
             return False
@@ -94,7 +95,7 @@ class Quorum(Decide):
             return False
         del self._open[request]
         self._final[request] = ballot.value
-        if len(self._final) > self._kept:
+        if len(self._final) > self.kept:
             self._final.popitem(last=False)
         for other in ballots:
             self._judge(other, ballot.value)
@@ -111,11 +112,11 @@ class Quorum(Decide):
                 self._newly_flagged(replica, self.disagreed[replica])
 
     def closed(self, request: bytes, pending: Pending[Any]) -> None:
-        """Forget the votes on a request that has none that decides."""
+        """Forget the votes on a request without a quorum."""
         self._open.pop(request, None)
 
     def hears_out(self, request: bytes) -> bool:
-        """Whether it was decided (and not long ago): then the others are judged by it."""
+        """Whether it was decided recently, so that later answers are compared with it."""
         return request in self._final
 
     def report(self) -> dict[str, Any]:

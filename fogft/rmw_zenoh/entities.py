@@ -71,7 +71,7 @@ class Server:
         self._declare(hash)
 
     def clients_hash(self, hash: str) -> None:
-        """Offer it to a client whose type has this hash, too."""
+        """Also offer it to clients whose type has this hash."""
         self._worker.add(partial(self._declare, hash))
 
     def _declare(self, hash: str) -> None:
@@ -177,7 +177,7 @@ class Client:
         self._worker = _worker(self._name)
 
     def available(self) -> bool:
-        """Whether anybody offers this service."""
+        """Whether any node offers this service."""
         return self.servers() > 0
 
     def mismatch(self) -> str:
@@ -185,7 +185,7 @@ class Client:
         return ""
 
     def servers(self) -> int:
-        """Count those who offer it."""
+        """Count the nodes that offer it."""
         return len(self._hashes()) if self.is_open else 0
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
@@ -253,7 +253,7 @@ class Client:
         self._waiting.pop(ticket, None)
 
     def forget(self, ticket: int) -> None:
-        """Drop what is kept for a request; unknown tickets are fine."""
+        """Drop a pending request; unknown tickets are ignored."""
         with self._lock:
             waiting = self._waiting.pop(ticket, None)
         if waiting is not None:

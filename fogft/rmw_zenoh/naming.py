@@ -1,4 +1,4 @@
-"""How `rmw_zenoh` names services on the wire, and what it attaches to requests. Pure.
+"""`rmw_zenoh`'s key expressions, liveliness tokens and attachments. Pure.
 
 A service is a queryable at ``domain/name/type/hash``. Who offers and who calls is told by
 liveliness tokens ``@ros2_lv/domain/session/node/entity/kind/enclave/namespace/node name``, and
@@ -73,9 +73,9 @@ class Token:
 
 
 def read_token(key: str) -> Token | None:
-    """Return what a token's key says; None where it is none of a node or a service."""
+    """Parse a token's key; None if it is not of a node or service."""
     parts = key.split("/")
-    if len(parts) < _NODE_PARTS or parts[0] != ROOT or not parts[1].isdigit():
+    if len(parts) < _NODE_PARTS or parts[0] != ROOT or not parts[1].isdecimal():
         return None
     domain, session, node_id, id, kind = int(parts[1]), *parts[2:6]
     namespace, node = _deep(parts[7]), parts[8]
@@ -117,12 +117,12 @@ def ros_type(dds_name: str) -> str:
 
 
 def request_attachment(sequence: int, sent_ns: int, gid: bytes) -> bytes:
-    """Return what goes with a client's n-th request, sent so many nanoseconds after 1970."""
+    """Return the attachment of a client's n-th request, with its time in ns since 1970."""
     return struct.pack("<qqB", sequence, sent_ns, _GID_BYTES) + gid
 
 
 def response_attachment(of_request: bytes, sent_ns: int) -> bytes:
-    """Return what goes with a response: the request's own number and GID, sent at another time.
+    """Return the attachment of a response: the request's number and GID, with a new time.
 
     A form that is not known goes back as it came, so that the client finds its number in it.
     """
@@ -167,7 +167,7 @@ class Graph:
         self._lock = threading.Lock()
 
     def put(self, key: str) -> Token | None:
-        """Take a token up; return it if it is new and another session's."""
+        """Add a token; return it if it is new and of another session."""
         token = read_token(key)
         if token is None or token.session == self._own or token.kind not in (SERVER, CLIENT):
             return None
@@ -177,7 +177,7 @@ class Graph:
         return token if new else None
 
     def drop(self, key: str) -> None:
-        """Forget a token. Unknown ones are fine."""
+        """Remove a token. Unknown ones are ignored."""
         with self._lock:
             self._tokens.pop(key, None)
 
@@ -191,7 +191,7 @@ class Graph:
         return sorted(t.hash for t in self._all() if (t.kind, t.service, t.type) == wanted)
 
     def node_of(self, service: str, client: bytes) -> ClientNode | None:
-        """Return the node that calls a service, if there is only one.
+        """Return the node that calls a service, if there is exactly one.
 
         Of several, `client` (a GID) does not tell which: it is a hash of the token in a way of
         `rmw_zenoh`'s own.
@@ -212,7 +212,7 @@ class Graph:
         return [t.service for t in self._all() if (t.kind, t.node, t.namespace) == node]
 
     def hash_of(self, type_name: str) -> str:
-        """Return the hash of a type as anybody here has it; empty where nobody says."""
+        """Return the hash of a type in any node's token; empty if unknown."""
         found = sorted(token.hash for token in self._all() if token.type == type_name)
         return found[0] if found else ""
 

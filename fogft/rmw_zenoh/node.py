@@ -4,8 +4,14 @@ Services pass through as bytes. What a type is nobody here knows; that two ends 
 one is told by its hash, which is part of every key: a server's stands in its token, a client's
 in its own.
 
-Owns: the session, the graph, what is offered and called. Not here: requests (`entities`),
-settings (`session`), names (`rmw_zenoh.naming`).
+Its session is configured as theirs are: a peer that finds the others by the router of its machine,
+and then talks to them directly, so that it outlives the router. ``ZENOH_SESSION_CONFIG_URI`` (a
+file) takes the place of all settings, ``ZENOH_CONFIG_OVERRIDE`` (``key=value;key=value``) of some,
+as for every node.
+
+Owns: the session and its settings, the graph, what is offered and called. Not here: requests
+(`entities`), names (`rmw_zenoh.naming`), settings of links (`fogft.link.zenoh.settings`), which
+never meet such a session.
 """
 
 from __future__ import annotations
@@ -22,9 +28,10 @@ import zenoh
 from zenoh import handlers
 
 from fogft.errors import RosError
+from fogft.link.zenoh import settings
 from fogft.model.cdr import Shape
 from fogft.model.type_definition import REQUEST, RESPONSE
-from fogft.rmw_zenoh import naming, session
+from fogft.rmw_zenoh import naming
 from fogft.rmw_zenoh.entities import Client, Server
 from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
 from fogft.ros import vendors
@@ -72,7 +79,7 @@ class RmwZenohNode:
         self._probes = NodeProbes(self)
         self._lock = threading.Lock()
         self._open = True
-        config = session.settings_from(environ)
+        config = settings_from(environ)
         try:
             self._session: Any = zenoh.open(config)
             self._start()
@@ -110,7 +117,7 @@ class RmwZenohNode:
 
     @property
     def alive(self) -> bool:
-        """Whether it is open."""
+        """Whether the node is open."""
         return self._open and not self._session.is_closed()
 
     def serve(
@@ -145,13 +152,16 @@ class RmwZenohNode:
         return server
 
     def client(self, name: str, type_name: str) -> Client:
-        """Make a client of a service. Raises RosError: the node is closed."""
+        """Create a client of a service. Raises RosError: the node is closed."""
         servers = functools.partial(self.graph.hashes, SERVER, name, type_name)
         fault = self._fault_of(type_name, REQUEST)
         made: Client = self._add(
             lambda: Client(self._session, self._tokens(CLIENT, name, type_name), servers, fault)
         )
         return made
+
+    def look(self) -> None:
+        """Nothing: Zenoh's timers do not depend on the system clock."""
 
     def _tokens(self, kind: str, name: str, type_name: str) -> Callable[[str], Token]:
         id = str(next(self._numbers))
@@ -170,7 +180,7 @@ class RmwZenohNode:
             return made
 
     def close(self) -> None:
-        """Close all that was made here, and the session. Repeatable."""
+        """Close all services and clients, and the session. Repeatable."""
         with self._lock:
             if not self._open:
                 return
@@ -182,6 +192,57 @@ class RmwZenohNode:
 
 def _domain(environ: Mapping[str, str]) -> int:
     text = environ.get(_DOMAIN) or "0"
-    if not text.isdigit():
+    if not text.isdecimal():
         raise RosError(f"`{_DOMAIN}={text}` is not a ROS domain", "set it to a number, such as 7")
     return int(text)
+
+
+FILE, OVERRIDE = "ZENOH_SESSION_CONFIG_URI", "ZENOH_CONFIG_OVERRIDE"
+ROUTER = "tcp/localhost:7447"
+
+SETTINGS: dict[str, Any] = {
+    "mode": "peer",
+    "connect/endpoints": [ROUTER],
+    "connect/timeout_ms": -1,  # a router that starts later is found then
+    "connect/exit_on_failure": False,
+    "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+    "listen/endpoints": ["tcp/localhost:0"],
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": True,
+    "scouting/gossip/target": {"router": ["router", "peer"], "peer": ["router"]},
+    "scouting/gossip/autoconnect": {"router": [], "peer": ["router", "peer"]},
+    "scouting/gossip/autoconnect_strategy": {
+        "peer": {"to_router": "always", "to_peer": "greater-zid"}
+    },
+    "queries_default_timeout": 600_000,
+    "transport/shared_memory/enabled": False,
+    "transport/link/rx/max_message_size": 1 << 30,
+}
+
+
+def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
+    """Return the Zenoh configuration of an environment.
+
+    Raises:
+        RosError: A variable names no configuration, or is none.
+    """
+    path = environ.get(FILE)
+    try:
+        made = zenoh.Config.from_file(path) if path else settings.to_zenoh(SETTINGS)
+    except Exception as error:
+        raise RosError(f"`{FILE}={path}` cannot be used: {error}") from error
+    settings.to_zenoh({})  # the runtime's own wish, whoever configures the session
+    for key, value in _overrides(environ.get(OVERRIDE, "")):
+        try:
+            made.insert_json5(key, value)
+        except Exception as error:
+            raise RosError(
+                f"`{OVERRIDE}` cannot be used at `{key}`: {error}",
+                'write `key=value;key=value`, such as `connect/endpoints=["tcp/10.0.0.5:7447"]`',
+            ) from error
+    return made
+
+
+def _overrides(text: str) -> list[tuple[str, str]]:
+    pairs = [pair.partition("=") for pair in text.split(";") if pair.strip()]
+    return [(key.strip(), value.strip()) for key, _, value in pairs]

@@ -1,4 +1,4 @@
-"""Whether two serialised responses say the same: compared field by field, floats with tolerance.
+"""Compare two serialised responses field by field, floats with tolerance.
 
 Bytes cannot be compared: the padding of CDR is whatever lay in memory. So both are made
 Python messages, which plain services never need.
@@ -96,5 +96,5 @@ def _check_float(message_type: Any, type_name: str, path: str) -> None:
 
 
 def check_tolerances(type_name: str, tolerances: Mapping[str, float]) -> str | None:
-    """Return why responses cannot be compared so, with what to do; None if they can."""
+    """Return why responses cannot be compared with these tolerances, with a hint; else None."""
     return trouble(partial(Comparison, type_name, tolerances))

@@ -1,4 +1,4 @@
-"""The services and clients of a node: what may be called from which thread.
+"""The services and clients of a node, and which thread may call what.
 
 A take loop calls `drain` and `destroy`; everything else may come from any thread. Each
 entity has one lock: over *send and insert*, so that a response never comes before its
@@ -70,7 +70,7 @@ class Server:
         self._pacer = Pacer(self._send, probes, service.service_name)
 
     def respond(self, handle: Any, payload: bytes) -> None:
-        """Send the serialised response; in a burst, when the client can bear it."""
+        """Send the serialised response; in a burst, paced to the client."""
         self._pacer.respond(handle, payload)
 
     def _send(self, handle: Any, payload: bytes) -> None:
@@ -83,7 +83,7 @@ class Server:
         self._withdraw(self)
 
     def drain(self) -> None:
-        """Deliver what has arrived. Take loop only.
+        """Deliver received messages. Take loop only.
 
         Where requests came one at a time lately, the first does not wait until ROS was asked for
         another one: it takes no part in a burst that begins with it.
@@ -184,7 +184,7 @@ class Client:
             return 0
 
     def mismatch(self) -> str:
-        """Say why no server that is there can be called; looked up when others are there."""
+        """Return why none of the servers can be called; else empty."""
         count = self.servers()
         if not count or count != self._trouble[0]:
             self._trouble = count, self._mismatch()
@@ -200,7 +200,7 @@ class Client:
         return ticket
 
     def forget(self, ticket: int) -> None:
-        """Drop what is kept for a request; unknown tickets are fine."""
+        """Drop a pending request; unknown tickets are ignored."""
         with self._lock:
             self._pending.pop(ticket, None)
 
@@ -209,7 +209,7 @@ class Client:
         self._withdraw(self)
 
     def drain(self) -> None:
-        """Deliver what has arrived. Take loop only."""
+        """Deliver received messages. Take loop only."""
         for _ in range(BURST):
             try:
                 taken = self.take()

@@ -1,4 +1,4 @@
-"""The environment that ROS 2 processes need here, and what is in force.
+"""The environment variables of ROS 2 processes, and the current ones.
 
 `prepare` must run before the first node is made, best before rclpy is imported.
 Settings of the user are never overridden; ``ROS_DOMAIN_ID``, ``ROS_LOCALHOST_ONLY`` and
@@ -80,7 +80,7 @@ def profile_in_force(segment_bytes: int) -> bool:
 
 
 def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
-    """Choose the shared-memory profile where the user has chosen none. Returns whether it did.
+    """Set the shared-memory profile unless the user has set one; return whether it did.
 
     It does not where /dev/shm is small, as containers have it by default (64 MB): Fast DDS
     would report errors and fall back to UDP.
@@ -99,7 +99,7 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
 
 
 def child_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return the environment for a command of the user's, in whatever installation it lives.
+    """Return the environment for a user's command, in any Python installation.
 
     Undoes what the ROS wheels' start-up hook did for this process: a child in the same
     virtual environment does it again for itself, and any other child must not find our
@@ -127,7 +127,7 @@ def _added_by_wheels(folder: Path) -> bool:
 
 
 def describe(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Return what ROS 2 there is and what is in force, for people. Imports rclpy; never raises.
+    """Describe the ROS 2 installation and settings, for people. Imports rclpy; never raises.
 
     Keys: ``rclpy`` (version and place, or why it is missing), ``distribution``, ``source``,
     ``rmw``, ``domain``, ``discovery``, ``profile``, ``shared_memory_free_mb``.
@@ -182,7 +182,7 @@ def _shared_memory_free_bytes() -> int:
 
 
 def _rclpy_version(place: Path) -> str:
-    for name in ("rclpy", "ros-rclpy"):
+    for name in ("ros-rclpy", "rclpy"):  # a wheel has rclpy's own record too, of another version
         for distribution in metadata.distributions(name=name, path=[str(place.parent)]):
             return distribution.version
     return "unknown"

@@ -1,4 +1,4 @@
-"""Keep glibc from giving large message buffers back to the system after each message.
+"""Keep glibc from returning large message buffers to the system after each message.
 
 A 0.9 MB buffer lies above malloc's threshold for mapping memory of its own; taking and
 dropping one costs hundreds of page faults: 0.75 ms against 0.05 ms when it is kept. So it
@@ -22,7 +22,7 @@ _ARENAS = 2  # each thread would have its own, and each keep what its own burst 
 
 
 def tune() -> bool:
-    """Tune this process's malloc. Returns whether it took effect: only glibc has the knobs."""
+    """Tune this process's malloc; return whether it took effect (glibc only)."""
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (OSError, AttributeError):
@@ -36,7 +36,7 @@ def tune() -> bool:
 
 
 def own_bytes() -> int:
-    """Return this process's own memory: what no file stands behind (RssAnon); 0 if unknown."""
+    """Return this process's anonymous memory (RssAnon) in bytes; 0 if unknown."""
     try:
         found = re.search(r"RssAnon:\s+(\d+) kB", Path("/proc/self/status").read_text())
     except OSError:  # there is no descriptor left
@@ -45,7 +45,7 @@ def own_bytes() -> int:
 
 
 def give_back() -> None:
-    """Give all memory that is free back to the system; some milliseconds. Only with glibc."""
+    """Return free memory to the system; takes some milliseconds. Only with glibc."""
     try:
         trim = ctypes.CDLL(None).malloc_trim
     except (OSError, AttributeError):
@@ -54,23 +54,19 @@ def give_back() -> None:
 
 
 class Trimmer:
-    """Gives memory back, now and then, when this process holds much more than it needs."""
+    """Returns memory to the system from time to time if this process holds far too much."""
 
-    def __init__(
-        self,
-        above_bytes: int = 64 << 20,
-        every_s: float = 5.0,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._above_bytes = above_bytes
-        self._every_s = every_s
+    above_bytes = 64 << 20
+    every_s = 5.0
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._looked_at = clock()
 
     def look(self) -> None:
-        """Give memory back if it is time and there is much."""
+        """Return memory to the system if it is time and there is much."""
         now = self._clock()
-        if now - self._looked_at >= self._every_s:
+        if now - self._looked_at >= self.every_s:
             self._looked_at = now
-            if own_bytes() > self._above_bytes:
+            if own_bytes() > self.above_bytes:
                 give_back()

@@ -1,21 +1,23 @@
-"""Python messages from and to bytes. No middleware is given bytes of another shape.
+"""Convert Python messages to and from bytes, which are checked first.
 
 CycloneDDS ends the process over a message of fewer than four bytes, and takes some that Fast DDS
 refuses. So bytes are walked along their type first (`fogft.model.cdr`).
 
-Owns: rclpy's two functions, default responses, boolean fields.
-Not here: C messages (`serialised`), which are checked by the same walk.
+Owns: rclpy's two functions, default responses, boolean fields, one status list of an action out of
+those of its replicas. Not here: C messages (`serialised`), which are checked by the same walk;
+which status counts (`fogft.topics.goals`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Any
 
 from fogft.errors import RosError, Unreadable
 from fogft.model.cdr import NUMBER_BYTES, Shape
 from fogft.ros.types import load_service_type, shape, trouble
+from fogft.topics import goals
 
 _XCDR1_HEADERS = (b"\x00\x00", b"\x00\x01")  # big and little endian
 
@@ -28,7 +30,7 @@ def to_bytes(message: Any) -> bytes:
 
 
 def from_bytes(payload: bytes, message_type: Any) -> Any:
-    """Read a serialised message back. Raises Unreadable."""
+    """Deserialise a message. Raises Unreadable."""
     from rclpy.serialization import deserialize_message
 
     fault = _shape_of(message_type).fault(payload)
@@ -98,5 +100,29 @@ def fixed_offset(fields: dict[str, str], field: str) -> int | None:
 
 
 def check_ok_field(name: str, field: str) -> str | None:
-    """Return why a type's response has no such boolean field, with what to do; None if it has."""
+    """Return why a type's response lacks a boolean field, with a hint; None if it has it."""
     return trouble(partial(bool_field, name, field))
+
+
+def merged_status(said: Mapping[int, bytes]) -> bytes | None:
+    """Return one `action_msgs/msg/GoalStatusArray` (CDR) from the replicas' last ones.
+
+    None where a list cannot be read; what cannot be read comes from no action server.
+    """
+    from action_msgs.msg import GoalStatusArray
+
+    entries: dict[bytes, Any] = {}
+    statuses: dict[int, dict[bytes, int]] = {}
+    try:
+        for replica, message in said.items():
+            listed = from_bytes(message, GoalStatusArray).status_list
+            statuses[replica] = {bytes(one.goal_info.goal_id.uuid): one.status for one in listed}
+            for one in listed:
+                entries.setdefault(bytes(one.goal_info.goal_id.uuid), one)
+    except Unreadable:
+        return None
+    found = GoalStatusArray()
+    for goal, status in goals.merged(statuses).items():
+        entries[goal].status = status
+        found.status_list.append(entries[goal])
+    return to_bytes(found)

@@ -1,4 +1,4 @@
-"""A node of the proxy's own: one context, one thread, one wait set over all it serves and calls.
+"""The proxy's ROS node: one context, one thread, one wait set for all services and clients.
 
 Two rules:
 1. Only the take loop touches the wait set, and only it destroys. Other threads put their
@@ -21,11 +21,10 @@ from typing import Any, TypeVar
 from fogft.errors import RosError
 from fogft.model import ros_names
 from fogft.model.topic import Quality
-from fogft.ros import topic_ends, vendors
+from fogft.ros import farewell, topic_ends, vendors
 from fogft.ros.entities import Client, Server
+from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
 from fogft.ros.pacing.client_probes import NodeProbes
-from fogft.ros.participant import farewell
-from fogft.ros.participant.joining import EarlyJoin, bare_node, new_context
 from fogft.ros.port import ClientNode, OnBurst
 from fogft.ros.serialised import ClientEnd, ServiceEnd, self_test
 from fogft.ros.topic_ends import Publisher, Subscription
@@ -64,6 +63,7 @@ class SerialisedNode:
         self._ended = threading.Event()
         self._visible: VisibleNode | None = None
         self._probes = NodeProbes(self)
+        self._timers = Timers()
         try:
             self._start_ros(name, domain_id, early)
         except ImportError as error:
@@ -72,7 +72,7 @@ class SerialisedNode:
                 "source a ROS 2 installation, or install `fogft[ros]`",
             ) from error
         except Exception as error:
-            raise RosError(f"the ROS node `{name}` cannot be made: {error}") from error
+            raise RosError(f"the ROS node `{name}` cannot be created: {error}") from error
         self._thread = threading.Thread(target=self._run, name=f"ros-{name}", daemon=True)
         self._thread.start()
 
@@ -129,7 +129,7 @@ class SerialisedNode:
         return self._add(name, create)
 
     def client(self, name: str, type_name: str) -> Client:
-        """Make a client of a service."""
+        """Create a client of a service."""
         # ROS 2 Humble cannot count: there, whether one is available must do.
         count: Any = getattr(self._node, "count_services", lambda _: 0)
         service_type = load_service_type(type_name)
@@ -142,7 +142,7 @@ class SerialisedNode:
         return self._add(name, create)
 
     def publisher(self, name: str, type_name: str, quality: Quality) -> Publisher:
-        """Make a publisher of a topic. Raises RosError: the type cannot be loaded."""
+        """Create a publisher of a topic. Raises RosError: the type cannot be loaded."""
         message_type = load_message_type(type_name)
 
         def create() -> Publisher:
@@ -169,7 +169,7 @@ class SerialisedNode:
     def make_visible(
         self, name: str, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
     ) -> VisibleNode:
-        """Make a node for people's tools beside this one. It ends with this one.
+        """Create a second node, visible to ROS tools. It ends with this one.
 
         Args:
             judge: Takes parameters that somebody sets, and returns why not.
@@ -184,7 +184,7 @@ class SerialisedNode:
         return self._visible
 
     def offered(self) -> dict[str, str]:
-        """Return name -> type of the services that applications offer, as discovery knows them.
+        """Return name -> type of the discovered services that applications offer.
 
         Asked node by node: the list of all names has clients' in it too.
         """
@@ -218,7 +218,7 @@ class SerialisedNode:
         return ClientNode(*nodes[client], unique=len(processes) == 1)
 
     def participant(self, service: str) -> bytes:
-        """Return the first bytes of our participant's id; empty before it offers `service`.
+        """Return the first bytes of our DDS participant's id; empty before `service` is offered.
 
         Empty as well while another of our name does: one that hands over to us, or was killed.
         """
@@ -231,7 +231,7 @@ class SerialisedNode:
         return named.pop() if len(named) == 1 else b""
 
     def callers(self, service: str) -> int:
-        """Count the clients of a service that discovery has found: those find us, too."""
+        """Count the discovered clients of a service, which have found us as well."""
         return len(self._identifiers(self._node.get_publishers_info_by_topic, service))
 
     def _server_trouble(self, service: str) -> str:
@@ -270,7 +270,7 @@ class SerialisedNode:
         return []
 
     def services_of(self, name: str, namespace: str) -> list[str]:
-        """Return the names of a node's services, as discovery knows them; empty if it is gone."""
+        """Return the names of a node's discovered services; empty if it is gone."""
         return [service for service, _ in self._services_of(name, namespace)]
 
     def _services_of(self, name: str, namespace: str) -> Any:
@@ -278,6 +278,12 @@ class SerialisedNode:
             return self._node.get_service_names_and_types_by_node(name, namespace)
         except Exception:  # the node has gone since
             return []
+
+    def look(self) -> None:
+        """Keep this process known to others. Call it every second or more often."""
+        with self._create_lock:
+            if not self._stopping and not self._ended.is_set():
+                self._timers.look(self._node)
 
     def _add(self, name: str, create: Callable[[], E]) -> E:
         """Create an entity, and have the take loop attend to it."""
@@ -289,7 +295,7 @@ class SerialisedNode:
             except RosError:
                 raise
             except Exception as error:
-                raise RosError(f"`{name}` cannot be made: {error}") from error
+                raise RosError(f"`{name}` cannot be created: {error}") from error
             self._changes.append((entity, True, threading.Event()))
             self._guard.trigger()
         return entity
@@ -305,7 +311,7 @@ class SerialisedNode:
             done.wait(_CLOSE_LIMIT_S)
 
     def close(self) -> None:
-        """Stop the thread and leave ROS. Repeatable; from a callback it only asks for the end."""
+        """Stop the thread and close the node. Repeatable; from a callback it only requests that."""
         if self._visible is not None:
             self._visible.close()
         with self._create_lock:

@@ -21,7 +21,7 @@ OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where 
 
 
 class NotFoundYet(RosError):
-    """Discovery has not found the client yet: sending again may help."""
+    """The client is not discovered yet; sending again may help."""
 
 
 class ClientNode(NamedTuple):
@@ -42,7 +42,7 @@ class RosServer(Protocol):
         """
 
     def mismatch(self) -> str:
-        """Say why a client is not heard, or who else answers; empty if all is well. Cheap."""
+        """Return why clients are not received, or who else answers; empty if all is well. Cheap."""
 
     def close(self) -> None:
         """Withdraw the service."""
@@ -55,7 +55,7 @@ class RosClient(Protocol):
         """Whether discovery has found a server. Cheap; never blocks."""
 
     def mismatch(self) -> str:
-        """Say why no server that is there can be called; empty if one can. Cheap."""
+        """Return why none of the servers can be called; empty if one can. Cheap."""
 
     def servers(self) -> int:
         """Count the servers that discovery lists: one that died stays listed for a while."""
@@ -69,14 +69,14 @@ class RosClient(Protocol):
         """
 
     def forget(self, ticket: int) -> None:
-        """Drop what is kept for a request whose response is no longer awaited."""
+        """Drop a request whose response is no longer awaited."""
 
     def close(self) -> None:
         """Withdraw the client."""
 
 
 class RosNode(Protocol):
-    """A node of the proxy's own, in one ROS domain."""
+    """The proxy's ROS node in one ROS domain."""
 
     @property
     def alive(self) -> bool:
@@ -100,7 +100,10 @@ class RosNode(Protocol):
         """
 
     def client(self, name: str, type_name: str) -> RosClient:
-        """Make a client of a service. Raises RosError: the type cannot be loaded."""
+        """Create a client of a service. Raises RosError: the type cannot be loaded."""
+
+    def look(self) -> None:
+        """Keep this process known to others. Call it every second or more often."""
 
     def offered(self) -> Mapping[str, str]:
         """Return name -> type of the services that applications offer in this domain.
@@ -109,11 +112,11 @@ class RosNode(Protocol):
         """
 
     def close(self) -> None:
-        """Stop the thread and leave ROS. Repeatable."""
+        """Stop the thread and close the node. Repeatable."""
 
 
 class Level(IntEnum):
-    """How bad a status is; the numbers of `diagnostic_msgs/msg/DiagnosticStatus`."""
+    """The level of a status; the numbers of `diagnostic_msgs/msg/DiagnosticStatus`."""
 
     OK = 0
     WARN = 1

@@ -104,7 +104,7 @@ _loaded: tuple[Rcl, Rcl] | None = None
 
 
 def load() -> tuple[Rcl, Rcl]:
-    """Return the functions, first those that hold the interpreter lock, then those that do not.
+    """Load the functions: a set that holds the GIL, and a set that releases it.
 
     Raises:
         RosError: The library or one of its functions is missing.

@@ -1,4 +1,4 @@
-"""Does ROS 2 work here? Run as a process of its own, so that a caller stays light.
+"""Test whether ROS 2 works here. Runs as its own process, to keep the caller light.
 
 ``python -m fogft.ros.self_test describe`` prints what ROS 2 there is. ``answer NAME`` and
 ``ask NAME`` are the two ends of one service call between two processes, in the
@@ -31,7 +31,7 @@ def _node(name: str) -> Iterator[tuple[Any, Any]]:
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 
-    from fogft.ros.participant.joining import new_context
+    from fogft.ros.joining import new_context
 
     context = new_context(None)
     node = rclpy.create_node(name, context=context, enable_rosout=False)
@@ -57,7 +57,7 @@ def answer(name: str) -> int:
 
 
 def ask(name: str) -> int:
-    """Call that service; print how long discovery and the call took, in seconds, or what failed.
+    """Call that service; print the seconds taken by discovery and by the call, or the error.
 
     That is printed before the node is taken down: Fast DDS now and then crashes there, which
     is no answer to the question.
@@ -67,7 +67,7 @@ def ask(name: str) -> int:
 
 
 def segment() -> dict[str, int]:
-    """Make a node; return the size of the shared memory that its middleware maps for it."""
+    """Create a node; return the size in bytes of its middleware's shared memory."""
     with _node(f"fogft_doctor_{os.getpid()}"):
         return {"segment_bytes": environment.largest_segment_bytes()}
 
@@ -101,7 +101,7 @@ def _tell(find: Callable[[], Mapping[str, Any]]) -> int:
 
 
 def main(arguments: list[str]) -> int:
-    """Run one of the four; it prints its result."""
+    """Run one of the four tests, which prints its result."""
     environment.prepare(os.environ)
     match arguments:
         case ["describe"]:

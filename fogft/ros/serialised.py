@@ -1,4 +1,4 @@
-"""Take and send the serialised bytes of any service, with no Python message between.
+"""Take and send serialised requests and responses without Python messages.
 
 `take` belongs to the take loop and raises RosError for what could not be read, which is gone;
 sending needs the caller's lock.
@@ -30,7 +30,7 @@ LARGE_BYTES = 256 * 1024
 
 
 class CMessage:
-    """One C message of a type, and its way from and to bytes. Not for two threads at once."""
+    """A C message of a type, converted from and to bytes. Not thread-safe."""
 
     def __init__(self, message_type: Any) -> None:
         kind = type(message_type)
@@ -69,7 +69,7 @@ class CMessage:
             raise Unreadable(f"{size} bytes are not a serialised {self._name}: {reason}")
 
     def write(self, functions: rcl.Rcl) -> bytes:
-        """Return the message as serialised bytes. Raises RosError when memory is short."""
+        """Return the message as serialised bytes. Raises RosError: out of memory."""
         code = functions.rmw_serialize(self.address, self._type_support, self._output_address)
         if code != rcl.OK:
             raise RosError(f"a {self._name} cannot be serialised: {rcl.error_text()}")
@@ -128,7 +128,7 @@ class _End:
 
 
 class ServiceEnd(_End):
-    """A service's end."""
+    """The server's end of a service."""
 
     def __init__(self, service: Any, service_type: Any) -> None:
         super().__init__(service, service_type.Request, service_type.Response)
@@ -156,7 +156,7 @@ class ServiceEnd(_End):
 
 
 class ClientEnd(_End):
-    """A client's end."""
+    """The client's end of a service."""
 
     def __init__(self, client: Any, service_type: Any) -> None:
         super().__init__(client, service_type.Response, service_type.Request)
@@ -188,7 +188,7 @@ class ClientEnd(_End):
 
 @lru_cache(maxsize=1)
 def self_test() -> None:
-    """Send a message through this path and through rclpy's, once a process; compare.
+    """Once per process, compare a message sent this way with one sent by rclpy.
 
     Compared after deserialising: the padding between fields is whatever lay in memory.
 

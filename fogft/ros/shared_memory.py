@@ -1,4 +1,4 @@
-"""Remove the shared memory that killed ROS processes left in /dev/shm. Never what is in use.
+"""Remove shared memory that killed ROS processes left in /dev/shm, never any in use.
 
 Fast DDS makes, for each participant, a *segment* (random name) and, for each port of a
 domain, a *port* (its number as the name), with lock files beside them::
@@ -39,7 +39,7 @@ _OURS = re.compile(
 
 
 def sweep() -> list[str]:
-    """Remove what no living process uses; return the names of the files removed, sorted.
+    """Remove files that no living process uses; return their names, sorted.
 
     Takes tens of milliseconds. Safe to run beside anything, itself included; files that
     cannot be judged stay.
@@ -89,7 +89,7 @@ def _unused() -> dict[str, list[str]]:
 
 
 def grouped_names() -> dict[str, list[str]]:
-    """Return the settled groups of this user's files, by what they belong to."""
+    """Return this user's files that are old enough, grouped by owner."""
     groups: dict[str, list[str]] = {}
     fresh: set[str] = set()
     now = time.time()
@@ -110,7 +110,7 @@ def grouped_names() -> dict[str, list[str]]:
 
 
 def make_private() -> None:
-    """Let no other user read the segments of this process: what it sends lies there.
+    """Make this process's segments, which hold its messages, private to this user.
 
     Fast DDS makes them readable by all, whatever the umask. Other users' processes lose nothing:
     they would have to write to a segment to use it, and go through UDP as before.
@@ -132,7 +132,7 @@ def _mapped(process: str) -> set[str]:
 
 
 def names_in_use() -> set[str]:
-    """Return the names in /dev/shm that a process of ours maps or holds open."""
+    """Return the names in /dev/shm that a process of this user maps or holds open."""
     used: set[str] = set()
     for process in filter(str.isdigit, os.listdir("/proc")):
         used |= _mapped(process)
@@ -176,7 +176,7 @@ def unlink_name(name: str) -> bool:
 
 
 def semaphore(group: str, operation: str) -> bool:
-    """Do something to the POSIX semaphore of a port; whether there is one and it worked."""
+    """Operate on the POSIX semaphore of a port; return whether it exists and that worked."""
     libc = ctypes.CDLL(None)
     libc.sem_open.restype = ctypes.c_void_p
     opened = libc.sem_open(f"/{group}_mutex".encode(), 0)

@@ -1,4 +1,4 @@
-"""A service's state as bytes, through whatever service types carry it.
+"""A service's state as bytes, independent of the service types that carry it.
 
 The state sits in one text or byte field of a response (snapshot) and of a request (restore).
 Where the response has a boolean `success`, false is a failure. These calls are rare, so
@@ -61,7 +61,7 @@ class StateBytes:
             raise RosError(f"a state of {len(state)} bytes does not fit: {error}") from error
 
     def check_restored(self, response: bytes) -> None:
-        """Raise RosError where a response of the restore service says that it failed."""
+        """Raise RosError if a response of the restore service reports a failure."""
         _check_success(from_bytes(response, self._restore.Response))
 
 
@@ -123,5 +123,5 @@ def _no_field(where: StateService, part: str, path: str) -> RosError:
 
 
 def check_state(spec: StateSpec) -> str | None:
-    """Return why a service's state cannot travel so, with what to do; None if it can."""
+    """Return why a service's state cannot be carried by its types, with a hint; else None."""
     return trouble(partial(StateBytes, spec))

@@ -1,4 +1,4 @@
-"""For Python nodes: make a service stateful in a few lines. Needs nothing of fogft but this file.
+"""For Python nodes: make a service stateful in a few lines. This file needs nothing else of fogft.
 
     from fogft.ros.stateful import AttributeState
 

@@ -1,4 +1,4 @@
-"""A node's publishers and subscriptions: serialised messages of any type, never a Python one.
+"""A node's publishers and subscriptions, for serialised messages of any type.
 
 Owns: quality of service of topics; that bytes are checked before they are published.
 Not here: the loop (`node`), which messages pass (`fogft.proxy`).
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 def profile(quality: Quality) -> Any:
-    """Return ROS's form of a quality of service."""
+    """Return a quality of service as an rclpy QoSProfile."""
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     reliability, durability = ReliabilityPolicy, DurabilityPolicy
@@ -96,7 +96,7 @@ class Subscription:
         self._open = True
 
     def mismatch(self) -> str:
-        """Say why a publisher that is there is not heard; empty if all are."""
+        """Return why a publisher is not received; empty if all are."""
         from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
         name = self._name
@@ -117,7 +117,7 @@ class Subscription:
         self._withdraw(self)
 
     def drain(self) -> None:
-        """Deliver what has arrived. Take loop only."""
+        """Deliver received messages. Take loop only."""
         for _ in range(BURST):
             try:
                 taken = self.handle.take_message(self._subscription.msg_type, True)

@@ -1,4 +1,4 @@
-"""Service types by name: loading them, their fields and hashes, and what is asked of them.
+"""Service and message types by name: loading, fields, hashes and checks.
 
 Needs the interface package, not rclpy, to load a type; so the pool file's reader can
 check one without starting ROS.
@@ -45,7 +45,7 @@ def load_service_type(name: str) -> Any:
     if not _NAME.fullmatch(name):
         raise RosError(
             f"`{name}` is not the name of a service type",
-            f"write `package/srv/Type`, as in `std_srvs/srv/SetBool`{_did_you_mean(name)}",
+            f"write `package/srv/Type`, as in `std_srvs/srv/SetBool`.{_did_you_mean(name)}",
         )
     service_type = _find(name, "services")
     _load_type_support(name, service_type, service_type.Request, service_type.Response)
@@ -70,12 +70,12 @@ def load_message_type(name: str) -> Any:
 
 
 def check_type(name: str) -> str | None:
-    """Return why a service or message type cannot be loaded, with what to do; None if it can."""
+    """Return why a service or message type cannot be loaded, with a hint; None if it can."""
     return trouble(partial(load_message_type if "/msg/" in name else load_service_type, name))
 
 
 def trouble(make: Callable[[], object]) -> str | None:
-    """Return why something of ROS cannot be made here, with what to do; None if it can."""
+    """Return why a ROS object cannot be created here, with a hint; None if it can."""
     try:
         make()
     except RosError as error:
@@ -111,7 +111,7 @@ def _find(name: str, what: str) -> Any:
         raise RosError(
             f"there is no package `{package}` with {what} here, so `{name}` cannot be loaded",
             "install the package, or source its workspace; ROS 2's own are in "
-            f"`fogft[ros]`{_did_you_mean(name)}",
+            f"`fogft[ros]`.{_did_you_mean(name)}",
         ) from error
     except AttributeError as error:
         raise RosError(
@@ -165,7 +165,7 @@ def _did_you_mean(name: str) -> str:
 
 
 def definition(type_name: str) -> Definition:
-    """Return what a service type is here. One that cannot be loaded has `trouble`; never raises."""
+    """Return a service type's definition here, with `trouble` if it fails; never raises."""
     try:
         service_type = load_service_type(type_name)
         fields: dict[str, Fields] = {}
@@ -187,7 +187,7 @@ def definition(type_name: str) -> Definition:
 
 
 def shape(message_type: Any) -> Shape:
-    """Return the shape of a message's bytes. A type whose fields cannot be read has none."""
+    """Return the shape of a message's bytes; None if its fields cannot be read."""
     fields: dict[str, Fields] = {}
     try:
         _add("", message_type, fields)
@@ -206,7 +206,7 @@ def _add(name: str, message: Any, fields: dict[str, Fields]) -> None:
 
 
 def nested_type(name: str) -> Any:
-    """Return what ``package/Type`` stands for: a message, or a part of an action."""
+    """Return the message, or part of an action, that ``package/Type`` names."""
     package, _, short = name.partition("/")
     action, _, part = short.rpartition("_")
     if action and part in ("Goal", "Result", "Feedback"):

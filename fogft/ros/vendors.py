@@ -1,4 +1,4 @@
-"""Which DDS an endpoint is of, whether it understands our services, and who else offers one. Pure.
+"""Detect DDS vendors that cannot call each other, and other servers of a service. Pure.
 
 Two implementations of DDS find each other and exchange topics, but not services: Fast DDS and
 CycloneDDS put requests behind headers of their own. Discovery shows a service that never answers.
@@ -15,7 +15,7 @@ _OF_DYNAMIC = {"rmw_fastrtps_dynamic_cpp": "rmw_fastrtps_cpp"}
 
 
 def strangers(ours: str, identifiers: Iterable[bytes]) -> list[str]:
-    """Return the middleware of each endpoint that does not understand our services.
+    """Return the middleware of each endpoint that is incompatible with ours.
 
     Of a middleware that is not known here nothing is said.
 
@@ -31,7 +31,7 @@ def strangers(ours: str, identifiers: Iterable[bytes]) -> list[str]:
 
 
 def of_client(service: str, ours: str, theirs: str) -> str:
-    """Say that a client of a service is not heard, and what to do."""
+    """Return a message about a client that is not received, with advice."""
     return (
         f"a client of `{service}` runs on {theirs} and the client proxy on {ours}: it gets no "
         f"answers; set RMW_IMPLEMENTATION={ours} where that node starts, or ={theirs} for "
@@ -40,7 +40,7 @@ def of_client(service: str, ours: str, theirs: str) -> str:
 
 
 def of_others(service: str, nodes: Iterable[str]) -> str:
-    """Say that others offer a service as well, and what to do; empty where there are none."""
+    """Return a message about other servers of a service, with advice; empty without any."""
     names = ", ".join(f"`{name}`" for name in sorted(set(nodes)))
     if not names:
         return ""
@@ -51,9 +51,9 @@ def of_others(service: str, nodes: Iterable[str]) -> str:
 
 
 def of_server(service: str, ours: str, theirs: str) -> str:
-    """Say that a service cannot be called, and what to do."""
+    """Return a message about a service that cannot be called, with advice."""
     return (
         f"`{service}` runs on {theirs} and the server proxy on {ours}: it cannot be called; write "
-        "`envs: {RMW_IMPLEMENTATION: ...}` in the pool file, which holds for both, and set it "
+        "`envs: {RMW_IMPLEMENTATION: ...}` in the pool file, which applies to both, and set it "
         "nowhere else"
     )

@@ -1,24 +1,27 @@
-"""The node of a proxy that people see: `/diagnostics`, parameters, and its log on `/rosout`.
+"""A proxy's node for people: `/diagnostics`, parameters, and its log on `/rosout`.
 
 An ordinary rclpy node on an executor and a thread of its own, in the context of the node that
 takes requests. Other threads only put work into its queue, so nothing here ever stands in a
 request's way, and whatever goes wrong here is logged and ends there.
 
-Owns: that node and its thread. Not here: what is said (`fogft.proxy.robot.diagnostics`),
-the log (`ros_log`).
+Our log is passed on to `/rosout`, through the node's rclpy logger. Any thread may log, also one
+that must not block, so a record is only put into a bounded queue. Standard error has every record.
+
+Owns: that node and its thread, that queue, and the node's level, which ours follow. Not here: what
+is said (`fogft.proxy.robot.diagnostics`).
 """
 
 from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from queue import Empty, SimpleQueue
 from typing import Any
 
 from fogft.errors import RosError
 from fogft.ros.port import Status
-from fogft.ros.ros_log import RosLog
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +55,7 @@ class VisibleNode:
         try:
             self._start(name, context)
         except Exception as error:
-            raise RosError(f"the ROS node `{name}` cannot be made: {error}") from error
+            raise RosError(f"the ROS node `{name}` cannot be created: {error}") from error
         self._thread = threading.Thread(target=self._run, name=f"ros-{name}", daemon=True)
         self._thread.start()
 
@@ -69,12 +72,12 @@ class VisibleNode:
     # -- any thread -----------------------------------------------------------------------
 
     def diagnose(self, statuses: Sequence[Status]) -> None:
-        """Publish statuses on `/diagnostics`, where that can be."""
+        """Publish statuses on `/diagnostics`, if possible."""
         if self._diagnostics is not None:
             self._put(lambda: self._publish(statuses))
 
     def show(self, values: Mapping[str, Any]) -> None:
-        """Have these parameters with these values, and no others."""
+        """Set the parameters to exactly these values."""
         self._put(lambda: self._show(dict(values)))
 
     def _put(self, work: Callable[[], None]) -> None:
@@ -88,7 +91,7 @@ class VisibleNode:
             self._executor.create_task(_nothing)
 
     def close(self) -> None:
-        """Leave ROS; before the context ends. Repeatable."""
+        """Close the node; call it before the context ends. Repeatable."""
         if not self._closing:
             self._closing = True
             self._put(lambda: None)
@@ -192,3 +195,76 @@ def _diagnostics_publisher(node: Any) -> Any:
         )
         return None
     return node.create_publisher(DiagnosticArray, TOPIC, 10)
+
+
+OURS = "fogft"  # the logger above all of ours
+RECORDS_LIMIT = 1000
+
+
+class RosLog(logging.Handler):
+    """A log handler that forwards records to a node's logger.
+
+    Args:
+        logger: The node's. Its level becomes ours; whoever changes it later changes ours.
+        wake: Has `pass_on` called soon. Any thread.
+    """
+
+    def __init__(self, logger: Any, wake: Callable[[], None]) -> None:
+        super().__init__()
+        self._logger = logger
+        self._wake = wake
+        self._waiting: deque[logging.LogRecord] = deque()
+        self._dropped = 0
+        ours = logging.getLogger(OURS)
+        logger.set_level(_severity(ours.getEffectiveLevel()))
+        self._level: int = int(logger.get_effective_level())
+        ours.addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a record for `pass_on`."""
+        if len(self._waiting) >= RECORDS_LIMIT:
+            self._dropped += 1
+            return
+        self._waiting.append(record)
+        self._wake()
+
+    def pass_on(self) -> None:
+        """Forward queued records, and follow the logger's level. The node's thread only."""
+        while self._waiting:
+            self._tell(self._waiting.popleft())
+        if self._dropped:
+            dropped, self._dropped = self._dropped, 0
+            self._logger.warning(f"log_records_dropped count={dropped}")
+        level = int(self._logger.get_effective_level())
+        if level != self._level:
+            self._level = level
+            logging.getLogger(OURS).setLevel(level)
+            log.warning("log_level_changed to=%s", logging.getLevelName(level))
+
+    def _tell(self, record: logging.LogRecord) -> None:
+        try:
+            text = self.format(record)
+        except Exception:  # a message that does not go with its arguments
+            self.handleError(record)
+            return
+        # rclpy knows a line of code by its level: each has a line of its own.
+        if record.levelno >= logging.CRITICAL:
+            self._logger.fatal(text)
+        elif record.levelno >= logging.ERROR:
+            self._logger.error(text)
+        elif record.levelno >= logging.WARNING:
+            self._logger.warning(text)
+        elif record.levelno >= logging.INFO:
+            self._logger.info(text)
+        else:
+            self._logger.debug(text)
+
+    def close(self) -> None:
+        """Stop taking records. Repeatable."""
+        logging.getLogger(OURS).removeHandler(self)
+        super().close()
+
+
+def _severity(level: int) -> int:
+    """Return rclpy's severity for a level; the numbers are the same."""
+    return max(logging.DEBUG, min(logging.CRITICAL, level // 10 * 10))

@@ -23,7 +23,7 @@ _NEEDED = "share/rosidl_default_generators/cmake"
 
 
 def lay_prefix(into: Path, wheels: Path = Path(sys.prefix)) -> Path:
-    """Lay a prefix down to build against; return it.
+    """Create a prefix to build against; return it.
 
     Args:
         into: A folder that does not exist yet, or an older one of this kind, which is replaced.
@@ -48,7 +48,7 @@ def lay_prefix(into: Path, wheels: Path = Path(sys.prefix)) -> Path:
         for path in (into / "share").rglob("*.cmake"):
             _name_this_python(path)
     except OSError as error:
-        raise RosError(f"`{into}` cannot be laid down: {error}") from error
+        raise RosError(f"`{into}` cannot be written: {error}") from error
     return into
 
 
@@ -63,7 +63,7 @@ def _name_this_python(path: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Lay a prefix down in the folder that is named, and print it."""
+    """Create a prefix in the given folder, and print it."""
     if len(arguments) != 1:
         print("usage: python -m fogft.ros.wheels FOLDER", file=sys.stderr)
         return 2

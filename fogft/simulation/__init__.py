@@ -1,4 +1,4 @@
-"""Whole pools under simulated time: the real manager against recorded or generated spot markets.
+"""Simulation of pools: the real manager in recorded or generated spot markets.
 
 Not here: the manager's decisions (`fogft.planning`). See docs/design/simulation.md.
 """

@@ -1,4 +1,4 @@
-"""What fogft is compared with: fixed policies, on the same machines and prices.
+"""Fixed policies that fogft is compared with, on the same machines and prices.
 
 Each sees a notice, a lost machine and a refusal as soon as fogft does, and is not charged for
 what it needs besides its replicas. A machine with a notice is replaced, and serves until it ends.
@@ -30,7 +30,7 @@ class Fleet:
         self._launched = 0
 
     def order(self, slot: int, offer: Offer, refused: Callable[[], None]) -> None:
-        """Order a machine; `refused` is called if there is no room."""
+        """Order a machine; `refused` is called if there is no capacity."""
         self._launched += 1
         id = ReplicaId(UID, slot, self._launched)
         self.ordered[id] = offer
@@ -52,7 +52,7 @@ class Fleet:
         self.world.submit(lambda: self.world.terminate(id))
 
     def missed(self) -> list[tuple[ReplicaId, Offer]]:
-        """Return, and forget, the machines that were taken away."""
+        """Remove and return the preempted machines."""
         gone = [id for id in self.ordered if id in self._accepted and id not in self.world.vms]
         return [(id, self.ordered.pop(id)) for id in gone]
 
@@ -67,7 +67,7 @@ class Fleet:
 
 
 class Static:
-    """One machine for each offer given, ordered again there whenever it is lost or refused."""
+    """One machine for each given offer, ordered again whenever it is lost or refused."""
 
     def __init__(self, world: World, offers: Sequence[Offer], wanted: Target) -> None:
         self._fleet = Fleet(world)
@@ -76,7 +76,7 @@ class Static:
         self._due = dict.fromkeys(range(len(offers)), world.now)
 
     def tick(self, now: float) -> float:
-        """Order what is missing."""
+        """Order missing machines."""
         for id, _ in self._fleet.missed():
             self._due[id.slot] = now
         for slot in [slot for slot, at in self._due.items() if at <= now]:
@@ -89,7 +89,7 @@ class Static:
 
 
 class Search:
-    """Spot machines wherever a rule finds room, and `extra` ones besides.
+    """Spot machines placed by a rule, and `extra` ones besides.
 
     `on_demand` runs for each spot machine that is not ready, but for no more than the replicas.
     After a refusal in every location it waits a minute.
@@ -119,7 +119,7 @@ class Search:
         self._spot_from = world.now
 
     def tick(self, now: float) -> float:
-        """Order and end what the policy says."""
+        """Order and end machines."""
         fleet, rule = self._fleet, self._rule
         for id, offer in fleet.missed():
             if offer.placement.spot and id not in self._left:
@@ -167,7 +167,7 @@ class Search:
 
 
 class Rule:
-    """Where the next spot machine is ordered."""
+    """A rule for where the next spot machine is ordered."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
         self._spot = spot
@@ -177,14 +177,14 @@ class Rule:
         raise NotImplementedError
 
     def lost(self, offer: Offer) -> None:
-        """Take into account that a location took a machine away, or had no room."""
+        """Note that a location preempted a machine or had no capacity."""
 
     def ready(self, offer: Offer) -> None:
-        """Take into account that a machine became ready there."""
+        """Note that a machine became ready there."""
 
 
 class InTurn(Rule):
-    """The next location of a list, wherever the others are: round robin."""
+    """Round robin: the next location of a list, wherever the others are."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
         self._turns = itertools.cycle(spot)
@@ -195,7 +195,7 @@ class InTurn(Rule):
 
 
 class Naive(Rule):
-    """The cheapest location with the fewest replicas, not again where it just failed."""
+    """The cheapest location with the fewest replicas, avoiding recent failures."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
         super().__init__(spot)
@@ -203,7 +203,7 @@ class Naive(Rule):
         self._failures = itertools.count(1)
 
     def place(self, taken: Sequence[Offer]) -> Offer:
-        """Return the offer to order: of equals the one whose failure is longest ago."""
+        """Return the offer to order; ties go to the oldest failure."""
         used = Counter(o.placement.location for o in taken)
         return min(
             self._spot,
@@ -216,7 +216,7 @@ class Naive(Rule):
         )
 
     def lost(self, offer: Offer) -> None:
-        """Ask there last."""
+        """Try that location last."""
         self._failed[offer.placement.location] = next(self._failures)
 
 
@@ -238,12 +238,12 @@ class ActiveZones(Rule):
         return min(active, key=lambda o: (used[o.placement.location], o.usd_per_hour, o.placement))
 
     def lost(self, offer: Offer) -> None:
-        """Let a location be inactive."""
+        """Make a location inactive."""
         self._preempted.add(offer.placement.location)
         locations = {o.placement.location for o in self._spot}
         if len(locations - self._preempted) < 2:
             self._preempted.clear()
 
     def ready(self, offer: Offer) -> None:
-        """Let it be active."""
+        """Make a location active."""
         self._preempted.discard(offer.placement.location)

@@ -1,4 +1,4 @@
-"""The least that so many replicas, always ready, could cost: by one who knows the future.
+"""The lower bound of cost for replicas that are always ready, with perfect foresight.
 
 Whoever serves was ordered a boot before, in a location that had room from then on, and the boot is
 paid. All else is free: whoever is no longer needed ends at once. So replicas are units of a flow
@@ -38,7 +38,7 @@ def least_usd_per_hour(
     boot_s: float,
     length_s: float,
 ) -> float | None:
-    """Return the least that `replicas` always ready cost on average; None if they cannot be had.
+    """Return the lowest average cost of `replicas` always ready; None if impossible.
 
     Args:
         timelines: Location -> its room for spot machines.

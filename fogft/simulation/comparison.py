@@ -22,11 +22,10 @@ from fogft.planning.sizing import size
 from fogft.pool.manager.offers import ask
 from fogft.simulation.baselines import ActiveZones, InTurn, Naive, Search, Static
 from fogft.simulation.bound import least_usd_per_hour
-from fogft.simulation.generator import generate
 from fogft.simulation.managed import Managed
 from fogft.simulation.market import FindOffers, Market
 from fogft.simulation.meter import DAY_S, HOURS_A_MONTH, Outcome
-from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.model import MarketModel, Timing, generate
 from fogft.simulation.timeline import Timeline
 from fogft.simulation.world import EPOCH, Policy, Target, World
 
@@ -46,7 +45,7 @@ _RESAMPLES = 1000
 
 @dataclass(frozen=True)
 class Scenario:
-    """What is simulated."""
+    """The scenario of a simulation."""
 
     spec: PoolSpec
     find: FindOffers  # what a cloud offers for a task's `resources`
@@ -67,7 +66,7 @@ class Scenario:
         return SETTLE_S + self.days * DAY_S
 
     def market(self, seed: int) -> Market:
-        """Return the market of a seed: a stretch of what was recorded, or a made-up one."""
+        """Return the market of a seed: a section of the recordings, or a generated one."""
         chance = random.Random(f"market {seed}")
         if not self.recorded:
             lines = generate(
@@ -88,7 +87,7 @@ class Scenario:
 
 
 def spot_locations(spec: PoolSpec, find: FindOffers) -> list[str]:
-    """Return where spot machines are sold that a pool may use, sorted."""
+    """Return the locations with spot machines for a pool, sorted."""
     sold = (o for group in groups_of(spec) for o in find(with_spot(group.resources, True)))
     return sorted({o.placement.location for o in sold if o.placement.spot})
 
@@ -112,7 +111,7 @@ class Row:
     curve: tuple[tuple[float, int], ...] = ()
 
     def estimate(self, figure: str) -> Estimate:
-        """Return a figure's mean and interval; ``..._per_day`` counts by the day."""
+        """Return a figure's mean and interval; ``..._per_day`` is per day."""
         if figure.endswith("_per_day"):
             counted = figure.removesuffix("_per_day")
             values = [getattr(o, counted) / (o.seconds / DAY_S) for o in self.outcomes]
@@ -137,7 +136,7 @@ class Row:
 
 
 def estimate(values: Sequence[float]) -> Estimate:
-    """Return the mean of some values with its interval; the same values give the same."""
+    """Return the mean of some values with its interval, deterministically."""
     chance = random.Random(len(values))
     mean = sum(values) / len(values)
     if len(values) == 1:
@@ -152,7 +151,7 @@ Factory = Callable[[World], Policy]
 
 
 def policies(scenario: Scenario) -> dict[str, Factory]:
-    """Return how to make each policy, by name; fogft first.
+    """Return a factory of each policy, by name; fogft first.
 
     The fixed ones have the machines of the pool's largest group, as many as the pool has.
     """
@@ -187,7 +186,7 @@ def _sold(spec: PoolSpec, market: Market) -> tuple[list[Offer], list[Offer]]:
 
 
 def replicas_of(spec: PoolSpec, offers: Sequence[Offer]) -> int:
-    """Return how many replicas the planner wants outside of the schedule's windows."""
+    """Return how many replicas the planner wants outside the schedule's windows."""
     bare = replace(spec, schedule=None)
     return size(bare, Intent(), Observed(EPOCH, (), None, tuple(offers))).total
 
@@ -211,7 +210,7 @@ def target_of(spec: PoolSpec, offers: Sequence[Offer]) -> Target:
 
 
 def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
-    """Return where a careful person would put so many replicas once and for all."""
+    """Return a careful fixed placement of this many replicas."""
     chosen: list[Offer] = []
     taken: list[Placement] = []
     for _ in range(count):
@@ -225,7 +224,7 @@ def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
 def compare(
     scenario: Scenario, told: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Row]:
-    """Run every policy in every market; `told` hears how many runs of how many are done."""
+    """Run every policy in every market; `told` is called with the runs done and in total."""
     made = policies(scenario)
     outcomes: dict[str, list[Outcome]] = {name: [] for name in made}
     curves: dict[str, tuple[tuple[float, int], ...]] = {}
@@ -248,7 +247,7 @@ def compare(
 
 
 def bound(scenario: Scenario, market: Market) -> Outcome | None:
-    """Return what one who knows the future needs to have all ready always; None if he cannot."""
+    """Return the cost with perfect foresight of always having all ready; None if impossible."""
     spec = scenario.spec
     spots, reserved = _sold(spec, market)
     cheapest = {
@@ -271,7 +270,7 @@ def bound(scenario: Scenario, market: Market) -> Outcome | None:
 
 @contextmanager
 def unlogged() -> Iterator[None]:
-    """Keep the manager's log quiet: what it tells of did not happen."""
+    """Silence the manager's log, because its events are simulated."""
     log = logging.getLogger("fogft.pool")
     before = log.level
     log.setLevel(logging.CRITICAL + 1)

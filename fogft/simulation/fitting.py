@@ -1,4 +1,4 @@
-"""Find the model that recorded traces could have come from.
+"""Fit a market model to recorded traces.
 
 Owns: the estimates. MTTF and MTTR are times with and without room over the number of times
 that they ended (the maximum likelihood of an exponential, the last, unfinished spells
@@ -29,7 +29,7 @@ def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
         if mean is None:
             raise FogftError(
                 f"the traces cannot be fitted: no location ever becomes {what}",
-                "leave out `--fit` to replay them as they are",
+                "omit `--fit` to replay them as they are",
             )
     mttf_s, mttr_s = (mean or 0.0 for mean in means)
     region, cloud, world = _correlations(timelines)
@@ -48,7 +48,7 @@ def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
 
 
 def of_zones(timelines: Mapping[str, Timeline]) -> dict[str, tuple[float, float]]:
-    """Return the MTTF and MTTR of each location that became full and free; others cannot tell."""
+    """Return the MTTF and MTTR of each location that became both full and free."""
     found: dict[str, tuple[float, float]] = {}
     for place, line in timelines.items():
         mttf_s, mttr_s = _means([line])
@@ -99,7 +99,7 @@ def _correlations(timelines: Mapping[str, Timeline]) -> tuple[float | None, ...]
 
 
 def correlation(one: Timeline, other: Timeline) -> float | None:
-    """Return the correlation of having room, over the time that both know; None if constant."""
+    """Return the correlation of two locations' capacity over shared time; None if constant."""
     length_s = min(one.length_s, other.length_s)
     a, b = one.window(0, length_s), other.window(0, length_s)
     mean_a, mean_b = a.room_s() / length_s, b.room_s() / length_s

@@ -116,7 +116,7 @@ class Managed:
         )
 
     def tick(self, now: float) -> float:
-        """Let the manager work once."""
+        """Run the manager once."""
         self.store.compact(now)
         before = self.store.published
         tick = self._reconciler.tick()

@@ -1,4 +1,4 @@
-"""A spot market to simulate in: what is on offer, and when each location takes machines away.
+"""A simulated spot market: the offers, and each location's capacity over time.
 
 Not here: the machines themselves (`world`).
 """
@@ -18,7 +18,7 @@ FindOffers = Callable[[Mapping[str, Any]], Sequence[Offer]]
 
 
 def remembered(find: FindOffers) -> FindOffers:
-    """Return the same, each question asked only once: nothing changes while one simulates."""
+    """Return a caching wrapper: nothing changes during a simulation."""
     known: list[tuple[Mapping[str, Any], Sequence[Offer]]] = []
 
     def ask(resources: Mapping[str, Any]) -> Sequence[Offer]:
@@ -33,7 +33,7 @@ def remembered(find: FindOffers) -> FindOffers:
 
 @dataclass(frozen=True)
 class Market:
-    """What can be bought, and each location's capacity for spot machines (none: on demand only)."""
+    """The offers, and each location's capacity for spot machines (none: on demand only)."""
 
     find: FindOffers
     timelines: Mapping[str, Timeline]
@@ -42,7 +42,7 @@ class Market:
     prices: Mapping[str, Timeline] = field(default_factory=dict)
 
     def offers(self, resources: Mapping[str, Any]) -> list[Offer]:
-        """Return what suits and is not spot in a location that nothing is known of."""
+        """Return the matching offers, without spot offers in locations of unknown capacity."""
         return [
             o
             for o in self.find(resources)
@@ -52,7 +52,7 @@ class Market:
 
 @dataclass(frozen=True)
 class Change:
-    """A location's capacity changes."""
+    """A change of a location's capacity."""
 
     at_s: float  # from here on no more machines than `capacity` are accepted
     location: str
@@ -61,7 +61,7 @@ class Change:
 
 
 def changes(market: Market, tick_s: float) -> Iterator[Change]:
-    """Yield what will happen, times rounded up to whole ticks, in no order between locations.
+    """Yield the changes, times rounded up to whole ticks, in no order between locations.
 
     A loss is announced `notice_s` before, but not before the room that is lost was there.
     """

@@ -1,4 +1,4 @@
-"""What a simulated pool was worth: how often it answered, and what it cost."""
+"""The availability and cost of a simulated pool."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Outcome:
 
 @dataclass
 class Meter:
-    """Adds up what happens from `begin_s` on; `curve` is from when how many served."""
+    """Measures from `begin_s` on; `curve` is the number of serving replicas over time."""
 
     begin_s: float
     seconds: float = 0.0
@@ -47,7 +47,7 @@ class Meter:
     def pass_time(
         self, now_s: float, seconds: float, *, ready: int, wanted: int, usd_per_hour: float
     ) -> None:
-        """Take into account that for so long before `now_s` nothing changed.
+        """Account for a span before `now_s` without changes.
 
         Stretches in which all stays the same are one, however often somebody looked: so the sums
         are the same to the last bit.
@@ -81,7 +81,7 @@ class Meter:
             self.longest_outage_s = max(self.longest_outage_s, self._down_s)
 
     def counts(self, now_s: float) -> bool:
-        """Whether what happens now is counted."""
+        """Whether events now are counted."""
         return now_s >= self.begin_s
 
     def outcome(self) -> Outcome:

@@ -1,4 +1,4 @@
-"""Draw a report: cost against unavailability, and how many replicas served over time."""
+"""Plot a report: cost over unavailability, and serving replicas over time."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _STYLE: Any = {"font.size": 9, "axes.spines.right": False, "axes.spines.top": Fa
 
 
 def check(path: Path) -> None:
-    """Check, before hours of simulation, that a plot can be drawn to a file."""
+    """Check, before a long simulation, that a plot can be written to a file."""
     if path.suffix not in ENDINGS:
         known = ", ".join(f"`{ending}`" for ending in ENDINGS)
         raise FogftError(f"{path}: cannot draw a `{path.suffix}` file", f"endings: {known}")
     if not path.absolute().parent.is_dir():
-        raise FogftError(f"{path}: there is no folder `{path.parent}`", "make it first")
+        raise FogftError(f"{path}: there is no folder `{path.parent}`", "create it first")
     needs_matplotlib()
 
 
@@ -44,7 +44,7 @@ def needs_matplotlib() -> None:
 
 
 def draw(report: Report, path: Path) -> None:
-    """Draw a report to a file; its ending tells the format."""
+    """Plot a report to a file, in the format of its suffix."""
     check(path)
     import matplotlib
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def draw(report: Report, path: Path) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure to a file, whose bytes depend on nothing but the figure."""
+    """Write a figure to a file reproducibly."""
     import matplotlib
 
     metadata: dict[str, Any] = {".svg": {"Date": None}, ".png": {"Software": None}}

@@ -1,6 +1,6 @@
 """How many spot machines fit into one location, over time.
 
-Not here: where it comes from (`traces`, `generator`) and who is taken away (`market`).
+Not here: where it comes from (`traces`, `model`) and who is taken away (`market`).
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ class Timeline:
         return Timeline(((0.0, self.capacity(begin_s)), *later), length_s)
 
     def spells(self) -> Iterator[tuple[bool, float, bool]]:
-        """Yield each time with or without room: ``(room, seconds, seen to its end)``."""
+        """Yield each spell with or without capacity: ``(room, seconds, seen to its end)``."""
         merged = list(_distinct((at, int(n > 0)) for at, n in self.changes))
         ends = [*(at for at, _ in merged[1:]), self.length_s]
         for index, ((at, room), end) in enumerate(zip(merged, ends, strict=True)):
             yield bool(room), end - at, index < len(merged) - 1
 
     def room_s(self) -> float:
-        """Return for how long there was room, in seconds."""
+        """Return for how long there was capacity, in seconds."""
         return sum(seconds for room, seconds, _ in self.spells() if room)
 
 

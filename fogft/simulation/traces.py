@@ -1,4 +1,4 @@
-"""Read recorded spot traces, and find out which locations they speak of.
+"""Read recorded spot traces, and match them to locations.
 
 A trace is a JSON file: ``{"metadata": {"gap_seconds": 300}, "data": [1, 1, 0, ...]}``, each
 sample the number of machines that could be had then. Optional: ``times``, the seconds at
@@ -32,7 +32,7 @@ MAX_BYTES = 64 << 20
 
 @dataclass(frozen=True)
 class Trace:
-    """One file."""
+    """One trace file."""
 
     file: str
     place: str  # ``cloud/region/zone``, or the zone alone
@@ -53,7 +53,7 @@ class _Written:
 
 
 def read(folder: Path, per_unit: int = 1) -> list[Trace]:
-    """Read every ``.json`` file in and below a folder; one that is no trace is an error.
+    """Read every ``.json`` file in and below a folder; an invalid trace is an error.
 
     Args:
         per_unit: What one of what was sampled counts: 1 for machines, `PER_USD` for prices.
@@ -106,7 +106,8 @@ def parse(value: Any, file: str, per_unit: int = 1) -> Timeline:
                 "cut the trace before or after it: the state in between is unknown",
             )
         if per_unit == 1 and sample % 1:
-            raise FogftError(f"{file}: data[{index}]: {sample:g} is no number of machines", FORMAT)
+            words = f"{file}: data[{index}]: {sample:g} is not a number of machines"
+            raise FogftError(words, FORMAT)
         samples.append(round(sample * per_unit))
     if trace.times is not None:
         _check_times(trace.times, len(samples), gap_s, file)
@@ -128,7 +129,7 @@ def _check_times(times: Sequence[float], samples: int, gap_s: float, file: str) 
 
 
 def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, Timeline]:
-    """Return the timelines by location, of those traces whose location is on offer.
+    """Return the timelines by location, of traces whose location is offered.
 
     `offered` is what can be bought anywhere, not only what this pool may buy. Raises FogftError: a
     trace is of a place that does not exist, two are of the same, or of different `gap_seconds`.

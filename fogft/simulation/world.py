@@ -34,12 +34,12 @@ Target = Callable[[float], int]
 
 
 class Policy(Protocol):
-    """Who decides what runs."""
+    """The interface of a policy, which orders and ends machines."""
 
     wanted: Target  # how many replicas the pool file wants ready at a time
 
     def tick(self, now: float) -> float:
-        """Act on the world as it is; return when to be asked again should nothing happen."""
+        """Act on the current state; return when to be called again if nothing happens."""
 
 
 @dataclass(eq=False)
@@ -94,15 +94,15 @@ class World:
     # -- time -------------------------------------------------------------------------------
 
     def at(self, time: float, happen: Happening) -> None:
-        """Let something happen at a time; it returns `UNSEEN` if nobody in the pool can notice."""
+        """Schedule an event at a time; it returns `UNSEEN` if no one in the pool can notice."""
         heapq.heappush(self._queue, (max(time, self.now), next(self._order), happen))
 
     def after(self, seconds: float, happen: Happening) -> None:
-        """Let something happen in a while, rounded up to whole ticks."""
+        """Schedule an event after a delay, rounded up to whole ticks."""
         self.at(self.now + rounded_up(seconds, TICK_S), happen)
 
     def run(self, policy: Policy, *, every_tick: bool = False) -> Meter:
-        """Let a policy work until the end.
+        """Run a policy until the end.
 
         `every_tick` asks it as often as the manager's loop, not only when something can have
         changed: slow, and to check that it makes no difference.
@@ -204,19 +204,19 @@ class World:
     # -- the cloud port -----------------------------------------------------------------------
 
     def submit(self, call: Happening) -> None:
-        """Make a call of the cloud, which takes its time to answer."""
+        """Submit a cloud call, which takes simulated time."""
         self.after(self.market.timing.answer_s, call)
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """List what the market sells; full locations too."""
+        """List the market's offers, full locations included."""
         return self._find(resources)
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
-        """List the machines, those lost and not yet missed included."""
+        """List the machines, including lost ones not noticed yet."""
         return [vm.machine or _listed(vm) for vm in self.vms.values()]
 
     def launch(self, order: Launch) -> None:
-        """Start a machine if there is room."""
+        """Start a machine if there is capacity."""
         if order.id in self.vms:
             return
         timing, place = self.market.timing, order.placement

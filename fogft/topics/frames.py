@@ -1,4 +1,4 @@
-"""The bytes of topics on the wire: a message to a replica, a pull, and what answers it. Pure.
+"""The bytes of topics on the link: a message to a replica, a pull, and its answer. Pure.
 
 They travel as the payloads of requests and answers, so all that holds for those holds for them.
 Whatever bytes come in, a decoder returns a value or raises `FrameError`.
@@ -24,12 +24,12 @@ Batch = tuple[bytes, int, list[tuple[int, bytes]]]
 
 
 def encode_message(session: bytes, number: int, message: bytes) -> bytes:
-    """Return a message of the robot's: who publishes (random at its start), its number, CDR."""
+    """Encode a message of the robot: publisher (random at its start), number, CDR."""
     return _MESSAGE.pack(session, number) + message
 
 
 def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
-    """Read a message of the robot's. Raises FrameError."""
+    """Decode a message of the robot. Raises FrameError."""
     if len(frame) < _MESSAGE.size:
         raise FrameError(f"a message of {len(frame)} bytes")
     session, number = _MESSAGE.unpack_from(frame)
@@ -38,12 +38,12 @@ def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
 
 
 def encode_pull(session: bytes, after: int) -> bytes:
-    """Ask for what a replica's session published after a number; `NO_SESSION`: where to begin."""
+    """Encode a pull of messages after a number of a session; `NO_SESSION` asks where to begin."""
     return _PULL.pack(session, after)
 
 
 def decode_pull(frame: bytes) -> tuple[bytes, int]:
-    """Read a pull. Raises FrameError."""
+    """Decode a pull. Raises FrameError."""
     if len(frame) != _PULL.size:
         raise FrameError(f"a pull of {len(frame)} bytes")
     session, after = _PULL.unpack(frame)
@@ -52,7 +52,7 @@ def decode_pull(frame: bytes) -> tuple[bytes, int]:
 
 
 def encode_batch(session: bytes, after: int, messages: Sequence[tuple[int, bytes]]) -> bytes:
-    """Answer a pull: the replica's session, the number to go on from, messages with theirs."""
+    """Encode the answer to a pull: session, number to continue from, numbered messages."""
     parts = [_BATCH.pack(session, after, len(messages))]
     for number, message in messages:
         parts += [_ENTRY.pack(number, len(message)), message]
@@ -60,7 +60,7 @@ def encode_batch(session: bytes, after: int, messages: Sequence[tuple[int, bytes
 
 
 def decode_batch(frame: bytes) -> Batch:
-    """Read what answers a pull. Raises FrameError."""
+    """Decode the answer to a pull. Raises FrameError."""
     if len(frame) < _BATCH.size:
         raise FrameError(f"a batch of {len(frame)} bytes")
     session, after, count = _BATCH.unpack_from(frame)

@@ -1,10 +1,10 @@
-"""An action's goals: each made by its client, and worked on by every replica. Pure.
+"""An action's goals: each sent by a client and executed by every replica. Pure.
 
 Everything about a goal is known by the id that its client gave it, the first 16 bytes of a
 request (CDR, after its header).
 
 Owns: what the parts' bytes mean, which goals are under way and who has them, one status out of
-several. Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.goal_status`).
+several. Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.messages`).
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ _RANK = {4: 9, 3: 8, 2: 7, 1: 6, 5: 5, 6: 4, 0: 0}
 
 
 def goal_of(request: bytes) -> bytes:
-    """Return the goal's id of a request of any part."""
+    """Return the goal id in a request to any of an action's services."""
     return request[_ID]
 
 
 def is_success(part: Part, response: bytes) -> bool:
-    """Whether a response ends its request: accepted, succeeded, or something is cancelled."""
+    """Whether a response completes its request: accepted, succeeded or cancelled."""
     if part is Part.RESULT:
         return response[4:5] == bytes([_SUCCEEDED])
     if part is Part.CANCEL:  # a return code, padding, and a list of goals
@@ -50,7 +50,7 @@ def is_unknown(response: bytes) -> bool:
 
 
 def cancelled(response: bytes) -> list[bytes]:
-    """Return the goals that a response to a cancellation names; a torn one names fewer."""
+    """Return the goals in a response to a cancellation; a truncated one has fewer."""
     order = "little" if response[1:2] == b"\1" else "big"
     count = int.from_bytes(response[8:12], order)  # type: ignore[arg-type]
     found = [response[at : at + 16] for at in range(12, len(response), 24)]
@@ -63,7 +63,7 @@ def cancel_request(goal: bytes) -> bytes:
 
 
 class Had(Enum):
-    """What a replica had said of a goal."""
+    """A replica's last answer about a goal."""
 
     NOTHING_SAID = "nothing said"
     TAKEN = "taken"
@@ -72,7 +72,12 @@ class Had(Enum):
 
 @dataclass(frozen=True)
 class Took:
-    """That a replica took a goal."""
+    """A replica's acceptance of a goal.
+
+    Attributes:
+        goal: Which; None where it did not, had it before, or that is not known any more.
+        in_vain: The goal is over, or cancelled.
+    """
 
     goal: bytes | None
     in_vain: bool
@@ -106,7 +111,7 @@ class _Goal:
 
 
 class Goals:
-    """The goals of one action, from when they are made until they have their result.
+    """The goals of one action, from their request to their result.
 
     A replica may be given a goal several times: because it came later, did not take it, or may
     have lost it. Beyond 4 096 goals or 64 MiB of requests the oldest are forgotten, at first those
@@ -123,7 +128,7 @@ class Goals:
     # -- giving ---------------------------------------------------------------------------
 
     def made(self, request: bytes, id: bytes, replicas: Iterable[int], until: float) -> None:
-        """A client makes a goal: its request goes to these replicas, under one id."""
+        """Note a new goal: its request goes to these replicas, under one id."""
         goal = goal_of(request)
         if goal not in self._goals:
             self._goals[goal] = _Goal(id, request)
@@ -138,7 +143,7 @@ class Goals:
             self._drop(next(unwanted, oldest))
 
     def gave(self, goal: bytes, id: bytes, replica: int, until: float) -> None:
-        """A replica is given a goal by a request; it is given it again if it is silent `until`."""
+        """Note that a replica is sent a goal; it is sent again if there is no answer `until`."""
         known = self._goals.get(goal)
         if known is not None:
             word = known.words.get(replica)
@@ -150,7 +155,7 @@ class Goals:
         self._of_id[id] = goal
 
     def took(self, id: bytes, replica: int, now: float, *, accepts: bool) -> Took:
-        """A replica has answered whether it takes a goal. Unknown ids are fine."""
+        """Note a replica's answer whether it accepts a goal. Unknown ids are ignored."""
         known = self._given_by(id)
         if known is None:
             goal = self.over.get(id) if accepts else None
@@ -165,7 +170,7 @@ class Goals:
         return Took(goal_of(known.request) if accepts else None, in_vain=known.cancelled)
 
     def failed(self, id: bytes, replica: int, now: float) -> None:
-        """A replica was not reached, or did not look at a goal: it is given it again soon."""
+        """Note that a goal did not reach a replica: it is sent again soon."""
         known = self._given_by(id)
         if known is None:
             return
@@ -182,18 +187,18 @@ class Goals:
         return self._goals.get(self._of_id.get(id, b""))
 
     def lost(self, goal: bytes, replica: int) -> None:
-        """A replica may have lost a goal: it is to be given it again."""
+        """Note that a replica may have lost a goal: it is sent again."""
         known = self._goals.get(goal)
         if known is not None:
             known.words.pop(replica, None)
 
     def left(self, replica: int) -> None:
-        """A replica is gone; whoever comes in its place may know nothing."""
+        """Note that a replica is gone; its successor may know nothing."""
         for known in self._goals.values():
             known.words.pop(replica, None)
 
     def lacking(self, replica: int, now: float) -> list[bytes]:
-        """Return the requests of the awaited goals that a replica is to be given, oldest first."""
+        """Return the goal requests to send to a replica, oldest first."""
         return [
             known.request
             for known in self._awaited.values()
@@ -203,19 +208,19 @@ class Goals:
     # -- results --------------------------------------------------------------------------
 
     def awaited(self, goal: bytes) -> None:
-        """Its client awaits the result of a goal that is under way."""
+        """Note that a client awaits the result of a running goal."""
         if goal in self and not self._goals[goal].cancelled:
             self._awaited[goal] = self._goals[goal]
 
     def cancelled(self, goal: bytes) -> None:
-        """A replica cancels a goal: it is begun nowhere any more. Unknown goals are fine."""
+        """Note a cancelled goal: it is not sent any more. Unknown goals are ignored."""
         known = self._goals.get(goal)
         if known is not None:
             known.cancelled = True
             self._awaited.pop(goal, None)
 
     def ended(self, goal: bytes) -> None:
-        """A goal has its result, or its client has given up. Unknown goals are fine."""
+        """Note that a goal has ended, or its client gave up. Unknown goals are ignored."""
         known = self._drop(goal)
         if known is not None and any(word.since == math.inf for word in known.words.values()):
             self.over.update(dict.fromkeys(known.ids, goal))
@@ -233,22 +238,22 @@ class Goals:
         return known
 
     def takers(self, goal: bytes) -> frozenset[int]:
-        """Return the replicas that have taken a goal, also those that are gone."""
+        """Return the replicas that accepted a goal, including those that are gone."""
         known = self._goals.get(goal)
         return frozenset() if known is None else frozenset(known.takers)
 
     def unwanted(self) -> list[bytes]:
-        """Return the goals under way that were cancelled."""
+        """Return the cancelled goals that still run."""
         return [goal for goal, known in self._goals.items() if known.accepted and known.cancelled]
 
     def clear(self) -> None:
-        """All goals are over."""
+        """Forget all goals."""
         for goal in list(self._goals):
             self.ended(goal)
 
     @property
     def kept(self) -> int:
-        """How many goals are remembered."""
+        """The number of remembered goals."""
         return len(self._goals)
 
     def __contains__(self, goal: bytes) -> bool:
@@ -257,7 +262,7 @@ class Goals:
         return known is not None and known.accepted
 
     def had(self, goal: bytes, replica: int, asked_at: float) -> Had:
-        """Return what a replica had said of a goal when it was asked for the result."""
+        """Return a replica's last answer about a goal when asked for the result."""
         known = self._goals.get(goal)
         word = None if known is None else known.words.get(replica)
         if known is not None and known.cancelled:
@@ -268,7 +273,7 @@ class Goals:
 
 
 def merged(said: Mapping[int, Mapping[bytes, int]]) -> dict[bytes, int]:
-    """Return one status for each goal of what replicas say (replica -> goal -> status)."""
+    """Merge statuses (replica -> goal -> status) into one for each goal."""
     found: dict[bytes, int] = {}
     for statuses in said.values():
         for goal, status in statuses.items():

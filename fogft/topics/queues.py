@@ -1,4 +1,4 @@
-"""Messages of a topic that wait: at a replica for its robots, on the robot for each replica. Pure.
+"""Queues of topic messages: at a replica for robots, on the robot for each replica. Pure.
 
 Messages are numbered by their publisher from 1. A replica keeps the last ones in a `Ring`; a
 robot asks for what comes after the last number that it has, so whatever is lost on the way is
@@ -16,35 +16,42 @@ Numbered = tuple[int, bytes]
 
 
 class Ring:
-    """The last messages that a replica's nodes published."""
+    """The last messages that a replica's nodes published.
 
-    def __init__(self, depth: int, *, latched: bool, kept_bytes: int = 64 << 20) -> None:
+    Args:
+        latched: Whether a robot that has none yet gets what is kept.
+    """
+
+    kept_bytes = 64 << 20  # of all together, at most; the newest is kept in any case
+
+    def __init__(self, depth: int, *, latched: bool) -> None:
         self._depth = depth
         self._latched = latched
-        self._limit = kept_bytes
         self._kept: deque[Numbered] = deque()
         self._bytes = 0
         self.last = 0
 
     def put(self, message: bytes) -> int:
-        """Keep a message; return how many older ones had to go."""
+        """Add a message; return how many older ones were dropped."""
         self.last += 1
         self._kept.append((self.last, message))
         self._bytes += len(message)
         gone = 0
-        while len(self._kept) > self._depth or (self._bytes > self._limit and len(self._kept) > 1):
+        while len(self._kept) > self._depth or (
+            self._bytes > self.kept_bytes and len(self._kept) > 1
+        ):
             self._bytes -= len(self._kept.popleft()[1])
             gone += 1
         return gone
 
     def begin(self) -> int:
-        """Return the number after which a robot that has nothing yet begins."""
+        """Return the number after which a new robot begins."""
         if self._latched:
             return self._kept[0][0] - 1 if self._kept else self.last
         return self.last
 
     def after(self, number: int, limit_bytes: int) -> list[Numbered]:
-        """Return what comes after a number, oldest first: one message, or up to so many bytes."""
+        """Return messages after a number, oldest first: one, or up to a number of bytes."""
         found: list[Numbered] = []
         size = 0
         for one in self._kept:
@@ -57,13 +64,18 @@ class Ring:
 
 
 class Outbox:
-    """What one replica is to get of a topic of the robot's, in order."""
+    """The messages of a robot's topic to send to one replica, in order.
 
-    def __init__(self, depth: int, *, window: int = 16, kept_bytes: int = 64 << 20) -> None:
-        self._limit = kept_bytes
+    Args:
+        depth: Messages that wait at most; the oldest go first.
+    """
+
+    window = 16  # messages under way at once
+    kept_bytes = 64 << 20  # of those that wait, at most; the newest is kept in any case
+
+    def __init__(self, depth: int) -> None:
         self._waiting: deque[Numbered] = deque()
         self._depth = depth
-        self._window = window
         self._open: dict[int, bytes] = {}
 
     def __len__(self) -> int:
@@ -71,26 +83,28 @@ class Outbox:
 
     @property
     def waiting(self) -> bool:
-        """Whether something is not even under way."""
+        """Whether a message has not been sent yet."""
         return bool(self._waiting)
 
     def put(self, number: int, message: bytes) -> int:
-        """Add a message; return how many older ones had to go."""
+        """Add a message; return how many older ones were dropped."""
         self._waiting.append((number, message))
         size = sum(len(one) for _, one in self._waiting)
         gone = 0
-        while len(self._waiting) > self._depth or (size > self._limit and len(self._waiting) > 1):
+        while len(self._waiting) > self._depth or (
+            size > self.kept_bytes and len(self._waiting) > 1
+        ):
             size -= len(self._waiting.popleft()[1])
             gone += 1
         return gone
 
     def next(self) -> Numbered | None:
-        """Return what is to be sent now; it counts as under way.
+        """Return the messages to send now; they count as under way.
 
         Nothing while later ones than that are under way: they may have been lost with it, and
         what overtakes a message makes it one that comes too late.
         """
-        if not self._waiting or len(self._open) >= self._window:
+        if not self._waiting or len(self._open) >= self.window:
             return None
         if self._open and max(self._open) > self._waiting[0][0]:
             return None
@@ -99,26 +113,27 @@ class Outbox:
         return number, message
 
     def confirmed(self, number: int) -> None:
-        """The replica has it. Unknown numbers are fine."""
+        """Note that the replica has a message. Unknown numbers are ignored."""
         self._open.pop(number, None)
 
     def returned(self, numbers: Iterable[int]) -> None:
-        """These did not get there: they go again, in order with all that waits."""
+        """Queue undelivered messages again, in order."""
         back = [(number, self._open.pop(number)) for number in numbers if number in self._open]
         self._waiting = deque(sorted([*back, *self._waiting]))
 
 
 class Seen:
-    """Drops at a replica what came before, or came after a later one. By robot and its start."""
+    """Detects duplicate and reordered messages at a replica, by robot and its start."""
 
-    def __init__(self, robots: int = 256) -> None:
-        self._robots = robots
+    robots = 256  # that are remembered; the one that is longest silent is forgotten
+
+    def __init__(self) -> None:
         self._last: dict[bytes, int] = {}
 
     def is_new(self, publisher: bytes, number: int) -> bool:
-        """Whether a message is to be published; if so, it counts as seen."""
+        """Whether to publish a message; if so, it counts as seen."""
         last = self._last.pop(publisher, 0)
         self._last[publisher] = max(last, number)
-        if len(self._last) > self._robots:
+        if len(self._last) > self.robots:
             del self._last[next(iter(self._last))]
         return number > last

@@ -1,8 +1,8 @@
-"""Which of several replicas' messages the robot gets. Pure: time comes in.
+"""Which replicas' messages the robot gets. Pure: time is an argument.
 
 Replicas run the same nodes on the same input, so most of what they publish says the same.
 
-Owns: `leader`, `stamp`, `goal`, `all`. Not here: an action's status (`fogft.ros.goal_status`).
+Owns: `leader`, `stamp`, `goal`, `all`. Not here: an action's status (`fogft.ros.messages`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _GOAL = slice(4, 20)  # of a feedback message: its goal's id
 
 
 class Leader:
-    """Passes one replica's messages; another one's when that falls silent or leaves."""
+    """Passes one replica's messages; another's when that falls silent or leaves."""
 
     def __init__(self) -> None:
         self._leader: int | None = None
@@ -30,11 +30,11 @@ class Leader:
         self._quiet_s = QUIET_LIMIT_S
 
     def would_pass(self, replica: int, now: float) -> bool:
-        """Whether a message of a replica's would be the robot's (`now`: monotonic seconds)."""
+        """Whether a replica's message would go to the robot (`now`: monotonic seconds)."""
         return self._leader in (None, replica) or now - self._last > self._quiet_s
 
     def passes(self, replica: int, now: float) -> bool:
-        """Take a message of a replica's; return whether it is the robot's."""
+        """Take a replica's message; return whether it goes to the robot."""
         if not self.would_pass(replica, now):
             return False
         if replica != self._leader:
@@ -45,13 +45,13 @@ class Leader:
         return True
 
     def left(self, replica: int) -> None:
-        """A replica answers no more: whoever speaks next leads."""
+        """Note that a replica is gone: the next one to publish leads."""
         if replica == self._leader:
             self._leader = None
 
 
 class Selection:
-    """Decides message by message."""
+    """The selection of one topic's messages."""
 
     def __init__(self, select: Select) -> None:
         self._select = select
@@ -60,7 +60,7 @@ class Selection:
         self._goals: OrderedDict[bytes, Leader] = OrderedDict()
 
     def passes(self, replica: int, message: bytes, now: float) -> bool:
-        """Whether the robot gets a message (CDR) of a replica's (`now`: monotonic seconds)."""
+        """Whether the robot gets a replica's message (CDR) (`now`: monotonic seconds)."""
         if self._select is Select.STAMP:
             return self._first_of_its_stamp(replica, message, now)
         if self._select is Select.GOAL:
@@ -68,7 +68,7 @@ class Selection:
         return self._select is not Select.LEADER or self._leader.passes(replica, now)
 
     def wants(self, replica: int, now: float) -> bool:
-        """Whether to ask a replica for messages: not where all that it says would be dropped."""
+        """Whether to pull messages from a replica: not if all of them would be dropped."""
         return self._select is not Select.LEADER or self._leader.would_pass(replica, now)
 
     def _first_of_its_stamp(self, replica: int, message: bytes, now: float) -> bool:
@@ -91,7 +91,7 @@ class Selection:
         return leader
 
     def left(self, replica: int) -> None:
-        """A replica answers no more."""
+        """Note that a replica is gone."""
         self._leader.left(replica)
         for leader in self._goals.values():
             leader.left(replica)

@@ -49,9 +49,11 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["throughput"] = speed.throughput
     found["stalls"] = faults.stalls
     found["killed"] = faults.killed
-    found["hostile"] = hostile.hostile
+    for lie in hostile.LIES:
+        found[f"hostile-{lie.replace(' ', '-')}"] = functools.partial(hostile.hostile, lie=lie)
     found["restarted"] = faults.restarted
     found["memory"] = speed.memory
+    found["hours"] = speed.hours
     found["hedging"] = tail.hedging
     found["load"] = load.load
     found["idle"] = load.idle

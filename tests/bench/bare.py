@@ -26,7 +26,8 @@ from typing import Any
 import zenoh
 from zenoh import handlers
 
-from fogft.link.zenoh import runtime, threads
+from fogft.link.zenoh import threads
+from fogft.link.zenoh.settings import ask_for_threads
 from fogft.model.choices import Speaks
 from fogft.proxy import middleware
 from fogft.ros import memory_tuning
@@ -121,7 +122,7 @@ def main() -> None:
     """Be one end, until the bench ends."""
     ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)
     middleware.prepare(Speaks.RCLPY)
-    runtime.prepare()
+    ask_for_threads()
     memory_tuning.tune()
     side, folder, domain, *ports = sys.argv[1:]
     if side == "replica":

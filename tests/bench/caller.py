@@ -26,18 +26,25 @@ def payloads(*, poison: bool = False) -> dict[str, bytes]:
     Args:
         poison: The first ends the process that serves it, if that sleeps over requests.
     """
+    from rclpy.serialization import serialize_message
+    from std_srvs.srv import SetBool
+
+    return {
+        FLAG[0]: bytes(serialize_message(SetBool.Request(data=not poison))),
+        MAP[0]: map_request(LARGE_BYTES),
+    }
+
+
+def map_request(size_bytes: int) -> bytes:
+    """Return a serialised request with a map of so many cells."""
     import array
 
     from nav_msgs.srv import SetMap
     from rclpy.serialization import serialize_message
-    from std_srvs.srv import SetBool
 
     large = SetMap.Request()
-    large.map.data = array.array("b", bytes(LARGE_BYTES))
-    return {
-        FLAG[0]: bytes(serialize_message(SetBool.Request(data=not poison))),
-        MAP[0]: bytes(serialize_message(large)),
-    }
+    large.map.data = array.array("b", bytes(size_bytes))
+    return bytes(serialize_message(large))
 
 
 def is_right_flag(response: bytes) -> bool:

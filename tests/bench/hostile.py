@@ -19,36 +19,33 @@ _SETTLES_S = 1.0  # an avoided replica is tried again, and found honest
 _MOST = 2
 
 
-def hostile(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
-    """Compare 0, 1 and 2 of 3 replicas that lie, in turns, for each of some lies.
+def hostile(folder: Path, *, quick: bool, lie: str) -> list[dict[str, Any]]:
+    """Compare 0, 1 and 2 of 3 replicas that lie, in turns.
 
     They lie to every request for as long as a block lasts, and nobody takes them away: no manager
     runs. One call follows the other: what fewer replicas can do together is not what is measured.
     `wrong` counts answers that the service does not give.
     """
-    rounds, count = (2, 60) if quick else (3, 150)
+    rounds, count = (2, 60) if quick else (10, 100)
     orders = {slot: folder / f"orders-{slot}" for slot in range(_MOST)}
-    rows = []
     with Rig(folder, 3, sleep_s=SLEEP_S, hostile=orders) as rig:
         caller = Caller(rig.robot_domain, "bench_hostile")
         caller.wait()
         _calls(caller, count)  # delays and loads become known
-        for lie in LIES:
-            took: dict[int, list[float]] = {bad: [] for bad in range(_MOST + 1)}
-            wrong = dict.fromkeys(took, 0)
-            for _ in range(rounds):
-                for bad in took:
-                    for slot, path in orders.items():
-                        path.write_text(lie if slot < bad else "honest")
-                    before = caller.wrong
-                    took[bad] += _calls(caller, count)
-                    wrong[bad] += caller.wrong - before
-                    for path in orders.values():
-                        path.write_text("honest")
-                    time.sleep(_SETTLES_S)
-            rows += [_row(lie, bad, took, wrong[bad], rounds * count) for bad in took]
+        took: dict[int, list[float]] = {bad: [] for bad in range(_MOST + 1)}
+        wrong = dict.fromkeys(took, 0)
+        for _ in range(rounds):
+            for bad in took:
+                for slot, path in orders.items():
+                    path.write_text(lie if slot < bad else "honest")
+                before = caller.wrong
+                took[bad] += _calls(caller, count)
+                wrong[bad] += caller.wrong - before
+                for path in orders.values():
+                    path.write_text("honest")
+                time.sleep(_SETTLES_S)
         caller.close()
-    return rows
+    return [_row(lie, bad, took, wrong[bad], rounds * count) for bad in took]
 
 
 def _calls(caller: Caller, count: int) -> list[float]:

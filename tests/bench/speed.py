@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import random
+import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any
 
 from fogft.model.choices import Speaks
 from tests.bench import machine
-from tests.bench.caller import Caller, Flood, milliseconds, payloads
+from tests.bench.caller import Caller, Flood, map_request, milliseconds, payloads
 from tests.bench.floor import Floor
 from tests.bench.rig import Rig
 from tests.bench.service import FLAG, MAP
@@ -182,12 +183,65 @@ def _throughput_row(
     }
 
 
+def _proxies(rig: Rig) -> dict[str, int]:
+    """Return the process id of each proxy, by what it is."""
+    servers = {f"server proxy {one.id.slot}": one.process.pid for one in rig.replicas}
+    return {"client proxy": rig.proxy.pid, **servers}
+
+
+def hours(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Follow each proxy's own memory over two hours of requests of all sizes, to 4 MB.
+
+    Medians of ten looks in each twelfth of the time (with `quick`, sixth).
+    """
+    lasts_s, windows = (60.0, 6) if quick else (7200.0, 12)
+    source = random.Random(0)
+    with Rig(folder, 2) as rig:
+        proxies, small = _proxies(rig), payloads()[FLAG[0]]
+        caller = Caller(rig.robot_domain, "bench_hours")
+        caller.wait()
+        seen: dict[str, list[list[int]]] = {name: [[] for _ in range(windows)] for name in proxies}
+        asked = unanswered = 0
+        begin, look_at = time.monotonic(), 0.0
+        while (spent_s := time.monotonic() - begin) < lasts_s:
+            large = map_request(int(10 ** source.uniform(2.0, 6.6)))
+            for _ in range(source.choice((1, 1, 1, 8))):
+                asked += 2
+                unanswered += 1 - caller.flood(MAP[0], large, 1, 1).answered
+                unanswered += 1 - caller.flood(FLAG[0], small, 1, 1).answered
+            if spent_s >= look_at:
+                look_at = spent_s + lasts_s / windows / 10
+                for name, pid in proxies.items():
+                    window = int(spent_s / lasts_s * windows)
+                    seen[name][window].append(machine.own_memory_bytes(pid))
+            time.sleep(0.2)
+        caller.close()
+    medians_of = {
+        name: [int(median([float(size) for size in window])) for window in found]
+        for name, found in seen.items()
+    }
+    return [
+        {
+            "process": name,
+            "requests": asked,
+            "unanswered": unanswered,
+            "minutes": lasts_s / 60,
+            "first_bytes": medians[0],
+            "second_bytes": medians[1],
+            "half_time_bytes": medians[windows // 2],
+            "last_bytes": medians[-1],
+            "most_bytes": max(map(max, seen[name])),
+            "all_bytes": medians,
+        }
+        for name, medians in medians_of.items()
+    ]
+
+
 def memory(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     """Follow each proxy's own memory over many requests (and some large ones before)."""
     steps, step = 10, 1_000 if quick else 10_000
     with Rig(folder, 2) as rig:
-        proxies = {"client proxy": rig.proxy.pid}
-        proxies |= {f"server proxy {r.id.slot}": r.process.pid for r in rig.replicas}
+        proxies = _proxies(rig)
         caller = Caller(rig.robot_domain, "bench_memory")
         caller.wait()
         small, large = payloads()[FLAG[0]], payloads()[MAP[0]]

@@ -32,4 +32,4 @@ def test_what_was_spent_is_shown_by_day_and_replica(home: Path, capsys):
 def test_a_pool_of_which_nothing_is_known_is_an_error(home: Path, capsys):
     assert main.run(["cost"]) == 0
     assert main.run(["cost", "nobody"]) == 1
-    assert "no cost is known" in capsys.readouterr().err
+    assert "no costs are recorded" in capsys.readouterr().err

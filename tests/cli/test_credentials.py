@@ -33,7 +33,7 @@ fogft: {services: [{name: /s, type: std_srvs/srv/SetBool}]}
 
 @pytest.fixture
 def paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PoolPaths:
-    """A pool without a running manager, in a home of its own."""
+    """A pool no manager is running, in a home of its own."""
     monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(bundle.SCRYPT, "n", 2)
@@ -90,7 +90,7 @@ def test_without_a_terminal_it_says_how_to_give_the_passphrase(paths, capsys, mo
 def test_the_list_shows_states_and_no_key(paths, capsys):
     passphrase = issue_ada(capsys)
     assert run("credentials", "revoke", "robot", "ada") == 0
-    assert "without a running manager" in capsys.readouterr().err
+    assert "no manager is running" in capsys.readouterr().err
     assert run("credentials", "issue", "robot", "ada", "--out", "again.join") == 0
     capsys.readouterr()
     assert run("credentials", "list") == 0
@@ -121,7 +121,7 @@ def test_revoking_what_is_known_to_all_says_so(paths, capsys):
     [
         (["issue", "manager", "x"], "there is no role `manager`"),
         (["issue", "robot", "a b"], "cannot be named"),
-        (["issue", "replica", "3"], "no slot for a replica"),
+        (["issue", "replica", "3"], "not a slot for a replica"),
         (["revoke", "robot", "nobody"], "no certificate of robot `nobody`"),
         (["rotate", "gateway", "edge"], "on another machine"),
         (["rotate", "robot", "ada"], "on another machine"),

@@ -15,7 +15,7 @@ from fogft import disk
 from fogft.cli import main
 from fogft.cloud.local import faults
 from fogft.cloud.local.faults import CloudFaults
-from fogft.doctor import checks, finding, leftovers, machine, pools, ros
+from fogft.doctor import checks, finding, machine, pools, ros
 from fogft.doctor.finding import Finding, Situation, Verdict, fail, ok, warn
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
 from fogft.pool.commands.status import Seen
@@ -85,7 +85,7 @@ def test_it_fails_when_something_does_not_work(monkeypatch, capsys):
     monkeypatch.setattr(checks, "examine", lambda _: iter(findings))
     assert main.run(["doctor"]) == 1
     said = capsys.readouterr()
-    assert said.err == "\n3 checks: 1 failed, 1 warnings\n"
+    assert said.err == "\n3 checks: 1 failed, 1 warning\n"
     assert len(said.out.splitlines()) == 5
     assert "\033" not in said.out
 
@@ -177,9 +177,9 @@ def test_a_profile_that_is_no_xml_is_found(tmp_path, monkeypatch):
     ("rmw", "verdict", "said"),
     [
         ("rmw_fastrtps_cpp", Verdict.OK, "measurements were made with it"),
-        ("rmw_cyclonedds_cpp", Verdict.WARN, "no service call passes between it and Fast DDS"),
+        ("rmw_cyclonedds_cpp", Verdict.WARN, "service calls between it and Fast DDS"),
         ("rmw_zenoh_cpp", Verdict.WARN, "rmw: zenoh"),
-        ("rmw_connextdds", Verdict.WARN, "nobody has tried it"),
+        ("rmw_connextdds", Verdict.WARN, "not tried"),
     ],
 )
 def test_the_middleware_is_named_with_what_is_known_of_it(rmw, verdict, said):
@@ -322,6 +322,21 @@ def test_a_doctor_says_of_answers_what_status_says(tmp_path):
         assert of_check("answers", tmp_path).verdict is Verdict.WARN
 
 
+def test_a_full_disk_is_found_and_no_process_is_blamed_for_it(tmp_path, monkeypatch):
+    paths = lay_down(tmp_path, STATUS)
+    with alive(paths):
+        report(paths, STATUS, age_s=30)
+        assert of_check("links", tmp_path).verdict is Verdict.FAIL
+        monkeypatch.setattr(disk, "unwritable", lambda folder: "full")
+        found = of_check("disk", tmp_path)
+        assert (found.verdict, found.text) == (
+            Verdict.FAIL,
+            f"pool `planner`: the disk of `{paths.folder}` is full",
+        )
+        every = pools.processes(situation(tmp_path, "planner"))
+        assert "links" not in {one.check for one in every}
+
+
 def judged_links(*links: LinkReport) -> list[Finding]:
     rows = [ReplicaStatus(one.id.slot, one.id.generation, "ready") for one in links]
     status = replace(STATUS, replicas=rows).joined(None, proxy_alive=True, links=links)
@@ -339,19 +354,19 @@ def test_silent_links_are_found():
 
 
 def test_a_replica_whose_program_ends_is_found():
-    ends = LinkReport(ReplicaId(UID, 1, 2), LinkState.UP, detail="`run` exit status 3")
+    ends = LinkReport(ReplicaId(UID, 1, 2), LinkState.UP, detail="`run` exited with status 3")
     found = judged_links(ends)
     assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
-    assert "`1.2` is not ready: `run` exit status 3" in found[0].text
+    assert "`1.2` is not ready: `run` exited with status 3" in found[0].text
     assert "`fogft logs 1`" in found[0].advice
 
 
 def test_chaos_that_lasts_is_found(tmp_path):
-    assert list(leftovers.chaos(situation(tmp_path))) == []
+    assert list(pools.chaos(situation(tmp_path))) == []
     outage = CloudFaults({"local/us-west-2": None, "local/us-west-1": 1.0}, {"local/us-east-1": 0})
     (tmp_path / "local").mkdir()
     faults.write(tmp_path / "local" / faults.FILE, outage)
-    found = the_only(leftovers.chaos(situation(tmp_path)))
+    found = the_only(pools.chaos(situation(tmp_path)))
     assert "`local/us-west-2` is out, `local/us-east-1` has room for 0 machines" in found.text
     assert "us-west-1" not in found.text
 

@@ -73,8 +73,8 @@ def test_text_has_costs_availability_and_response(pool, capsys):
     assert "a month" in out
     assert "one on-demand cpu8" in out
     assert "0.996346 expected (0.999527 if replicas failed independently)" in out
-    assert "spot up 15 h" in out
-    assert "response      11 ms and the service's own time; 23 ms while" in out
+    assert "uptime 15 h spot" in out
+    assert "response      11 ms plus the service's own time; 23 ms while" in out
     assert "(pool file)" in out
 
 
@@ -191,7 +191,7 @@ def test_how_long_launches_took_is_shown_and_taken_for_the_time_away(pool, capsy
         assert shown["ready_p90_s"] == known
         assert shown["availability"]["assumed"]["recovery_s"] == (known or 1200)
     assert main.run(["plan", str(pool)]) == 0
-    assert "within 700 s of the order (p90 of 5 launches" in capsys.readouterr().out
+    assert "within 700 s of being ordered (p90 of 5 launches" in capsys.readouterr().out
 
 
 @needs("matplotlib")
@@ -206,11 +206,14 @@ def test_every_offer_is_drawn_and_the_chosen_ones_named(pool, tmp_path):
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (["aws,us-west-1,a,m,8,32,0.4,-0.1,"], "row 2: SpotPrice: `-0.1` is not a number from 0"),
+        (
+            ["aws,us-west-1,a,m,8,32,0.4,-0.1,"],
+            "row 2: SpotPrice: `-0.1` is not a number of at least 0",
+        ),
         (["aws,us-west-1,a,m,8,32,0.4,cheap,"], "SpotPrice: `cheap` is not a number"),
         (["aws,us-west-1,a,m,8,32,0.4,0.1,yesterday"], "AsOf: `yesterday` is not a date"),
-        ([], "nothing in"),
-        (["aws,us-west-1,a,m,2,4,0.4,0.1,"], "nothing in"),
+        ([], "no row of"),
+        (["aws,us-west-1,a,m,2,4,0.4,0.1,"], "no row of"),
     ],
 )
 def test_a_bad_table_is_told(pool, tmp_path, capsys, rows, message):

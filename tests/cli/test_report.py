@@ -34,7 +34,7 @@ def test_a_screen_has_trends_events_and_cost(home, capsys):
     assert "1 of 3 ready" in shown
     assert re.search(r"P99 /plan +█ +148 ms", shown)
     assert re.search(r"RTT 0\.1 +█ +0\.42 ms", shown)
-    assert "spent $0.000 so far" in shown
+    assert "/h on local" in shown
     assert "local/<west>/a" in shown
 
 

@@ -75,7 +75,7 @@ def test_a_home_in_which_no_unit_can_be_written_is_one_clear_error(
     Systemd(tmp_path / "bin", monkeypatch)
     (tmp_path / "config").touch()
     assert main.run(["service", "install"]) == 1
-    assert f"error: `{units}` cannot be made: Not a directory" in capsys.readouterr().err
+    assert f"error: `{units}` cannot be created: Not a directory" in capsys.readouterr().err
 
 
 def test_units_of_a_gateway_and_of_the_machine(tmp_path, monkeypatch):

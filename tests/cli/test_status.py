@@ -104,6 +104,17 @@ def test_a_manager_that_hangs_is_told(home, capsys):
     )
 
 
+def test_a_full_disk_is_told_instead(home, capsys, monkeypatch):
+    """It is why what is shown is old; the manager is not to blame."""
+    monkeypatch.setattr(disk, "unwritable", lambda folder: "full")
+    paths = lay_down(home, age_s=40)
+    with alive(paths):
+        main.run(["status"])
+    said = capsys.readouterr().err
+    assert said.startswith(f"warning: the disk of `{paths.folder}` is full: ")
+    assert "observed" not in said
+
+
 def test_what_sounds_alarm_stands_in_the_first_line(home, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     status = replace(STATUS, uplink_suspected=True, stopping=True)
@@ -196,7 +207,7 @@ def test_a_status_of_another_version_is_an_error(home, capsys):
     paths.status.write_text('{"pool": "planner", "replicas": [], "services": []}')
     assert main.run(["status"]) == 1
     said = capsys.readouterr().err
-    assert said.startswith(f"error: `{paths.status}` is not a status: ")
+    assert said.startswith(f"error: `{paths.status}` is not a status file: ")
     assert "remove it" in said
 
 

@@ -14,8 +14,7 @@ from fogft.cli import main
 from fogft.model.plain import from_plain, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
-from fogft.pool.commands.status import Seen
-from fogft.pool.commands.status_schema import status_schema
+from fogft.pool.commands.status import Seen, status_schema
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager import status
 from fogft.pool.manager.reconciler import Tick

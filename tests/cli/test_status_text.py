@@ -40,7 +40,7 @@ def test_a_topic_is_shown_with_who_hears_it_and_what_became_of_its_messages():
 @pytest.mark.parametrize(
     ("ready", "trouble", "said"),
     [
-        ({"/plan"}, "", "nobody hears `/scan`: no node of a replica subscribes to it"),
+        ({"/plan"}, "", "`/scan` has no subscriber: no node on a replica subscribes to it"),
         ({"/plan", "topic /scan"}, "it offers best effort", "it offers best effort"),
     ],
 )
@@ -79,7 +79,7 @@ def test_a_port_that_strangers_flood_is_told_of():
     flooded = replace(STATUS.replicas[0], strangers=9800)
     status = replace(STATUS, notes=(), replicas=(flooded, *STATUS.replicas[1:]))
     (line,) = [line.plain for line in notes(status)]
-    assert line.startswith("note: replica 0.1 has turned away 9 800 connections of strangers: ")
+    assert line.startswith("note: replica 0.1 has refused 9 800 unauthenticated connections: ")
 
 
 def test_the_lines_of_a_log_stand_below_the_note_that_they_explain():
@@ -93,5 +93,5 @@ def test_a_pool_that_is_too_small_says_how_many_replicas_would_do():
     service = replace(STATUS.services[0], counters={"needed_replicas": 6})
     status = replace(STATUS, notes=(), excluded=(), services=(service,))
     assert [line.plain for line in notes(status)] == [
-        f"note: `{service.name}`: more is asked than the replicas can do; 6 would do"
+        f"note: `{service.name}`: load exceeds the capacity of its replicas; 6 would do"
     ]

@@ -62,8 +62,8 @@ def test_what_a_living_manager_owns_is_left_alone(home, machines, capsys):
     assert run(capsys, "--end", "--yes") == (
         [],
         "done: every machine belongs to a managed pool\n"
-        "\nhint: real clouds were never used from this machine: "
-        "`--cloud sky` checks them as well\n",
+        "\nhint: no real cloud has been used from this machine; "
+        "`--cloud sky` checks them anyway\n",
     )
     assert machines.machine(id)
     lock.release()
@@ -163,7 +163,7 @@ def test_a_vm_that_only_its_cloud_still_knows_is_found_and_ended(scene, capsys):
     assert left_of("planner", "sky", scene.cloud) == []
     [line], err = run(capsys)
     assert line.split()[:3] == [str(replica()), "aws/us-east-1/us-east-1a", "$0.021/h"]
-    assert "asked SkyPilot for all its clouds, and `aws` directly" in err
+    assert "checked all of SkyPilot's clouds, and `aws` directly" in err
     run(capsys, "--end", "--yes")
     assert scene.provider.found == {}
 
@@ -173,7 +173,7 @@ def test_a_cloud_that_does_not_answer_is_no_empty_list(scene, capsys):
     scene.sky.unreachable = True
     out, err = run(capsys, status=1)
     assert out == []
-    assert err.startswith("error: SkyPilot cannot tell")
+    assert err.startswith("error: SkyPilot gave no answer")
 
 
 def test_what_does_not_end_is_an_error_with_what_to_do(scene, capsys):

@@ -116,7 +116,7 @@ def test_it_gives_up_with_the_reason_and_says_what_still_runs(home, file, looks,
 def test_it_gives_up_at_once_when_run_keeps_ending(home, file, looks, capsys):
     lay_down(home)
     silent = replace(UP.services[0], ready_replicas=0)
-    detail = "`run` ended (exit status 1) and is started again"
+    detail = "`run` exited with status 1: see `fogft logs 0`"
     hopeless = replace(STARTING, restarts=4, detail=detail)
     looks(updated(file, services=(silent,), replicas=(hopeless,)))
     assert main.run(["up", str(file), "--timeout", "1000"]) == 1
@@ -133,13 +133,19 @@ def test_one_replica_that_still_starts_is_worth_waiting_for(file, looks, capsys)
     assert main.run(["up", str(file)]) == 0
 
 
-def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, capsys):
+def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, monkeypatch, capsys):
     lay_down(home).manager_log.write_text("its last words\n")
+    monkeypatch.setattr(progress, "MANAGER_GONE_S", 0.01)
     looks(Seen(STATUS, 0.1, False))
     assert main.run(["up", str(file)]) == 1
     assert (
         "error: the manager of `planner` has exited:\nits last words\n" in capsys.readouterr().err
     )
+
+
+def test_a_manager_that_another_up_replaces_is_waited_for(file, looks):
+    looks(Seen(STATUS, 0.1, False), Seen(STATUS, 0.1, False), UP)
+    assert main.run(["up", str(file)]) == 0
 
 
 def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
@@ -193,7 +199,7 @@ def test_a_file_for_another_cloud_can_be_tried_here(file, looks, capsys):
     assert capsys.readouterr().err == (
         "error: there is no cloud `aws`\n\n"
         "hint: there are: `local`, `sky`; "
-        "`sky` stands for all real ones, which the pool file names\n"
+        "`sky` stands for all real clouds, which the pool file names\n"
     )
 
 

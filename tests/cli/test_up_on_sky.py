@@ -167,14 +167,17 @@ def test_files_that_every_vm_gets_are_told_before_anything_is_launched(
     assert "warning: SkyPilot gives every VM these files of yours" in said
     assert "`~/.runpod/config.toml`" in said
     assert "port 7448" in said
-    assert "are open to the world: `fogft.allow_from` names who may connect" in said
+    assert "are open to the world: on AWS, `fogft.allow_from` limits who may connect" in said
     assert started == []
 
 
 def test_what_cannot_be_told_of_credentials_hinders_no_up(scene, file, started, capsys):
-    scene.sky.fail_next("uploaded_credentials", CloudUnreachable("SkyPilot cannot tell"))
+    scene.sky.fail_next("uploaded_credentials", CloudUnreachable("SkyPilot gave no answer"))
     assert main.run(["up", str(file), "--yes"]) == 0
-    assert "what a VM is given cannot be told now: SkyPilot cannot tell" in capsys.readouterr().err
+    assert (
+        "it is unknown now which files a VM gets: SkyPilot gave no answer"
+        in capsys.readouterr().err
+    )
 
 
 def test_skypilot_that_does_not_answer_ends_a_first_up(home, scene, file, started, capsys):
@@ -187,7 +190,7 @@ def test_skypilot_that_does_not_answer_ends_a_first_up(home, scene, file, starte
 def test_real_clouds_and_the_local_one_do_not_mix(file, capsys):
     file.write_text(SPEC + "resources: {any_of: [{infra: aws}, {infra: local}]}\n")
     assert main.run(["up", str(file)]) == 1
-    assert f"error: {file}:7: resources: `aws` and `local` cannot be in one pool" in (
+    assert f"error: {file}:7: resources: `aws` and `local` cannot be combined in one pool" in (
         capsys.readouterr().err
     )
 

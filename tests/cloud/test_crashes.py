@@ -100,7 +100,7 @@ def test_a_full_disk_is_told_and_nothing_is_started(local):
     process = launcher(local, "full")
     _, complaint = process.communicate(timeout=100)
     assert process.returncode == 1
-    assert complaint.startswith("CloudError: machine `0.1` cannot be made: "), complaint
+    assert complaint.startswith("CloudError: machine `0.1` cannot be created: "), complaint
     assert "File too large" in complaint
     assert os.listdir(local.root / "machines") == []
     assert processes.find(pool_uid=local.uid) == []

@@ -111,7 +111,7 @@ def test_a_zombie_is_not_alive(start, uid):
 def test_what_does_not_end_is_told(start, uid, monkeypatch):
     process = start("exec sleep 60", FOGFT_MACHINE=f"{uid}-0.1")
     monkeypatch.setattr(processes, "send", lambda pids, number: None)
-    with pytest.raises(CloudUnreachable, match=f"do not end: {process.pid}"):
+    with pytest.raises(CloudUnreachable, match=f"do not exit: {process.pid}"):
         processes.end([process.pid], limit_s=0.05)
 
 

@@ -149,7 +149,7 @@ def test_what_is_nothing_to_this_cloud_is_accepted():
         ({"any_of": ["local"]}, "resources.any_of[0]: must be a map, not `local`", "infra"),
         (
             {"any_of": [{}], "ordered": [{}]},
-            "resources.ordered: cannot stand beside `any_of`",
+            "resources.ordered: cannot be combined with `any_of`",
             "keep one",
         ),
         (

@@ -21,7 +21,7 @@ from fogft.doctor.checks import ALL
 from fogft.model import reason, refusal
 from fogft.model.reason import Cause
 from fogft.model.refusal import Effect, Refusal
-from fogft.pool.commands.status_schema import status_schema
+from fogft.pool.commands.status import status_schema
 from fogft.proxy.robot.diagnostics import Diagnosis
 from tests.docs.documents import ROOT
 from tests.docs.pool_file_tables import tables as pool_file

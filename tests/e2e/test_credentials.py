@@ -54,7 +54,7 @@ def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
     pool.fogft("credentials", "rotate", "replica")
     pool.wait(lambda: generations(pool) == ["2", "2"])
     result = first.finish()
-    assert result["requests"] > 150
+    assert result["requests"] > 100  # ten a second, for as long as all this takes
     assert flawless(result), result
     states = [line.split()[:3] for line in pool.fogft("credentials", "list").splitlines()[1:]]
     assert ["robot", "ada.1", "revoked"] in states

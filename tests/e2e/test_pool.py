@@ -9,8 +9,8 @@ import time
 
 import pytest
 
+from fogft.disk import holder as lock_holder
 from fogft.pool.folder.paths import PoolPaths
-from fogft.pool.manager.process_control import lock_holder
 from tests.e2e.pool import Pool
 from tests.nightly import by_day
 

@@ -1,6 +1,6 @@
 """Experiment `failures`: the paper's failure qualification (III.C), put right and simulated.
 
-Owns: what is compared. Not here: the arithmetic (`fogft.planning.reliability`), pools in
+Owns: what is compared. Not here: the arithmetic (`fogft.planning.availability`), pools in
 simulated markets (`simulated`), the number of replicas for a target (`fogft plan`).
 """
 
@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from fogft.planning.reliability import replicas_needed, system_unavailability, unavailability
+from fogft.planning.availability import replicas_needed, system_unavailability, unavailability
 from fogft.simulation.model import MarketModel, Timing
 from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting

@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from fogft.planning.reliability import system_unavailability
+from fogft.planning.availability import system_unavailability
 from fogft.simulation.model import MarketModel, Timing
 from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting

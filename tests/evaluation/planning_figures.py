@@ -38,5 +38,5 @@ def _one(samples: Samples, scenes: Sequence[str], variant: str, field: str) -> A
         below.set_xlabel(_AXES[field], fontsize=8)
         below.set_ylabel("fraction of trials", fontsize=8)
         below.legend(fontsize=7)
-    figure.suptitle(f"Motion planning, {variant}", fontsize=10)
+    figure.suptitle(f"Motion planning, {variant}: {_AXES[field]}", fontsize=10)
     return figure

@@ -65,11 +65,10 @@ def page_head(machine: Mapping[str, Any]) -> str:
 
 def section(into: Path, experiment: Experiment, samples: Samples) -> Iterator[str]:
     """Yield one experiment's part of the page; write its plots."""
-    said = html.escape
-    yield f"<h2 id={experiment.name}>{said(experiment.title)}</h2>"
-    yield f"<p><b>The paper.</b> {said(experiment.claim)}</p>"
-    yield f"<p><b>Here.</b> {said(experiment.method)}</p>"
-    yield f"<p>{said(circumstances(samples))}</p>"
+    yield f"<h2 id={experiment.name}>{_said(experiment.title)}</h2>"
+    yield f"<p><b>The paper.</b> {_said(experiment.claim)}</p>"
+    yield f"<p><b>Here.</b> {_said(experiment.method)}</p>"
+    yield f"<p>{circumstances(samples)}</p>"
     findings = experiment.findings(samples)
     if findings:
         yield from findings_table(findings)
@@ -88,6 +87,11 @@ def section(into: Path, experiment: Experiment, samples: Samples) -> Iterator[st
         f"<a href='{experiment.name}/{c}.csv'>{c}</a> ({len(samples[c])})" for c in samples
     )
     yield f"<p>Raw samples: {files}</p>"
+
+
+def _said(text: str) -> str:
+    """Return text as HTML; what stands in backticks is code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", html.escape(text))
 
 
 def circumstances(samples: Samples) -> str:
@@ -112,7 +116,7 @@ def findings_table(findings: Any) -> Iterator[str]:
         yield (
             f"<tr><td>{html.escape(one.what)}<td class=n>{_with_unit(one.paper, one.unit)}"
             f"<td class=n>{_with_unit(str(one.ours), one.unit)}"
-            f"<td class=why>{html.escape(one.why)}</tr>"
+            f"<td class=why>{_said(one.why)}</tr>"
         )
     yield "</table>"
 

@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from fogft.planning.reliability import replicas_needed, unavailability
+from fogft.planning.availability import replicas_needed, unavailability
 from tests.evaluation import costs, failures, planning, registry, report
 from tests.evaluation.experiment import Scale
 from tests.evaluation.planning import Condition, contended_trials

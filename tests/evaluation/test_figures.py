@@ -26,8 +26,6 @@ from tests.needs import need
 
 need("matplotlib")
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: E402 - where it is
-
 
 @pytest.fixture
 def folder(tmp_path):
@@ -50,6 +48,15 @@ def column(folder, condition, field):
         return [float(row[field]) for row in csv.DictReader(file)]
 
 
+def drawn(figure):
+    """Draw a figure; return its canvas."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return canvas
+
+
 @pytest.mark.parametrize("draw", [plotting.distribution, plotting.series, plotting.curve])
 def test_what_colours_tell_apart_is_told_apart_without_them(draw):
     seen = set()
@@ -59,9 +66,7 @@ def test_what_colours_tell_apart_is_told_apart_without_them(draw):
         draw(axes[0][0], values, *([] if draw is plotting.distribution else [values]), colour, "")
         for line in axes[0][0].lines:
             line.set_color("black")
-        canvas = FigureCanvasAgg(figure)
-        canvas.draw()
-        seen.add(bytes(canvas.buffer_rgba()))
+        seen.add(bytes(drawn(figure).buffer_rgba()))
     assert len(seen) == len(plotting.COLOURS)
 
 
@@ -72,7 +77,7 @@ def test_every_label_is_whole(name):
     folder = ROOT / "docs" / "results"
     found = running.found(folder, {name: experiment})
     for figure in experiment.figures(found[name]).values():
-        FigureCanvasAgg(figure).draw()
+        drawn(figure)
         width, height = figure.bbox.size
         for axis in figure.axes:
             for text in (axis.xaxis.label, axis.yaxis.label, axis.title):

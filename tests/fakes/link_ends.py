@@ -66,14 +66,14 @@ class MemoryLink:
         self._sessions = 0
         self._closed = False
         self._status = LinkStatus(
-            LinkState.CONNECTING, None, None, 0.0, None, 0, 0, 0, "not reached yet"
+            LinkState.CONNECTING, None, None, 0.0, None, 0, 0, "not reached yet"
         )
         self._heard_at: float | None = None
         self._forgotten: dict[bytes, None] = {}
 
     @property
     def peer(self) -> Peer:
-        """Whom it talks to."""
+        """The replica at the other end."""
         return self._peer
 
     @property
@@ -89,7 +89,7 @@ class MemoryLink:
 
     @property
     def draining(self) -> bool:
-        """Whether the replica asked to be left alone."""
+        """Whether the replica is draining."""
         answer = self._status.probe_answer
         return answer is not None and answer.draining
 
@@ -154,7 +154,7 @@ class MemoryLink:
                 self._events.changed(self)
 
     def flush(self) -> None:
-        """Tell the replica of all that was forgotten and not answered."""
+        """Send cancellations for forgotten, unanswered requests."""
         session, ids = self._session, list(self._forgotten)
         self._forgotten.clear()
         if session is not None and ids:
@@ -168,7 +168,6 @@ class MemoryLink:
             heard_age_s=None if self._heard_at is None else now - self._heard_at,
             silent_for_s=self._silence.for_s(now),
             in_flight=len(session.window) if session else 0,
-            in_flight_bytes=session.window.held_bytes if session else 0,
             reopened=max(self._sessions - 1, 0),
         )
 
@@ -235,7 +234,7 @@ class MemoryLink:
         id = self._peer.id
         if (answer.slot, answer.generation) != (id.slot, id.generation):
             self._part(
-                f"`{self._peer.endpoint}` says that it is {answer.slot}.{answer.generation}, "
+                f"`{self._peer.endpoint}` identifies itself as {answer.slot}.{answer.generation}, "
                 f"not {id.short}"
             )
             return

@@ -48,7 +48,7 @@ class MemoryDomain:
         self._pumping = threading.Lock()
 
     def node(self, name: str = "node") -> MemoryNode:
-        """Make a node."""
+        """Create a node."""
         return MemoryNode(self, name)
 
     def pump(self, limit: int | None = None) -> int:
@@ -190,7 +190,7 @@ class MemoryClient:
             on_response(payload)
 
     def forget(self, ticket: int) -> None:
-        """Drop what is kept for a request; unknown tickets are fine."""
+        """Drop a pending request; unknown tickets are ignored."""
         self._pending.pop(ticket, None)
 
     def close(self) -> None:
@@ -210,7 +210,7 @@ class MemoryNode:
 
     @property
     def alive(self) -> bool:
-        """Whether it is open."""
+        """Whether the node is open."""
         return self._open
 
     def serve(
@@ -228,11 +228,14 @@ class MemoryNode:
         return server
 
     def client(self, name: str, type_name: str) -> MemoryClient:
-        """Make a client of a service."""
+        """Create a client of a service."""
         self._check(type_name)
         client = MemoryClient(self._domain, name, type_name)
         self._made.append(client)
         return client
+
+    def look(self) -> None:
+        """Nothing here depends on a clock."""
 
     def offered(self) -> dict[str, str]:
         """Return name -> type of what is served in the domain, but not by this node."""

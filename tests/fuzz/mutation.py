@@ -52,14 +52,26 @@ def damaged_text(seed: bytes, dice: random.Random) -> bytes:
 
 
 def _other_values(tree: Any, dice: random.Random) -> bytes:
-    """Change, drop or replace one to three values."""
+    """Change, drop, exchange, repeat, nest or rename one to three values."""
     for _ in range(dice.randrange(1, 4)):
         places = list(_places(tree))
         if not places:
             break
         holder, key = dice.choice(places)
-        if dice.random() < 0.15:
+        kind = dice.random()
+        if kind < 0.15:
             del holder[key]
+        elif kind < 0.3:  # what stands elsewhere is good there
+            other, there = dice.choice(places)
+            holder[key] = copy.deepcopy(other[there])
+        elif kind < 0.4 and isinstance(holder[key], list) and holder[key]:
+            holder[key] = copy.deepcopy(holder[key]) * dice.choice((2, 300))
+        elif kind < 0.45:
+            holder[key] = {"": [holder[key]]} if dice.random() < 0.5 else [holder[key]]
+        elif kind < 0.55 and isinstance(holder, dict):
+            holder[dice.choice(("", "\x1b[2J", key + "_", key.upper()))] = holder.pop(key)
+        elif kind < 0.65 and isinstance(holder[key], (int, float)):
+            holder[key] = -holder[key] if dice.random() < 0.5 else holder[key] * 10**9
         else:
             holder[key] = copy.deepcopy(dice.choice(VALUES))
     return json.dumps(tree).encode()

@@ -96,14 +96,16 @@ def _pool(paths: PoolPaths) -> None:
     for read in reads:
         with contextlib.suppress(FogftError):
             read()
+    into = str(paths.folder / "report.html")
     for words in (["status", NAME], ["status", NAME, "--json"], ["events", NAME], ["list"],
-                  ["credentials", "list", "--pool", NAME]):  # fmt: skip
+                  ["credentials", "list", "--pool", NAME], ["cost", NAME, "--json"],
+                  ["report", NAME, "--into", into]):  # fmt: skip
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             assert main.run(words) in (0, 1)
 
 
 @cache
-def _files() -> Mapping[str, tuple[Path, bytes, Callable[[], object]]]:
+def read_by() -> Mapping[str, tuple[Path, bytes, Callable[[], object]]]:
     """Return each file with its good content, and what reads it."""
     home = Path(tempfile.mkdtemp(prefix="fogft-fuzz-state-"))
     atexit.register(shutil.rmtree, home, ignore_errors=True)
@@ -161,5 +163,5 @@ def state_files() -> dict[str, Target]:
             (FogftError,),
             (good,),
         )
-        for name, (path, good, read) in _files().items()
+        for name, (path, good, read) in read_by().items()
     }

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 from fogft.errors import CredentialError, FrameError, StateError
 from fogft.link import batch_frames, compression, frame, probe_frames
@@ -195,7 +196,8 @@ def _token(data: bytes) -> None:
 
 def _bundle() -> bytes:
     label = bundle.Label("id", "pool", ROBOT, 1.0, 2.0)
-    return bundle.seal(label, {"files": {"a/b": "c"}}, "a passphrase of mine")
+    with patch.dict(bundle.SCRYPT, n=2):  # nobody guesses at it
+        return bundle.seal(label, {"files": {"a/b": "c"}}, "a passphrase of mine")
 
 
 def targets() -> dict[str, Target]:

@@ -20,6 +20,8 @@ from fogft.records.signing import Signer
 from tests.fuzz.mutation import damaged
 from tests.link.wire_pool import SERVICE, hears, keys, knows, peer, request_id
 
+PROBE = b'{"v":%d,"robot":"eve"}' % frame.VERSION
+
 
 class Target(NamedTuple):
     """A replica, and the key of a service of its."""
@@ -48,16 +50,19 @@ def session_at(at: Target, files: CredentialPaths) -> Iterator[zenoh.Session]:
         session.close()
 
 
+def greeting(signer: Signer, at: Target, token: bytes) -> bytes:
+    """Return what has a connection let in under a token."""
+    signed = signer(frame.greeted_bytes(token, at.peer.certificate_name))
+    return frame.encode_greeting(frame.Greeting(token, *signed))
+
+
 def greets(session: zenoh.Session, files: CredentialPaths, at: Target) -> bytes:
     """Have a robot's bare session let in, and return its token."""
     hears(session, at.key)
     knows(session, at.peer.id.slot, at.peer.id.pool_uid)
     token = bytes(range(8))
-    name = at.peer.certificate_name
-    signed = Signer(files.certificate, files.key)(frame.greeted_bytes(token, name))
-    greeting = frame.encode_greeting(frame.Greeting(token, *signed))
-    probe = b'{"v":%d,"robot":"eve"}' % frame.VERSION
-    (said,) = session.get(names.probe_key(*at.place), payload=probe, attachment=greeting)
+    signed = greeting(Signer(files.certificate, files.key), at, token)
+    (said,) = session.get(names.probe_key(*at.place), payload=PROBE, attachment=signed)
     assert said.ok is not None
     bare = frame.encode_greeting(frame.Greeting(token))
     session.get(names.answers_key(*at.place), lambda reply: None, attachment=bare, timeout=1e6)
@@ -76,7 +81,7 @@ def sends(
     requests = frame.encode_request(request_id(3), 1.0, origin), header
     packed = frame.encode_request(request_id(4), 1.0, origin, packed=True)
     cancel = frame.encode_cancel([request_id(1), request_id(2)])
-    greeting = frame.encode_greeting(frame.Greeting(token))
+    bare = frame.encode_greeting(frame.Greeting(token))
     probe = probe_frames.encode_probe(Probe("eve", describe=True))
     asked = [(names.probe_key, probe), (names.records_key, b"{}"), (names.answers_key, b"")]
 
@@ -89,7 +94,7 @@ def sends(
             attachment = damaged((head,), dice) if kind < 6 else head
             session.put(to, payload, attachment=attachment)
         else:
-            hello = damaged((greeting,), dice) if kind == 8 else greeting
+            hello = damaged((bare,), dice) if kind == 8 else bare
             # Not the last as it should be: who asks for answers anew ends those to himself.
             key, payload = dice.choice(asked[:-1] if token in hello else asked)
             session.get(

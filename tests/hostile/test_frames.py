@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pytest
@@ -41,14 +41,11 @@ STAMP = b"seen"
 @pytest.mark.timeout(1800)  # at night
 def test_a_robot_that_sends_damaged_frames_costs_nobody_else_anything(
     authority: Authority,
-    start_replica: Callable[..., ReplicaProcess],
-    dial: Callable[..., ZenohLink],
+    replica: ReplicaProcess,
+    good: ZenohLink,
     owner: Owner,
 ) -> None:
     """Under its flood each request of another robot is answered: none wrong, none lost."""
-    replica = start_replica()
-    good = dial(replica.endpoint)
-    wait_for(lambda: good.usable)
     files = authority.robot("eve")
     at, done = target(replica.endpoint), threading.Event()
     with session_at(at, files) as session:

@@ -148,7 +148,7 @@ def test_all_runs_here_when_told_so(tmp_path: Path, home: Path) -> None:
     ],
 )
 def test_what_cannot_be_carried_is_refused_when_loaded(key: str, value: Any) -> None:
-    with pytest.raises(FogftError, match=f"`{key}` cannot be carried"):
+    with pytest.raises(FogftError, match=f"`{key}` is not supported"):
         CloudNode(package="demo", executable="setter", **{key: value})
 
 

@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 from unittest import mock
 
-from fogft.link.deadline_filter import DeadlineFilter
 from fogft.link.port import SendOptions
+from fogft.link.socket_progress import DeadlineFilter
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import (

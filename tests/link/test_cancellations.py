@@ -7,7 +7,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.cancellations import EVERY_S, LIMIT, WORTH_S, Cancellations
+from fogft.link.window import CANCELLED_LIMIT, EVERY_S, WORTH_S, Cancellations
 
 ids = st.binary(min_size=16, max_size=16)
 
@@ -32,9 +32,9 @@ def test_each_is_told_once_unless_it_was_answered(steps):
 
 def test_they_are_bounded():
     cancellations = Cancellations()
-    for number in range(LIMIT + 10):
+    for number in range(CANCELLED_LIMIT + 10):
         cancellations.add(number.to_bytes(16, "big"), 0.0, 0.0)
-    assert len(cancellations.take()) == LIMIT
+    assert len(cancellations.take()) == CANCELLED_LIMIT
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.02), st.floats(0, 0.02)), min_size=1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.credit import CREDIT_BYTES, SMALL_BYTES, Credit
+from fogft.link.credit import SMALL_BYTES, Credit
 
 
 def test_a_large_send_is_never_taken():
@@ -13,13 +13,15 @@ def test_a_large_send_is_never_taken():
 
 
 def test_small_sends_are_taken_until_the_credit_is_used_up():
-    credit = Credit(limit=1000)
+    credit = Credit()
+    credit.limit_bytes = 1000
     marks = [credit.take(100) for _ in range(4)]
     assert [mark is not None for mark in marks] == [True, True, False, False]
 
 
 def test_a_sign_gives_back_what_came_before_it():
-    credit = Credit(limit=1000)
+    credit = Credit()
+    credit.limit_bytes = 1000
     first, _ = credit.take(100), credit.take(100)
     assert first is not None
     credit.heard(first)
@@ -48,7 +50,8 @@ def test_nothing_is_taken_while_the_other_thread_may_be_sending():
 
 
 def test_signs_out_of_order_take_nothing_back():
-    credit = Credit(limit=1000)
+    credit = Credit()
+    credit.limit_bytes = 1000
     first, second = credit.take(100), credit.take(100)
     credit.heard(second)
     credit.heard(first)
@@ -69,7 +72,7 @@ def test_whatever_happens_the_credit_is_kept(steps):
         if step == "take":
             mark = credit.take(number)
             if mark is not None:
-                assert mark - heard <= CREDIT_BYTES
+                assert mark - heard <= Credit.limit_bytes
                 assert not queued
                 marks.append(mark)
         elif step == "queue":

@@ -12,9 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link.compression import Compression
-from fogft.link.deadline_filter import DeadlineFilter
 from fogft.link.port import SendOptions
-from fogft.link.socket_progress import BULK_BYTES, KEPT_S, Flow, SocketProgress, Throughput
+from fogft.link.socket_progress import (
+    BULK_BYTES,
+    KEPT_S,
+    DeadlineFilter,
+    Flow,
+    SocketProgress,
+    Throughput,
+)
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.spec import ServiceSpec

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import threading
 
-from fogft.link.large_send_gate import LargeSendGate
+from fogft.link.credit import LargeSendGate
 from tests.link.wire_pool import wait_for
 
 
 def test_turns_do_not_overlap() -> None:
     """With patience enough, no two threads have their turn at once."""
-    gate = LargeSendGate(patience_s=60.0)
+    gate = LargeSendGate()
+    gate.patience_s = 60.0
     inside: list[int] = []
     most: list[int] = []
 
@@ -33,7 +34,8 @@ def test_turns_do_not_overlap() -> None:
 
 def test_who_is_stuck_loses_the_turn() -> None:
     """The first to lose patience goes without; those after it have turns of their own."""
-    gate = LargeSendGate(patience_s=0.001)
+    gate = LargeSendGate()
+    gate.patience_s = 0.001
     stuck = gate.take()
     assert stuck is not None
     assert gate.take() is None
@@ -48,7 +50,8 @@ def test_who_is_stuck_loses_the_turn() -> None:
 
 def test_a_waiting_thread_gets_the_turn_that_ends() -> None:
     """It need not wait for its patience to end."""
-    gate = LargeSendGate(patience_s=60.0)
+    gate = LargeSendGate()
+    gate.patience_s = 60.0
     mine = gate.take()
     got: list[object] = []
     waiting = threading.Thread(target=lambda: got.append(gate.take()))

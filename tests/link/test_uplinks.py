@@ -9,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link.port import Answer, Peer
-from fogft.link.uplinks import UplinkDialer
-from fogft.model.choices import Freshness
+from fogft.link.uplinks import UplinkDialer, choose
+from fogft.model.choices import Freshness, UplinkPolicy, is_interface
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
-from fogft.model.uplinks import UplinkPolicy, choose, is_interface
 from tests.proxy.fakes import UID, FakeDialer
 
 READY = frozenset({"/s"})

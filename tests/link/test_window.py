@@ -32,7 +32,8 @@ class WindowMachine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.window: LinkWindow = LinkWindow(self.LIMIT, self.LIMIT_BYTES)
+        self.window: LinkWindow = LinkWindow()
+        self.window.limit, self.window.limit_bytes = self.LIMIT, self.LIMIT_BYTES
         self.open: list[Attempt] = []
         self.all: list[Attempt] = []
         self.closed = False
@@ -79,7 +80,8 @@ TestWindow = WindowMachine.TestCase
 @given(limit=st.integers(1, 20), extra=st.integers(1, 5))
 def test_room_is_announced_once_after_a_refusal(limit: int, extra: int) -> None:
     """Only a window that declined something tells of room, and only once."""
-    window: LinkWindow = LinkWindow(limit)
+    window: LinkWindow = LinkWindow()
+    window.limit = limit
     attempts = [Attempt(bytes([n]), 1) for n in range(limit + extra)]
     taken = [window.admit(a) for a in attempts]
     assert taken == [True] * limit + [False] * extra
@@ -95,7 +97,8 @@ def test_room_is_announced_once_after_a_refusal(limit: int, extra: int) -> None:
 
 def test_an_attempt_ends_once_whoever_comes_first() -> None:
     """Four threads end the same attempts; each end is granted to exactly one of them."""
-    window: LinkWindow = LinkWindow(10_000)
+    window: LinkWindow = LinkWindow()
+    window.limit = 10_000
     attempts = [Attempt(n.to_bytes(4, "big"), 3) for n in range(5000)]
     assert all(window.admit(a) for a in attempts)
     granted: Counter[bytes] = Counter()

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import resource
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -25,6 +23,7 @@ from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Role
 from tests import certificate_names
 from tests.freezing import freeze
+from tests.link import forked
 
 POOL_UID = "0123456789abcdef"
 SERVICE, TYPE = "/echo", "plain_msgs/srv/Echo"  # not installed: its bytes are anything
@@ -160,13 +159,7 @@ class ReplicaProcess:
             "settings": asdict(settings or LinkSettings()),
             "records": str(records or ""),
         }
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", "tests.link.zenoh.replica_process", json.dumps(arguments)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            cwd=Path(__file__).parents[2],
-        )
+        self._process = forked.start("tests.link.zenoh.replica_process", json.dumps(arguments))
         self.endpoint = str(self._read()["endpoint"])
 
     def _read(self) -> dict[str, object]:

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from prometheus_client import Metric, generate_latest
 
 from fogft.metrics import proxies
-from fogft.metrics.families import Labels, registry
 from fogft.metrics.outcomes import BUCKETS_S, OUTCOMES_COUNTED
+from fogft.metrics.scrape import Labels, registry
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.manager.tally import Tally, of_pool, of_rendezvous

@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families as parsed
 
 import fogft
 from fogft.metrics import proxies
-from fogft.metrics.families import counter, gauge, histogram
+from fogft.metrics.scrape import counter, gauge, histogram
 from fogft.pool.manager.tally import of_pool
 from tests.cli.pools import STATUS
 from tests.metrics.samples import CLIENT, LINK, POOL, PROCESSES, tally, text

@@ -9,8 +9,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from fogft.metrics.families import gauge
-from fogft.metrics.scrape import Scrape
+from fogft.metrics.scrape import Scrape, gauge
 
 
 def one():

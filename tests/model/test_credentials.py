@@ -1,4 +1,4 @@
-"""Whom a certificate names."""
+"""The holder that a certificate names."""
 
 from __future__ import annotations
 

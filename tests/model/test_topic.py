@@ -50,7 +50,8 @@ def test_a_batch_has_at_least_one_message_and_then_at_most_so_many_bytes():
 
 
 def test_what_is_kept_is_bounded_in_bytes_but_the_newest_stays():
-    ring = Ring(10, latched=True, kept_bytes=100)
+    ring = Ring(10, latched=True)
+    ring.kept_bytes = 100
     assert [ring.put(b"x" * size) for size in (60, 60, 300)] == [0, 1, 1]
     assert [len(m) for _, m in ring.after(ring.begin(), 1 << 20)] == [300]
 
@@ -61,7 +62,8 @@ def test_what_is_kept_is_bounded_in_bytes_but_the_newest_stays():
 )  # fmt: skip
 def test_a_replica_gets_each_message_once_and_in_order(depth, window, steps):
     """Whatever is lost and sent again; only the oldest of too many that wait are left out."""
-    outbox, seen = Outbox(depth, window=window), Seen()
+    outbox, seen = Outbox(depth), Seen()
+    outbox.window = window
     under_way: list[int] = []
     got: list[int] = []
     put = gone = 0
@@ -93,13 +95,15 @@ def test_a_replica_gets_each_message_once_and_in_order(depth, window, steps):
 
 
 def test_what_waits_for_a_replica_is_bounded_in_bytes_but_the_newest_stays():
-    outbox = Outbox(10, kept_bytes=100)
+    outbox = Outbox(10)
+    outbox.kept_bytes = 100
     assert [outbox.put(n, b"x" * size) for n, size in enumerate((60, 60, 300), 1)] == [0, 1, 1]
     assert outbox.next()[0] == 3
 
 
 def test_a_robot_that_starts_anew_is_another_publisher():
-    seen = Seen(robots=2)
+    seen = Seen()
+    seen.robots = 2
     assert [seen.is_new(b"a", 5), seen.is_new(b"a", 5), seen.is_new(b"a", 4)] == [
         True,
         False,

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fogft.ordering import orders
+from fogft.ordering.log import OrderedLog
 from fogft.ordering.orders import START
 from fogft.ordering.peer import Order
 from fogft.ordering.replica import OrderedReplica, Refuse
@@ -41,7 +42,7 @@ class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
         self.waiting: list[tuple[int, Asked]] = []
         self.mark = START  # on the robot's disk
         self.epoch = 0  # likewise
-        self.log_entries = log_entries
+        OrderedLog.entries_limit = log_entries  # until the module ends: see conftest
         for _ in range(replicas):
             self.add_replica()
         self.sequencer = self.new_term()
@@ -55,7 +56,7 @@ class World(ServiceWorld[Sent, OrderedReplica[Sent]]):
             self.history.append(Call(asked.began, asked.asked))
         self.pending.clear()
         self.waiting.clear()
-        self.sequencer = Sequencer(self.epoch, mark=self.mark, log_entries=self.log_entries)
+        self.sequencer = Sequencer(self.epoch, mark=self.mark)
         self.reach()
         return self.sequencer
 

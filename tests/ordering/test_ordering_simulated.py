@@ -111,6 +111,28 @@ def test_all_replicas_lost_while_the_proxy_lives_loses_nothing():
     assert world.restored == 1
 
 
+@pytest.mark.parametrize("calls", [0, 3])
+def test_all_replicas_lost_after_a_new_proxy_that_was_not_called_loses_nothing(calls):
+    """A term that nobody has called in yet has a checkpoint, too: what it began from."""
+    world = World(counter, 0)
+    world.settle()
+    for _ in range(calls):
+        world.ask(0, ("add", 1))
+        world.settle()
+    world.new_term()
+    world.settle()
+    world.new_term()  # replicas have joined a term, and so are no longer where they began
+    for _ in range(20):
+        world.tick()
+        world.settle()
+    for replica in list(world.hosts):
+        world.remove_replica(replica)
+    world.add_replica()
+    world.ask(0, ("add", 1))
+    world.settle(500)
+    assert world.answers() == list(range(1, calls + 2))
+
+
 def test_proxy_and_all_replicas_lost_is_said_and_never_answered_from_an_older_state():
     """Nobody holds the answered state any more: requests stay unanswered, `stranded` says why."""
     world = World(counter, 0)

@@ -72,10 +72,7 @@ class Versions(World):
             waiting = self.waiting
             super().new_term()
             self.waiting = waiting
-            self.sequencer = Sequencer(
-                self.epoch, mark=self.mark, holder=self.holder, begin=begin,
-                log_entries=self.log_entries,
-            )  # fmt: skip
+            self.sequencer = Sequencer(self.epoch, mark=self.mark, holder=self.holder, begin=begin)
             self.reach()
 
     def ready(self, replica: int) -> bool:

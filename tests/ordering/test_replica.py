@@ -25,7 +25,8 @@ class Replica(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.machine: OrderedReplica[int] = OrderedReplica(queue_limit=3, kept=2)
+        self.machine: OrderedReplica[int] = OrderedReplica()
+        self.machine.queue_limit, self.machine.kept_limit = 3, 2
         self.machine.serving = True
         self.state = b""
         self.begun: Begin | None = None

@@ -16,8 +16,8 @@ from fogft.planning.availability import (
     expected,
     full_together,
     joint_unavailability,
+    system_unavailability,
 )
-from fogft.planning.reliability import system_unavailability
 
 A = Placement("aws", "us-west-1", "a", "m1")
 ZONE = replace(A, instance="m2")

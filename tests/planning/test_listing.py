@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model.replica import Offer, Placement
-from fogft.model.scoring import Scale
-from fogft.planning.listing import Catalogue, catalogue
+from fogft.planning.listing import Catalogue, Scale, catalogue
 
 offers = st.lists(
     st.builds(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.planning.reliability import replicas_needed, system_unavailability, unavailability
+from fogft.planning.availability import replicas_needed, system_unavailability, unavailability
 
 seconds = st.floats(1, 1e8)
 fractions = st.floats(0, 1)

@@ -141,12 +141,12 @@ MISTAKES = {
     ),
     "SkyServe's section": (
         pool(top="service: {replicas: 2}"),
-        "pool.yaml:1: service: cannot stand in a pool file",
+        "pool.yaml:1: service: is not allowed in a pool file",
         "it is SkyServe's; list what to replicate under `fogft.services` instead",
     ),
     "SkyPilot's pools": (
         pool(top="pool: {workers: 2}"),
-        "pool.yaml:1: pool: cannot stand in a pool file",
+        "pool.yaml:1: pool: is not allowed in a pool file",
         "it is for SkyPilot's own worker pools; the file is a pool by its `fogft` section",
     ),
     "several nodes": (
@@ -156,12 +156,12 @@ MISTAKES = {
     ),
     "duplicate key": (
         pool("replicas: 2\nreplicas: 3"),
-        "pool.yaml:5: fogft.replicas: stands here twice (first in line 4)",
+        "pool.yaml:5: fogft.replicas: is given twice (first in line 4)",
         "keep one",
     ),
     "duplicate key in what is SkyPilot's": (
         pool(top="resources:\n  cpus: 1\n  cpus: 2"),
-        "pool.yaml:3: resources.cpus: stands here twice (first in line 2)",
+        "pool.yaml:3: resources.cpus: is given twice (first in line 2)",
         "keep one",
     ),
     "key that is no text": (
@@ -172,7 +172,7 @@ MISTAKES = {
     "list as a key": (
         "? [a]\n: b\n",
         "pool.yaml:1: a list or a map cannot be a key",
-        "write a text",
+        "write text",
     ),
     # what must be there
     "no fogft": (
@@ -284,7 +284,7 @@ MISTAKES = {
     ),
     "environment variable with no value": (
         pool(top="envs:\n  TOKEN:"),
-        "pool.yaml:2: envs.TOKEN: must have a text for a value",
+        "pool.yaml:2: envs.TOKEN: must have a text as its value",
         'write `TOKEN: "..."`',
     ),
     "environment variable with no name": (
@@ -365,8 +365,8 @@ MISTAKES = {
     ),
     "duplicate service": (
         pool(services="\n    - {name: /a, type: a/srv/A}\n    - {name: a, type: b/srv/B}"),
-        "pool.yaml:5: fogft.services[1].name: `/a` stands here twice (first in line 4)",
-        "give each one entry",
+        "pool.yaml:5: fogft.services[1].name: `/a` is listed twice (first in line 4)",
+        "give each only one entry",
     ),
     "malformed field": (
         pool(services="[{name: a, type: a/srv/A, ok_field: result.ok}]"),
@@ -389,17 +389,17 @@ MISTAKES = {
         pool(services="[{name: a, type: a/srv/A, hedging: adaptive}]"),
         "pool.yaml:3: fogft.services[0].hedging: must be `auto` or `all` or `failover`, "
         "not `adaptive`",
-        "is called `auto` now, and is the default; write that",
+        "is now called `auto`, and is the default; write that",
     ),
     "key that is gone": (
         pool(services="[{name: a, type: a/srv/A, hedging_budget: 0.2}]"),
-        "pool.yaml:3: fogft.services[0].hedging_budget: is no key any more",
+        "pool.yaml:3: fogft.services[0].hedging_budget: is no longer a key",
         "remove it: the default is right",
     ),
     "key with another name now": (
         pool(services="[{name: a, type: a/srv/A, replicas: 4}]"),
-        "pool.yaml:3: fogft.services[0].replicas: is no key of a service",
-        "put this service into a pool of its own, with as many",
+        "pool.yaml:3: fogft.services[0].replicas: is not a key of a service",
+        "put this service into its own pool, with that many",
     ),
     "advanced key beside the others": (
         pool(services="[{name: a, type: a/srv/A, trace: true}]"),
@@ -441,8 +441,8 @@ MISTAKES = {
     ),
     "cancel service and concurrency": (
         pool(services="[{name: a, type: a/srv/A, cancel: stop, concurrency: 4}]"),
-        "pool.yaml:3: fogft.services[0].concurrency: must be 1 where there is a `cancel` "
-        "service: that names no request",
+        "pool.yaml:3: fogft.services[0].concurrency: must be 1 with a `cancel` service, "
+        "which cannot name a request",
         "remove one of the two",
     ),
     "cancel service that is the service": (

@@ -40,7 +40,7 @@ def test_it_replaces_no_replica():
         ("9464", "must be a map"),
         ("{proxy: 9464}", "must be text"),
         ("{robot: 127.0.0.1:9464}", "unknown key"),
-        ("{proxy: 127.0.0.1:1, manager: 127.0.0.1:1}", "stands here twice"),
+        ("{proxy: 127.0.0.1:1, manager: 127.0.0.1:1}", "is used twice"),
         ("{replica: 127.0.0.1:65530}", "above 65535"),
     ],
 )

@@ -36,7 +36,7 @@ ALL = [
     (10, "fogft.services[0].type: is missing"),
     (10, "fogft.services[0].timeout_s: must be above 0"),
     (10, "fogft.services[0].hedging: must be `auto`"),
-    (12, "fogft.services[2].name: `/b` stands here twice"),
+    (12, "fogft.services[2].name: `/b` is listed twice"),
     (13, "fogft.health.start_limit: unknown key"),
     (13, "fogft.health.suspect_after_s: must be above 0"),
     (14, "fogft.availability: must be above 0"),

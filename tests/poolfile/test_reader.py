@@ -167,7 +167,7 @@ def test_types_are_checked_once_each_and_last():
     read(document(services=services), types=check)
     assert asked == ["a/srv/A", "b/srv/B"]
     asked.clear()
-    with pytest.raises(SpecError, match="stands here twice"):
+    with pytest.raises(SpecError, match="is listed twice"):
         read(document(services=[*services, services[0]]), types=check)
     assert asked == []
 
@@ -266,7 +266,7 @@ def test_a_robot_over_zenoh_needs_no_type_but_where_a_policy_looks_into_response
 
 def test_topics_and_actions_do_not_pass_over_zenoh():
     topic = {"name": "/t", "type": "std_msgs/msg/Header", "from": "robot"}
-    with pytest.raises(SpecError, match=r"fogft\.topics: does not go with `rmw: zenoh`"):
+    with pytest.raises(SpecError, match=r"fogft\.topics: cannot be combined with `rmw: zenoh`"):
         read(document(rmw={"replica": "zenoh"}, topics=[topic]))
-    with pytest.raises(SpecError, match=r"fogft\.actions: does not go with `rmw: zenoh`"):
+    with pytest.raises(SpecError, match=r"fogft\.actions: cannot be combined with `rmw: zenoh`"):
         read(document(rmw="zenoh", actions=[{"name": "/a2", "type": "a/action/B"}]))

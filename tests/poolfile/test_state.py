@@ -102,7 +102,7 @@ def test_mistakes_name_line_key_and_remedy(state, key, what, hint):
 
 @pytest.mark.parametrize("line", ["ok_field: success", "hedging: failover"])
 def test_what_does_not_go_with_state_is_refused(line):
-    with pytest.raises(SpecError, match="does not go with `state`"):
+    with pytest.raises(SpecError, match="cannot be combined with `state`"):
         parse(SHORT, f"      {line}\n")
 
 
@@ -125,10 +125,10 @@ def test_a_quorum_and_its_tolerances_reach_the_client_proxy():
 @pytest.mark.parametrize(
     ("file", "what"),
     [
-        (VOTING + "      ok_field: success\n", "does not go with `quorum`"),
-        (VOTING + "      hedging: failover\n", "does not go with `quorum`"),
-        (VOTING + f"      state: {SHORT}\n", "does not go with `state`"),
-        (FILE + "      tolerance: {x: 1}\n", "has no meaning here"),
+        (VOTING + "      ok_field: success\n", "cannot be combined with `quorum`"),
+        (VOTING + "      hedging: failover\n", "cannot be combined with `quorum`"),
+        (VOTING + f"      state: {SHORT}\n", "cannot be combined with `state`"),
+        (FILE + "      tolerance: {x: 1}\n", "has no effect here"),
         (VOTING + "      tolerance: {a..b: 1}\n", "is not the path of a field"),
         (VOTING + "      tolerance: {x: 0}\n", "must be above 0"),
         (VOTING + "      tolerance: 3\n", "must be a map"),

@@ -74,7 +74,7 @@ WRONG = {
     "nobody": ("topics", "[{name: a, type: p/msg/T}]", "from: is missing"),
     "somebody else": ("topics", "[{name: a, type: p/msg/T, from: cloud}]", "must be `robot`"),
     "select of the robot's": (
-        "topics", "[{name: a, type: p/msg/T, from: robot, select: all}]", "no meaning here"),
+        "topics", "[{name: a, type: p/msg/T, from: robot, select: all}]", "no effect here"),
     "unknown select": (
         "topics", "[{name: a, type: p/msg/T, from: replicas, select: goal}]", "must be `leader`"),
     "depth": ("topics", "[{name: a, type: p/msg/T, from: robot, depth: 0}]", "from 1 to 1000"),
@@ -99,5 +99,5 @@ def test_mistakes_are_told_with_line_and_remedy(case):
 
 def test_they_do_not_go_with_gateways_yet():
     more = "\n  rendezvous: [m:1]\n  topology: {gateways: [{name: a, endpoint: h:1}]}"
-    with pytest.raises(SpecError, match="does not go with `topology`"):
+    with pytest.raises(SpecError, match="cannot be combined with `topology`"):
         parse("topics", "[{name: a, type: p/msg/T, from: robot}]" + more)

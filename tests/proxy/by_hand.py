@@ -208,6 +208,11 @@ class Robot:
     def links(self) -> list[dict[str, Any]]:
         return list(self.report().get("links", []))
 
+    def told(self) -> str:
+        """Return what it and its replicas have logged lately, for a failure's message."""
+        logs = sorted(self._parts.folder.glob("*.log"))
+        return "\n".join(f"{log.name}: ...{log.read_text()[-4000:]}" for log in logs)
+
     def ready(self) -> list[int]:
         """Return the slots that can answer now."""
         return [link["slot"] for link in self.links() if link["ready"]]

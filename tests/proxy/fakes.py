@@ -74,7 +74,7 @@ class FakeLink:
 
     def status(self) -> LinkStatus:
         state = LinkState.UP if self.ready else LinkState.SUSPECT
-        return LinkStatus(state, self.told, 0.0, 0.0, 0.001, 0, 0, 0, "")
+        return LinkStatus(state, self.told, 0.0, 0.0, 0.001, 0, 0, "")
 
     def close(self) -> None:
         self.closed = True
@@ -229,6 +229,9 @@ class FakeNode:
             raise RosError("its type cannot be loaded")
         self.clients[name] = FakeClient()
         return self.clients[name]
+
+    def look(self) -> None:
+        """Nothing here depends on a clock."""
 
     def offered(self) -> dict[str, str]:
         return dict(self.graph)

@@ -20,6 +20,7 @@ from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Gateway, RobotRoute, Topology
 from tests import certificate_names
+from tests.link import forked
 from tests.link.namespaces import inside
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
 from tests.ports import free_port
@@ -162,13 +163,11 @@ class Process:
         pool.processes.append(self)
         self.start()
 
-    def command(self) -> list[str]:
-        return [sys.executable, "-m", "fogft", "gateway", "--config", str(self._config)]
-
     def start(self) -> None:
+        command = [sys.executable, "-m", "fogft", "gateway", "--config", str(self._config)]
         with _inside(self._where), self._log.open("ab") as log:
-            self.process = subprocess.Popen(
-                tied(self.command()), cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            self.process: forked.Forked | subprocess.Popen[str] = subprocess.Popen(
+                tied(command), cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                 stderr=log, text=True,
             )  # fmt: skip
 
@@ -233,9 +232,11 @@ class ServerProxy:
 class Robot(Process):
     """A client proxy without ROS; see `plain_robot`."""
 
-    def command(self) -> list[str]:
-        return [sys.executable, "-m", "tests.proxy.robot.plain_robot", str(self._config),
-                str(self._first)]  # fmt: skip
+    def start(self) -> None:
+        with _inside(self._where), self._log.open("ab") as log:
+            given = (str(self._config), str(self._first))
+            name = "tests.proxy.robot.plain_robot"
+            self.process = forked.start(name, *given, stderr=log.fileno())
 
     def tell(self, **command: Any) -> dict[str, Any]:
         assert self.process.stdin is not None

@@ -20,8 +20,8 @@ from typing import Any
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.process import stop_on_signal
-from fogft.proxy.announcing import Presence
 from fogft.proxy.config import read_server
+from fogft.proxy.replica.announcing import Presence
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.records.record import RecordKind
@@ -45,6 +45,9 @@ class EchoNode:
 
     def client(self, name: str, type_name: str) -> EchoNode:
         return self
+
+    def look(self) -> None:
+        """Nothing here depends on a clock."""
 
     def offered(self) -> Mapping[str, str]:
         return {}

@@ -116,7 +116,15 @@ def links_by_id(robot: Robot) -> dict[tuple[int, int], str]:
     return {(li["slot"], li["generation"]): li["state"] for li in robot.links() if li["ready"]}
 
 
-def test_a_second_robot_needs_no_manager_and_replicas_move_under_load(pool, call):
+@pytest.mark.parametrize("how", [pytest.param("kill", marks=needs("night")), "freeze"])
+def test_who_is_where_is_learned_from_the_rendezvous_under_load(pool, call, how):
+    """What may happen to two robots that nobody tells anything, one after the other."""
+    robots, callers = a_second_robot_needs_no_manager_and_a_replica_moves(pool, call)
+    no_request_fails_while_the_rendezvous_is_away(pool, robots[0], callers[0], how)
+    the_managers_file_and_the_records_go_together(pool, robots[0], callers[0])
+
+
+def a_second_robot_needs_no_manager_and_a_replica_moves(pool, call):
     """Two robots learn of a replica from its own record: its address is told to nobody else.
 
     It is launched again at another port, as the next generation; then a request that goes on
@@ -142,15 +150,12 @@ def test_a_second_robot_needs_no_manager_and_replicas_move_under_load(pool, call
         assert caller.all_answered()
     assert [robot.process.poll() for robot in robots] == [None, None]
     assert [robot.report()["pid"] for robot in robots] == pids
+    robots[1].process.kill()
+    return robots, callers
 
 
-@pytest.mark.parametrize("how", [pytest.param("kill", marks=needs("night")), "freeze"])
-def test_no_request_fails_while_the_rendezvous_is_away(pool, call, how):
+def no_request_fails_while_the_rendezvous_is_away(pool, robot, caller, how):
     """And what joins meanwhile is used once it is back, with the robot untouched."""
-    pool.make_replica(0)
-    pool.admit((0, 1))
-    robot = pool.make_robot("ada")
-    caller = call(robot)
 
     def connected() -> bool:
         return robot.report()["records"]["rendezvous"][0]["connected"]
@@ -161,76 +166,51 @@ def test_no_request_fails_while_the_rendezvous_is_away(pool, call, how):
         os.kill(pool.rendezvous.pid, signal.SIGSTOP)
     load_until(caller, lambda: not connected())
     pool.make_replica(1)
-    pool.admit((0, 1), (1, 1))
+    pool.admit((0, 3), (1, 1))
     caller.ask(100)
     assert caller.all_answered()
-    assert links_by_id(robot) == {(0, 1): "up"}
+    assert links_by_id(robot) == {(0, 3): "up"}
     if how == "kill":
         pool.start_rendezvous()
     else:
         os.kill(pool.rendezvous.pid, signal.SIGCONT)
-    load_until(caller, lambda: links_by_id(robot) == {(0, 1): "up", (1, 1): "up"})
+    load_until(caller, lambda: links_by_id(robot) == {(0, 3): "up", (1, 1): "up"})
     assert caller.all_answered()
 
 
-def test_a_robot_starts_again_while_the_rendezvous_is_away(pool, call):
-    """From the records on its own disk; `test_restart_from_cache` shows it of all proxies."""
-    pool.make_replica(0)
-    pool.admit((0, 1))
-    robot = pool.make_robot("ada")
-    caller = call(robot)
-    cache = pool.folder / "ada-records.json"
-    wait_for(lambda: cache.exists() and '\\"slot\\"' in cache.read_text(), "the cache")
-    pool.kill_rendezvous()
-    robot.restart()
-    wait_for(robot.ready, "the replica")
-    caller.wait()
-    caller.ask(50)
-    assert caller.all_answered()
-
-
-def test_the_managers_file_and_the_records_go_together(pool, call):
+def the_managers_file_and_the_records_go_together(pool, robot, caller):
     """The later of both counts: a file of an older epoch or version moves nobody."""
-    pool.make_replica(0)
-    for _ in range(5):
-        pool.admit((0, 1))
-    robot = pool.make_robot("ada")
-    caller = call(robot)
     file = pool.folder / "ada-members.json"
     file.write_text(json.dumps(membership.to_dict(Membership("p", UID, 1, 2, ()))))
     caller.ask(20)
     assert caller.all_answered()
-    assert [link["slot"] for link in robot.news()["links"] if link["ready"]] == [0]
+    assert sorted(link["slot"] for link in robot.news()["links"] if link["ready"]) == [0, 1]
     file.write_text(json.dumps(membership.to_dict(Membership("p", UID, 2, 1, ()))))
     wait_for(lambda: not robot.links(), "the later membership of the file")
 
 
-def test_a_replica_that_cannot_be_reached_dials_out_to_the_robot(pool, call):
-    """It listens on its own loopback only; its connections and its process die and come back."""
+def test_a_replica_that_cannot_be_reached_dials_out_to_every_robot(pool, call):
+    """It listens on its own loopback only; its connections and its process die and come back.
+
+    It was told of one robot's door alone: the other one's own record tells it where to dial.
+    """
     pool.admit((0, 1))
-    door = free_endpoint()
-    robot = pool.make_robot("ada", extra=f"dial_in: {door}\ndial_in_listen: {door}\n")
-    replica = pool.make_replica(0, extra=f"dial_out: ['{door}']\n")
-    caller = call(robot)
-    caller.ask(100)
-    assert caller.all_answered()
-    assert robot.news()["door"]["tunnels"] >= 1
-    replica.process.kill()
-    caller.ask(5)
-    pool.admit((0, 2))
-    pool.make_replica(0, 2, extra=f"dial_out: ['{door}']\n")
-    assert caller.all_answered()
-
-
-def test_a_replica_learns_of_further_robots_from_their_records(pool, call):
-    """It was told of no door at all but that it has to dial: a robot's own record tells it."""
     doors = [free_endpoint(), free_endpoint()]
-    pool.admit((0, 1))
-    pool.make_replica(0, extra=f"dial_out: ['{doors[0]}']\n")
-    robot = pool.make_robot("bob", extra=f"dial_in: {doors[1]}\ndial_in_listen: {doors[1]}\n")
-    caller = call(robot)
-    caller.ask(20)
-    assert caller.all_answered()
+    robots = [
+        pool.make_robot(name, extra=f"dial_in: {door}\ndial_in_listen: {door}\n")
+        for name, door in zip(("ada", "bob"), doors, strict=True)
+    ]
+    replica = pool.make_replica(0, extra=f"dial_out: ['{doors[0]}']\n")
+    callers = [call(robot) for robot in robots]
+    for robot, caller in zip(robots, callers, strict=True):
+        caller.ask(100)
+        assert caller.all_answered()
+        assert robot.news()["door"]["tunnels"] >= 1
+    replica.process.kill()
+    callers[0].ask(5)
+    pool.admit((0, 2))
+    pool.make_replica(0, 2, extra=f"dial_out: ['{doors[0]}']\n")
+    assert callers[0].all_answered()
 
 
 def test_one_robot_and_its_manager_need_no_rendezvous_for_a_dialling_replica(

@@ -162,12 +162,30 @@ def what_a_dying_command_worked_on_is_answered_by_the_next(robot, replica, calle
     wait_for(lambda: robot.links()[0]["restarts"] == 1, "the restart in the report")
 
 
-def test_a_machine_that_is_told_of_its_end_gets_no_more_requests(parts, call):
-    """The metadata server's words reach the robot, which asks the others; none is lost.
+@needs("night")
+def test_client_proxies_that_were_stopped_for_long_begin_anew(parts, call):
+    """DDS may have forgotten them: the standby joins anew and takes over."""
+    replica = parts.replica(0)
+    robot = parts.robot("robot", replica)
+    caller = call(robot)
+    standby = robot.start_standby()
+    stopped = [robot.process.pid, standby.pid, replica.process.pid]
+    for number, seconds in ((signal.SIGSTOP, 25.0), (signal.SIGCONT, 0.0)):
+        for pid in stopped:
+            os.kill(pid, number)
+        time.sleep(seconds)
+    assert robot.process.wait(LIMIT_S) == 1
+    assert "handed over to its standby" in robot.config.with_suffix(".log").read_text()
+    robot.process = standby
+    wait_for(lambda: robot.report().get("pid") == standby.pid, "the standby's report")
+    assert replica.log.read_text().count("services_ready") == 2
+    caller.wait()
+    caller.ask(50)
+    assert caller.all_answered()
 
-    A rebalance is a hint: the replica is marked, and goes on answering. Where no cloud gives
-    notice, the machine's SIGTERM is one: what is under way is answered, then it ends.
-    """
+
+def test_deadly_requests_and_notices_cost_no_others_answer(parts, call):
+    """Three replicas: a request kills each one's service, then two of them are told to go."""
     nowhere = {
         "AWS_EC2_METADATA_SERVICE_ENDPOINT": "http://127.0.0.1:1/",
         "GCE_METADATA_HOST": "127.0.0.1:1",
@@ -176,39 +194,19 @@ def test_a_machine_that_is_told_of_its_end_gets_no_more_requests(parts, call):
         told = parts.replica(0, AWS_EC2_METADATA_SERVICE_ENDPOINT=f"http://{metadata.address}/")
         ended = parts.replica(1, **nowhere)
         robot = parts.robot("robot", told, ended, parts.replica(2))
-        caller = call(robot)
         wait_for(lambda: robot.ready() == [0, 1, 2], "all replicas")
-
-        metadata.rebalance = {"noticeTime": "2026-01-01T00:00:00Z"}
-        wait_for(lambda: robot.links()[0]["at_risk"], "the hint")
-        assert not robot.links()[0]["draining"]
-        assert not robot.links()[1]["at_risk"]
-
-        caller.ask(20)
-        metadata.action = {"action": "terminate", "time": "2026-01-01T00:02:00Z"}
-        wait_for(lambda: robot.links()[0]["draining"], "the notice")
-        assert caller.all_answered()
-        freeze(told.process.pid)  # whoever is asked now, it is not this one
-        caller.ask(100)
-        assert caller.all_answered()
-        assert robot.news()["links"][0]["in_flight"] == 0
-
-    caller.ask(20)
-    ended.process.send_signal(signal.SIGTERM)
-    wait_for(lambda: robot.links()[1]["draining"], "the notice")
-    caller.ask(100)
-    assert caller.all_answered()
-    assert ended.process.wait(LIMIT_S) == 0
+        caller = call(robot)
+        requests_that_kill_the_service_harm_only_themselves(robot, caller)
+        a_machine_that_is_told_of_its_end_gets_no_more_requests(robot, caller, told, metadata)
+    a_machines_sigterm_is_a_notice(robot, caller, ended)
+    a_proxy_ends_when_its_folder_is_gone(parts, robot)
 
 
-def test_requests_that_kill_the_service_harm_only_themselves(parts, call):
+def requests_that_kill_the_service_harm_only_themselves(robot, caller):
     """Two of them among a flow: each is tried once more, alone, and nothing else is lost.
 
     The first is at every idle replica when it kills; the second never at all three.
     """
-    robot = parts.robot("robot", *(parts.replica(slot) for slot in range(3)))
-    wait_for(lambda: robot.ready() == [0, 1, 2], "three replicas")
-    caller = call(robot)
     for _ in range(2):
         for _ in range(20):
             caller.ask()
@@ -217,13 +215,50 @@ def test_requests_that_kill_the_service_harm_only_themselves(parts, call):
         for _ in range(60):
             caller.ask()
             caller.spin(0.02)
-        assert caller.all_answered()
+        assert caller.all_answered(), robot.told()
         wait_for(lambda: robot.ready() == [0, 1, 2], "all to be back")
     report = robot.news()
     assert report["services"]["/plan"]["poison"] == 2
     assert report["services"]["/plan"]["silent"] == 0
     deaths = sum(link["restarts"] for link in report["links"])
     assert deaths <= (3 + 1) + (2 + 1)  # the copies of each, and then alone
+
+
+def a_machine_that_is_told_of_its_end_gets_no_more_requests(robot, caller, told, metadata):
+    """The metadata server's words reach the robot, which asks the others; none is lost.
+
+    A rebalance is a hint: the replica is marked, and goes on answering.
+    """
+    metadata.rebalance = {"noticeTime": "2026-01-01T00:00:00Z"}
+    wait_for(lambda: robot.links()[0]["at_risk"], "the hint")
+    assert not robot.links()[0]["draining"]
+    assert not robot.links()[1]["at_risk"]
+
+    caller.ask(20)
+    metadata.action = {"action": "terminate", "time": "2026-01-01T00:02:00Z"}
+    wait_for(lambda: robot.links()[0]["draining"], "the notice")
+    assert caller.all_answered()
+    freeze(told.process.pid)  # whoever is asked now, it is not this one
+    caller.ask(100)
+    assert caller.all_answered()
+    assert robot.news()["links"][0]["in_flight"] == 0
+
+
+def a_machines_sigterm_is_a_notice(robot, caller, ended):
+    """Where no cloud gives notice: what is under way is answered, then it ends."""
+    caller.ask(20)
+    ended.process.send_signal(signal.SIGTERM)
+    wait_for(lambda: robot.links()[1]["draining"], "the notice")
+    caller.ask(100)
+    assert caller.all_answered()
+    assert ended.process.wait(LIMIT_S) == 0
+
+
+def a_proxy_ends_when_its_folder_is_gone(parts, robot):
+    """Who removes a pool's folder by hand leaves no process behind."""
+    gone = parts.folder.rename(parts.folder.with_name("gone"))
+    assert robot.process.wait(LIMIT_S) == 0
+    gone.rename(parts.folder)
 
 
 def test_a_spare_process_takes_over_when_the_one_at_work_dies(parts, call):
@@ -269,13 +304,3 @@ def test_a_robot_and_a_replica_one_minor_version_apart_work_together(parts, call
         caller = call(robot)
         caller.ask(200)
         assert caller.all_answered()
-
-
-def test_a_proxy_ends_when_its_folder_is_gone(parts):
-    """Who removes a pool's folder by hand leaves no process behind."""
-    robot = parts.robot("robot")
-    wait_for(lambda: (parts.folder / "robot-status.json").exists(), "the first report")
-    gone = parts.folder.rename(parts.folder.with_name("gone"))
-    assert robot.process.wait(LIMIT_S) == 0
-    gone.rename(parts.folder)
-    assert "folder_gone" in (parts.folder / "robot.log").read_text()

@@ -36,8 +36,8 @@ CARRY = {
 }
 # Who keeps it, or judges it, and gives it to nobody.
 KEEP = {
-    *("proxy.robot.request", "requests.pending", "requests.first_response", "requests.decide"),
-    *("link.window", "link.deadline_filter", "link.compression"),
+    *("proxy.robot.request", "requests.pending", "requests.decide"),
+    *("link.window", "link.socket_progress", "link.compression"),
     *("proxy.replica.service_queue", "proxy.replica.known_requests"),
 }
 

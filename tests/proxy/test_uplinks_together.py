@@ -13,8 +13,8 @@ import pytest
 from fogft.link.uplinks import UplinkDialer
 from fogft.link.zenoh.robot.dialer import ZenohDialer
 from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.choices import UplinkPolicy
 from fogft.model.spec import ServiceSpec
-from fogft.model.uplinks import UplinkPolicy
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Owner, keys, peer, request_id, wait_for
 from tests.proxy.gateway_pool import GatewayPool, ran

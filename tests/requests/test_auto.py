@@ -32,7 +32,8 @@ def test_the_budget_is_never_exceeded(takes, share, capacity):
 @given(st.lists(st.floats(0.0002, 1000), min_size=1, max_size=200), st.floats(0.5, 0.99))
 def test_a_quantile_is_right_to_a_bucket(values, share):
     """Without decay it lies at the sample's own quantile, to within 10 %."""
-    found = Latencies(half_life=1e9)
+    found = Latencies()
+    found.per_sample = 1.0
     for value in values:
         found.add(value, 0.0)
     ordered = sorted(values)
@@ -44,7 +45,8 @@ def test_a_quantile_is_right_to_a_bucket(values, share):
 
 
 def test_old_latencies_fade_with_samples_and_with_time():
-    by_samples, by_time = Latencies(half_life=20), Latencies(half_life_s=10)
+    by_samples, by_time = Latencies(), Latencies()
+    by_samples.per_sample, by_time.half_life_s = 2 ** (1 / 20), 10
     for n in range(100):
         by_samples.add(1.0, 0.0)
         by_time.add(1.0, n / 100)
@@ -58,7 +60,8 @@ def test_old_latencies_fade_with_samples_and_with_time():
 
 
 def test_weights_do_not_overflow():
-    found = Latencies(half_life=1, half_life_s=0.1)
+    found = Latencies()
+    found.per_sample, found.half_life_s = 2.0, 0.1
     for n in range(5000):
         found.add(0.2, n * 60.0)
     assert found.quantile_s(0.95) == pytest.approx(0.2, rel=0.11)

@@ -1,4 +1,7 @@
-"""One service's requests with what chooses and what decides: every step keeps them together."""
+"""The laws of pending requests: one answer each, the first success, never a late one.
+
+Every step keeps the table, the policy and the decision together.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from fogft.model.choices import FallbackSpec
 from fogft.model.refusal import Refusal
@@ -14,10 +20,17 @@ from fogft.requests.alarms import ALARM_S, FALSE_ALARMS, LATELY_S
 from fogft.requests.choose import All
 from fogft.requests.decide import Decide, Means
 from fogft.requests.fallback import FallbackTimer
-from fogft.requests.first_response import Verdict
-from fogft.requests.pending import PendingRequests
+from fogft.requests.pending import (
+    ATTEMPTS,
+    RETRY_FIRST_S,
+    RETRY_LIMIT_S,
+    PendingRequests,
+    Verdict,
+)
+from tests.nightly import by_day
 
 A = b"a" * 16
+B = b"b" * 16
 OK, NO = b"ok", b"no"
 
 
@@ -59,7 +72,7 @@ def test_the_first_success_ends_a_request_and_names_who_stops():
     means, pending, losers, _ = answer(requests, 1, OK)
     assert (means, list(losers)) == (Means.SUCCESS, [2])
     assert pending is not None
-    assert (len(requests.table), requests.held_bytes, spy.ended) == (0, 0, [A])
+    assert (len(requests), requests.held_bytes, spy.ended) == (0, 0, [A])
     assert answer(requests, 2, OK)[1] is None  # too late
     assert spy.ended == [A]
 
@@ -91,7 +104,7 @@ def test_an_answer_that_is_about_no_request_changes_nothing():
         (),
         Verdict.LATE,
     )
-    assert (len(requests.table), spy.ended) == (1, [])
+    assert (len(requests), spy.ended) == (1, [])
 
 
 def test_the_fallback_ends_a_request_once():
@@ -144,3 +157,265 @@ def test_a_replica_whose_service_was_really_killed_is_believed_the_next_time():
         requests.refused(A, 0, Refusal.CRASHED, now)
         assert wolf(requests, n, now) == 1
         requests.give_up(A, now)
+
+
+def test_a_suspect_whose_replica_says_nothing_is_asked_of_another_in_time():
+    """It may be innocent, and its answer or its replica lost: half of the time left is enough."""
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests.begin(A, Item(b"x"), (0, 1, 2), deadline=80.0, now=0.0)
+    for replica in (0, 1, 2):
+        requests.refused(A, replica, Refusal.CRASHED, 0.0)
+    at, asked_at = 1.0, list[float]()
+    while at < 80.0:
+        if step := asked(requests, 0, 1, 2, now=at):
+            assert len(step) == 1
+            requests.attempt(A, step[0], at)
+            asked_at.append(at)
+        at += 1.0
+    assert asked_at == [1.0, 41.0, 61.0]
+    assert won(requests, A, 2, 79.0)
+
+
+def test_copies_that_others_work_on_are_none_more_for_a_death():
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests.begin(A, Item(b"x"), (0, 1), deadline=80.0, now=0.0)
+    requests.refused(A, 0, Refusal.CRASHED, 0.0)
+    assert asked(requests, 0, 1, 2, now=39.0) == []
+    assert len(asked(requests, 0, 1, 2, now=40.0)) == 1
+
+
+# -- first response ---------------------------------------------------------------------------
+
+
+def won(requests: PendingRequests[Item], request: bytes, replica: int, now: float) -> bool:
+    """Have a replica answer well; return whether its answer is the caller's."""
+    return requests.answered(request, request, replica, OK, True, None, now)[1] is not None
+
+
+def asked(requests: PendingRequests[Item], *able: int, now: float = 0.0) -> list[int]:
+    """Return which of these replicas request A goes to now, beside those that have it."""
+    return [replica for id, replica in requests.more(able, now, newest_first=False) if id == A]
+
+
+def test_the_first_success_wins_and_later_ones_are_late():
+    requests, _ = made()
+    assert won(requests, A, 1, 1.0)
+    assert not won(requests, A, 2, 1.1)
+
+
+def test_a_success_at_the_deadline_is_late():
+    requests, spy = made()
+    assert not won(requests, A, 1, 10.0)
+    assert spy.ended == []
+    assert [id for id, _ in requests.expire(10.0)] == [A]
+
+
+def test_an_answer_to_an_unknown_request_is_late():
+    requests, _ = made()
+    assert not won(requests, B, 1, 1.0)
+
+
+def test_the_same_id_cannot_be_under_way_twice():
+    requests, _ = made()
+    with pytest.raises(ValueError, match="under way already"):
+        requests.begin(A, Item(b"again"), (1,), deadline=1.0, now=0.0)
+    assert (len(requests), requests.held_bytes) == (1, len(b"question"))
+
+
+def test_failures_leave_the_request_open_until_nobody_works_on_it():
+    requests, _ = made()
+    assert requests.refused(A, 1, Refusal.LOST, 0.0) is Verdict.WAIT
+    assert requests.refused(A, 2, Refusal.LOST, 0.0) is Verdict.IDLE
+
+
+def test_a_rejection_is_kept_and_its_replica_not_asked_again():
+    requests, _ = made()
+    assert answer(requests, 1, NO)[3] is Verdict.WAIT
+    assert requests.attempt(A, 1, 1.0) is None
+    assert requests.get(A).rejection == NO
+    assert requests.idle() == []
+    requests.declined(A, 2)
+    assert requests.idle() == [A]
+
+
+def test_a_replica_that_failed_too_often_is_barred():
+    requests, _ = made()
+    for _ in range(ATTEMPTS):
+        requests.refused(A, 1, Refusal.CRASHED, 0.0)
+        last = requests.attempt(A, 1, 0.0)
+    assert last is None
+
+
+def test_a_lost_link_never_bars_a_replica():
+    """A replica whose link was lost may never have seen the request."""
+    requests, _ = made((1,))
+    for _ in range(10):
+        assert requests.refused(A, 1, Refusal.LOST, 0.0) is Verdict.IDLE
+        assert requests.attempt(A, 1, 0.0) is not None
+
+
+def test_a_reopened_link_gets_what_was_in_flight_on_it():
+    requests, _ = made()
+    requests.refused(A, 1, Refusal.LOST, 0.0)
+    assert asked(requests, 1, 2) == []  # left alone for a moment
+    requests.came([1])
+    assert asked(requests, 1, 2) == [1]
+
+
+def test_a_newcomer_gets_what_others_work_on():
+    """Those others may be frozen, and the newcomer the only one that answers."""
+    requests, _ = made((1,))
+    assert asked(requests, 1, 7) == []
+    requests.came([7])
+    assert asked(requests, 1, 7) == [7]
+
+
+def test_a_replica_that_declined_may_be_asked_while_another_works_on_the_request():
+    requests, _ = made()
+    assert asked(requests, 1, 2) == []
+    requests.declined(A, 2)
+    assert asked(requests, 1, 2) == [2]
+
+
+def test_a_replica_that_failed_is_left_alone_longer_each_time():
+    """Else a replica whose service is away is asked fifty times a second."""
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
+    requests.begin(A, Item(b""), (1,), deadline=1000.0, now=0.0)
+    now, waits = 0.0, []
+    for _ in range(8):
+        requests.refused(A, 1, Refusal.LOST, now)
+        wait = next(n for n in range(1000) if asked(requests, 1, now=now + n / 100))
+        waits.append(wait / 100)
+        now += wait / 100
+        requests.attempt(A, 1, now)
+    assert waits == sorted(waits)
+    assert (waits[0], waits[-1]) == (RETRY_FIRST_S, RETRY_LIMIT_S)
+
+
+def test_nobody_is_asked_for_a_request_that_has_ended():
+    requests, _ = made()
+    requests.declined(A, 2)
+    assert won(requests, A, 1, 0.0)
+    requests.came([3])
+    requests.use(All())
+    assert asked(requests, 1, 2, 3) == []
+    assert requests.idle() == []
+
+
+class OneFirst(All):
+    """Begins with one replica."""
+
+    def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
+        return able[:1]
+
+
+def test_a_request_that_not_all_were_asked_for_is_looked_at_again():
+    """A policy that began with one replica wants to be asked about the next."""
+    requests: PendingRequests[Item] = PendingRequests(OneFirst(), Spy())
+    requests.begin(A, Item(b""), (0, 1), deadline=1.0, now=0.5)
+    assert requests.get(A).open == {0: 0.5}
+    assert asked(requests, 0, 1, now=0.5) == [1]
+
+
+def test_every_request_is_put_before_another_policy():
+    requests, _ = made((1,))
+    assert asked(requests, 1, 2) == []
+    requests.use(All())
+    assert asked(requests, 1, 2) == [2]
+
+
+def test_a_shorter_deadline_does_not_wait_for_a_longer_one():
+    """The time-out changes with the pool file while requests are under way."""
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
+    requests.begin(A, Item(b"old policy"), (), deadline=100.0, now=0.0)
+    requests.begin(B, Item(b"new policy"), (), deadline=5.0, now=0.0)
+    assert [request for request, _ in requests.expire(5.0)] == [B]
+
+
+def test_expiry_is_in_order_and_complete():
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
+    for n in range(5):
+        requests.begin(bytes([n]) * 16, Item(bytes([n])), (), deadline=float(n), now=-1.0)
+    assert [pending.item.payload[0] for _, pending in requests.expire(2.0)] == [0, 1, 2]
+    assert len(requests) == 2
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([A, B]), st.integers(0, 3), st.floats(0, 20), st.booleans()),
+        max_size=40,
+    )
+)
+def test_no_request_is_answered_twice_or_after_its_deadline(answers):
+    """Whatever order answers come in, each request has at most one winner, in time."""
+    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
+    for request in (A, B):
+        requests.begin(request, Item(b""), range(4), deadline=10.0, now=0.0)
+    winners: list[tuple[bytes, float]] = []
+    for request, replica, now, ok in answers:
+        if not ok:
+            requests.refused(request, replica, Refusal.CRASHED, now)
+        elif won(requests, request, replica, now):
+            winners.append((request, now))
+    assert len({request for request, _ in winners}) == len(winners)
+    assert all(now < 10.0 for _, now in winners)
+
+
+class Requests(RuleBasedStateMachine):
+    """Against a model: every request ends exactly once, as answered or expired."""
+
+    @initialize()
+    def begin(self):
+        self.spy = Spy()
+        self.requests: PendingRequests[Item] = PendingRequests(All(), self.spy)
+        self.now = 0.0
+        self.next = 0
+        self.open: dict[bytes, float] = {}
+        self.ended: dict[bytes, str] = {}
+
+    @rule(replicas=st.sets(st.integers(0, 3)))
+    def register(self, replicas):
+        request = self.next.to_bytes(16, "big")
+        self.next += 1
+        able, deadline = sorted(replicas), self.now + 5
+        self.requests.begin(request, Item(b"x"), able, deadline=deadline, now=self.now)
+        self.open[request] = deadline
+
+    @precondition(lambda self: self.next)
+    @rule(data=st.data(), replica=st.integers(0, 3))
+    def answer(self, data, replica):
+        request = data.draw(st.integers(0, self.next - 1)).to_bytes(16, "big")
+        first = won(self.requests, request, replica, self.now)
+        expected = request in self.open and self.now < self.open[request]
+        assert first == expected
+        if first:
+            self.end(request, "answered")
+
+    @precondition(lambda self: self.next)
+    @rule(data=st.data(), replica=st.integers(0, 3), kind=st.sampled_from(Refusal))
+    def fail(self, data, replica, kind):
+        request = data.draw(st.integers(0, self.next - 1)).to_bytes(16, "big")
+        verdict = self.requests.refused(request, replica, kind, self.now)
+        if request not in self.open:
+            assert verdict is Verdict.LATE
+
+    @rule(step=st.floats(0, 3))
+    def advance(self, step):
+        self.now += step
+        for request, _ in self.requests.expire(self.now):
+            assert self.open[request] <= self.now
+            self.end(request, "expired")
+
+    def end(self, request, how):
+        assert request not in self.ended
+        self.ended[request] = how
+        del self.open[request]
+
+    @invariant()
+    def nothing_is_lost(self):
+        assert len(self.requests) == self.requests.held_bytes == len(self.open)
+        assert self.spy.ended == list(self.ended)
+
+
+Requests.TestCase.settings = settings(max_examples=by_day(30, at_night=300), stateful_step_count=30)
+TestRequests = Requests.TestCase

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.first_response import Pending
+from fogft.requests.decide import Pending
 from fogft.requests.votes import LIMIT, Ballot, Quorum
 
 
@@ -22,8 +22,8 @@ class Within:
         return abs(one - other) <= self.tolerance
 
 
-def of(quorum: int, **kept: int) -> Quorum:
-    return Quorum(quorum, Within(), **kept)
+def of(quorum: int) -> Quorum:
+    return Quorum(quorum, Within())
 
 
 def ballot(replica: int, value: float) -> Ballot:
@@ -118,7 +118,8 @@ def test_a_seldom_error_flags_nobody():
 
 
 def test_final_answers_are_kept_for_a_while_only():
-    votes = of(1, kept=10)
+    votes = of(1)
+    votes.kept = 10
     for number in range(100):
         votes.vote(bytes([number]), ballot(0, 1.0))
     assert sum(votes.hears_out(bytes([n])) for n in range(100)) == 10

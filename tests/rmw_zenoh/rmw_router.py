@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fogft.rmw_zenoh import session
+from fogft.rmw_zenoh.node import OVERRIDE
 
 _PROGRAM = """
 import sys, zenoh
@@ -38,7 +38,7 @@ class Router:
     def environ(self) -> dict[str, str]:
         """What nodes need in their environment to find it, and nobody else."""
         here = f'connect/endpoints=["{self.endpoint}"]', 'listen/endpoints=["tcp/127.0.0.1:0"]'
-        return {session.OVERRIDE: ";".join(here)}
+        return {OVERRIDE: ";".join(here)}
 
     def start(self) -> None:
         """Start it, and wait until it listens."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fogft.rmw_zenoh import naming
@@ -48,6 +48,7 @@ def test_a_token_looks_as_the_middleware_s_own_do() -> None:
     )
 
 
+@example("@ros2_lv/²/session/0/0/NN/%/%/node")  # a digit, and no number
 @given(st.one_of(st.text(), st.lists(st.text(max_size=5), max_size=15).map("/".join)))
 def test_no_text_breaks_the_reader(text: str) -> None:
     """What is no token is None, whatever it is; a prefix that fits changes nothing."""

@@ -21,9 +21,8 @@ from zenoh import handlers
 
 from fogft.errors import RosError, Unreadable
 from fogft.model.type_definition import REQUEST, RESPONSE
-from fogft.rmw_zenoh import session as rmw_session
 from fogft.rmw_zenoh.naming import CLIENT, NO_HASH, SERVER, Token, request_attachment, service_key
-from fogft.rmw_zenoh.node import RmwZenohNode
+from fogft.rmw_zenoh.node import RmwZenohNode, settings_from
 from tests.needs import needs
 from tests.rmw_zenoh.rmw_router import Router
 
@@ -46,7 +45,7 @@ def wait_for(condition: Callable[[], Any], what: str) -> Any:
 @pytest.fixture
 def peer(rmw_router: Router) -> Iterator[zenoh.Session]:
     """A session of somebody else."""
-    session = zenoh.open(rmw_session.settings_from(rmw_router.environ))
+    session = zenoh.open(settings_from(rmw_router.environ))
     yield session
     session.close()
 

@@ -17,7 +17,8 @@ def test_a_large_process_gives_back_but_no_more_often_than_it_may(own, times, mo
     monkeypatch.setattr(memory_tuning, "own_bytes", lambda: own)
     monkeypatch.setattr(memory_tuning, "give_back", lambda: given.append(own))
     clock = Clock()
-    trimmer = memory_tuning.Trimmer(100, 5.0, clock)
+    trimmer = memory_tuning.Trimmer(clock)
+    trimmer.above_bytes = 100
     for _ in range(20):
         trimmer.look()
         clock.now += 1.0

@@ -108,9 +108,9 @@ def test_a_wrong_service_name_is_an_error(make_node: Callable[[int], Any], ros_d
     """A name that ROS refuses is said, and the node lives on."""
     node = make_node(ros_domain)
     for name in ("no spaces", "", "/trailing/"):
-        with pytest.raises(RosError, match="cannot be made"):
+        with pytest.raises(RosError, match="cannot be created"):
             node.serve(name, SET_BOOL, lambda *_: None)
-        with pytest.raises(RosError, match="cannot be made"):
+        with pytest.raises(RosError, match="cannot be created"):
             node.client(name, SET_BOOL)
     assert node.alive
 

@@ -63,7 +63,7 @@ def test_a_node_is_not_made_where_messages_come_back_changed(
     serialised.self_test()
     monkeypatch.setattr(serialised.CMessage, "write", lambda *_: messages.to_bytes(Parameter()))
     serialised.self_test.cache_clear()
-    with pytest.raises(RosError, match=r"cannot be made.*came back changed"):
+    with pytest.raises(RosError, match=r"cannot be created.*came back changed"):
         SerialisedNode("fogft_never")
     with pytest.raises(RosError, match="came back changed"):
         serialised.self_test()

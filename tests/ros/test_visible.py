@@ -111,7 +111,7 @@ def test_without_diagnostic_msgs_one_warning_says_so(
 
 def test_a_bad_name_is_a_clear_error_and_the_node_lives_on(make_node, ros_domain):
     node = make_node(ros_domain)
-    with pytest.raises(RosError, match="`not a name` cannot be made"):
+    with pytest.raises(RosError, match="`not a name` cannot be created"):
         node.make_visible("not a name")
     assert node.alive
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fogft.planning.reliability import unavailability
+from fogft.planning.availability import unavailability
 from fogft.simulation.model import MarketModel, Timing
 
 

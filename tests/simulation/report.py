@@ -18,8 +18,12 @@ from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers_for
 from fogft.model.choices import Assumption, Correlation
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
-from fogft.planning.availability import expected, joint_unavailability
-from fogft.planning.reliability import replicas_needed, system_unavailability
+from fogft.planning.availability import (
+    expected,
+    joint_unavailability,
+    replicas_needed,
+    system_unavailability,
+)
 from fogft.poolfile import file
 from fogft.simulation import plot
 from fogft.simulation.comparison import (
@@ -34,7 +38,7 @@ from fogft.simulation.comparison import (
 from fogft.simulation.market import remembered
 from fogft.simulation.meter import HOURS_A_MONTH
 from fogft.simulation.model import MarketModel, Timing
-from fogft.simulation.report import Report, simulate
+from fogft.simulation.report import Report, simulate_scenario
 from fogft.simulation.world import World
 from tests.simulation.arithmetic import moving, staying
 
@@ -84,7 +88,7 @@ def main() -> None:
     options.into.mkdir(parents=True, exist_ok=True)
     found = {}
     for name, scenario in scenarios(quick=options.quick).items():
-        found[name] = simulate(scenario)
+        found[name] = simulate_scenario(scenario)
         print(f"simulated: {name}", flush=True)
     first = next(iter(found.values()))
     plot.draw(first, options.into / "planner.png")
@@ -210,7 +214,7 @@ def arithmetic_table(errors: list[dict[str, Any]]) -> Iterator[str]:
     one = 1 - moving(PAPER, WITHOUT_NOTICE)
     needed = replicas_needed(one, 0.9995)
     yield (
-        "Unavailability of spot replicas by `fogft.planning.reliability`, which takes them for "
+        "Unavailability of spot replicas by `fogft.planning.availability`, which takes them for "
         "independent, and as"
     )
     yield (

@@ -8,8 +8,7 @@ import pytest
 
 from fogft.errors import FogftError
 from fogft.simulation import fitting, model
-from fogft.simulation.generator import generate
-from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.model import MarketModel, Timing, generate
 from fogft.simulation.timeline import of_samples
 from tests.needs import needs
 from tests.simulation.markets import INDEPENDENT
@@ -98,7 +97,7 @@ def test_a_wrong_model_is_told(text, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("correlation_region=0.1,correlation_cloud=0.3", "cannot be more alike"),
+        ("correlation_region=0.1,correlation_cloud=0.3", "cannot be more correlated"),
         ("correlation=0.95,regime_s=60", "no market has correlations as high"),
     ],
 )

@@ -54,6 +54,6 @@ def test_there_is_a_picture():
 
 def test_a_page_can_be_made_of_any_simulation():
     name, scenario = next(iter(report.scenarios(quick=True).items()))
-    found = report.simulate(replace(scenario, days=0.1, seeds=(0,)))
+    found = report.simulate_scenario(replace(scenario, days=0.1, seeds=(0,)))
     lines = list(report.page({name: found}, FIGURES["arithmetic"]))
     assert sum(line.startswith("| **fogft**") for line in lines) == 1

@@ -8,8 +8,8 @@ import pytest
 
 from fogft.model.choices import OnDemandSpec, ScheduleSpec, WindowSpec
 from fogft.planning import planner
+from fogft.planning.availability import system_unavailability
 from fogft.planning.observed.history import EventKind
-from fogft.planning.reliability import system_unavailability
 from fogft.simulation.comparison import (
     SETTLE_S,
     Row,
@@ -20,7 +20,7 @@ from fogft.simulation.comparison import (
 )
 from fogft.simulation.market import Market
 from fogft.simulation.model import MarketModel, Timing
-from fogft.simulation.report import simulate
+from fogft.simulation.report import simulate_scenario
 from fogft.simulation.timeline import PER_USD, UNLIMITED, of_changes, of_samples
 from fogft.simulation.world import World
 from tests.needs import needs
@@ -194,7 +194,7 @@ def test_with_correlation_independence_promises_too_much():
 
 def test_policies_meet_the_same_markets_and_the_same_seeds_give_the_same_report():
     wanted = scenario(spec(2), days=0.5, seeds=(3, 4))
-    first, second = simulate(wanted).to_json(), simulate(wanted).to_json()
+    first, second = simulate_scenario(wanted).to_json(), simulate_scenario(wanted).to_json()
     assert first == second
     assert [row["policy"] for row in first["policies"]] == [
         "fogft",
@@ -207,7 +207,7 @@ def test_policies_meet_the_same_markets_and_the_same_seeds_give_the_same_report(
         "round robin",
         "omniscient",
     ]
-    assert first != simulate(replace(wanted, seeds=(5, 6))).to_json()
+    assert first != simulate_scenario(replace(wanted, seeds=(5, 6))).to_json()
 
 
 def test_an_on_demand_machine_costs_its_price_and_never_stops():
@@ -318,7 +318,7 @@ def test_a_region_that_has_become_dear_is_left(replicas):
 def test_recorded_traces_shorter_than_asked_are_used_whole():
     wanted = scenario(spec(1), days=5.0)
     lines = {p: of_samples([1] * 48, HOUR_S) for p in wanted.market(0).timelines}
-    report = simulate(replace(wanted, recorded=lines))
+    report = simulate_scenario(replace(wanted, recorded=lines))
     assert report.scenario.days == pytest.approx(47 / 24)
     assert report.notes == (
         "the traces cover 2.0 days after the first hour: all are used",
@@ -328,7 +328,10 @@ def test_recorded_traces_shorter_than_asked_are_used_whole():
 
 def test_boots_that_the_pool_file_does_not_wait_for_are_told():
     wanted = scenario(spec(1), days=0.1, timing=Timing(boot_s=900.0))
-    assert "some boots take longer than `health.start_limit_s` (900 s)" in simulate(wanted).notes[0]
+    assert (
+        "some boots take longer than `health.start_limit_s` (900 s)"
+        in simulate_scenario(wanted).notes[0]
+    )
 
 
 def test_recorded_numbers_are_room_for_so_many_machines():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from fogft import template_files
-from fogft.simulation.run import simulate
+from fogft.simulation.report import simulate
 from tests.needs import needs
 from tests.simulation.trials import KINDS, Trial, run
 

@@ -297,7 +297,7 @@ class ScriptedSky:
         if call != "launch-heard":
             self.calls.append((call, subject))
         if self.unreachable:
-            raise CloudUnreachable("SkyPilot cannot tell")
+            raise CloudUnreachable("SkyPilot gave no answer")
         if self.errors.get(call):
             raise self.errors[call].pop(0)
 

@@ -433,7 +433,7 @@ def test_an_order_that_was_never_heard_fails_after_a_while(scene: Scene):
     scene.pass_s(ASK_LIMIT_S)
     scene.work()
     assert scene.machine().failure == Reason(
-        Cause.ERROR, words="SkyPilot never heard of this launch"
+        Cause.ERROR, words="SkyPilot has no record of this launch"
     )
 
 
@@ -592,7 +592,7 @@ def test_whether_a_cloud_can_be_asked_is_found_out_by_asking(scene: Scene):
     """`up` says so before anything was launched: nobody has refused us by then."""
     assert scene.cloud.unverified("aws") == ""
     scene.provider.allowed = False
-    assert "SkyPilot's word" in scene.cloud.unverified("aws")
+    assert "fogft relies on SkyPilot's list" in scene.cloud.unverified("aws")
     scene.provider.allowed = True
     scene.provider.reachable = False
     assert "ExpiredToken" in scene.cloud.unverified("aws")
@@ -788,7 +788,10 @@ def test_without_an_index_it_is_told_and_a_whole_generation_has_no_lock(scene: S
     scene.make_lock = no_index
     cloud = scene.another_process()
     [told] = cloud.exposures(["aws"], open_port=None)
-    assert told == "each VM chooses what fogft needs itself, unlocked: nobody answers"
+    assert told == (
+        "the packages that fogft needs are not pinned, and each VM resolves them itself: "
+        "nobody answers"
+    )
     cloud.launch(scene.order())
     scene.make_lock = resolves("1")
     cloud = scene.another_process()
@@ -812,7 +815,9 @@ def test_a_machine_lets_in_whom_its_pool_names_and_nobody_else(
 
 def test_where_nobody_can_be_kept_out_nothing_is_launched(scene: Scene):
     scene.provider.allowed = False
-    with pytest.raises(CloudError, match=r"`fogft\.allow_from` cannot be held in `aws/us-east-1"):
+    with pytest.raises(
+        CloudError, match=r"`fogft\.allow_from` cannot be enforced in `aws/us-east-1"
+    ):
         scene.cloud.launch(scene.order(allow_from=LAB))
     scene.provider.allowed, scene.provider.reachable = True, False
     with pytest.raises(CloudUnreachable):
@@ -885,7 +890,7 @@ def test_credentials_that_end_before_the_pool_are_told_and_counted_down(scene: S
     for until in (None, scene.now + 9 * 3600):
         [said] = scene.cloud.hindrances(["aws"], until)
         assert said.startswith(
-            "the credentials of `aws` end in 2.0 h: from then on nothing is launched"
+            "the credentials of `aws` expire in 2.0 h: after that, nothing is launched"
         )
     assert scene.cloud.hindrances(["gcp"], None) == []
     scene.sky.server_told = (

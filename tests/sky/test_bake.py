@@ -13,7 +13,13 @@ from fogft.cloud.sky import bake, task
 from fogft.errors import CloudError, SpecError
 from fogft.pool.commands import bake as commands
 from tests.sky.scene import Scene
-from tests.sky.test_task import installed, new_vm, on_skypilot, wheel_of  # noqa: F401 - a fixture
+from tests.sky.test_task import (  # noqa: F401 - two fixtures
+    installed,
+    new_vm,
+    on_skypilot,
+    quick_vm,
+    wheel_of,
+)
 
 TASK: dict[str, Any] = {
     "setup": "set -e\necho baked $GREETING >> ~/setups\npip install -q userlib==1.0",
@@ -40,37 +46,42 @@ def carry(home: Path, version: str) -> None:
 
 
 @pytest.fixture
-def image(new_vm: Path) -> Path:  # noqa: F811
+def image(quick_vm: Path) -> Path:  # noqa: F811
     """A home as on a machine that has booted from a baked image."""
-    carry(new_vm, "0.1.0")
-    folder = new_vm / "context"
+    carry(quick_vm, "0.1.0")
+    folder = quick_vm / "context"
     folder.mkdir()
-    bake.write(folder, TASK, "lab/ros:1", new_vm / ".fogft/wheel", {})
+    bake.write(folder, TASK, "lab/ros:1", quick_vm / ".fogft/wheel", {})
     text = (folder / "Dockerfile").read_text()
     (command,) = re.findall(r"^RUN (export HOME.*)$", text, re.MULTILINE)
-    shutil.rmtree(new_vm / ".fogft")
-    shutil.copytree(folder / "fogft", new_vm / ".fogft")
-    (new_vm / ".fogft/setup.sh").write_text(
-        (folder / "fogft/setup.sh").read_text().replace("/opt/ros", str(new_vm / "no-ros"))
+    shutil.rmtree(quick_vm / ".fogft")
+    shutil.copytree(folder / "fogft", quick_vm / ".fogft")
+    (quick_vm / ".fogft/setup.sh").write_text(
+        (folder / "fogft/setup.sh").read_text().replace("/opt/ros", str(quick_vm / "no-ros"))
     )
-    done = on_skypilot(new_vm, f"true /opt/ros\n{command.replace('/root', str(new_vm))}")
+    done = on_skypilot(quick_vm, f"true /opt/ros\n{command.replace('/root', str(quick_vm))}")
     assert done.returncode == 0, done.stdout + done.stderr
-    return new_vm
+    return quick_vm
 
 
-@pytest.mark.parametrize("version", ["0.1.0", "0.2.0"])
-def test_a_machine_takes_from_an_image_what_fits_and_makes_the_rest(image: Path, version: str):
+def test_a_machine_takes_from_an_image_what_fits_and_makes_the_rest(
+    image: Path, tmp_path_factory: pytest.TempPathFactory
+):
     """Its own `setup` always runs: what that installed may have changed since."""
     assert sorted(path.name for path in (image / ".fogft").iterdir()) == [
         *("setup-installed.txt", "there-before.txt", "venv")
     ]
     (image / ".fogft/venv/baked").touch()
-    carry(image, version)
-    done = on_skypilot(image, f"export GREETING=\n{task.setup_of(TASK, task.read())}")
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert (image / "setups").read_text().splitlines() == ["baked it's", "baked"]
-    assert (installed(image)["fogft"], installed(image)["userlib"]) == (version, "1.0")
-    assert (image / ".fogft/venv/baked").exists() == (version == "0.1.0")
+    as_baked = shutil.copytree(image, tmp_path_factory.mktemp("image") / "home", symlinks=True)
+    for version in ("0.1.0", "0.2.0"):
+        shutil.rmtree(image)
+        shutil.copytree(as_baked, image, symlinks=True)
+        carry(image, version)
+        done = on_skypilot(image, f"export GREETING=\n{task.setup_of(TASK, task.read())}")
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert (image / "setups").read_text().splitlines() == ["baked it's", "baked"]
+        assert (installed(image)["fogft"], installed(image)["userlib"]) == (version, "1.0")
+        assert (image / ".fogft/venv/baked").exists() == (version == "0.1.0")
 
 
 @pytest.mark.parametrize("asked", [{"secrets": {"TOKEN": "t"}}, {"file_mounts": {"~/m": "m"}}])

@@ -20,7 +20,7 @@ from unittest import mock
 
 import pytest
 
-from fogft.cloud.sky import answers, settings, task
+from fogft.cloud.sky import sdk, settings, task
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, Sale
@@ -54,7 +54,7 @@ def test_the_reasons_of_sky_check_are_found_in_its_text():
         "  Azure: disabled\n"
         "    Reason [compute]: Getting user's Azure identity failed.\n"
     )
-    reasons = answers.told_reasons(told)
+    reasons = sdk.told_reasons(told)
     assert set(reasons) == {"aws", "azure"}
     assert reasons["aws"].endswith("Run the following commands: $ aws configure")
 
@@ -157,7 +157,7 @@ def test_every_call_fits_the_installed_signatures(real: tuple[InstalledSky, Any,
     installed.provision_log("c", 10)
     installed.down("c")
     sdk.stream_and_get.return_value = {"default": {"AWS": ["compute", "storage"]}}
-    assert installed.check(["aws", "gcp"]) == {"aws": "", "gcp": "SkyPilot may not use it"}
+    assert installed.check(["aws", "gcp"]) == {"aws": "", "gcp": "SkyPilot has no access to it"}
     called = {call[0] for call in sdk.method_calls}
     assert called >= {
         *("endpoints", "launch", "api_status", "api_cancel", "status", "job_status", "tail_logs"),
@@ -302,9 +302,9 @@ def test_the_guard_is_what_cloud_init_reads(home: Path):
 
 @needs("skypilot")
 def test_records_read_what_skypilot_says(home: Path):
-    record = answers.cluster_of(status_record())
+    record = sdk.cluster_of(status_record())
     assert (record.state, record.labels, record.launched_at) == (ClusterState.UP, {"a": "b"}, 5.0)
-    early = answers.cluster_of(status_record(handle=None, labels=None, init_status_reason="boots"))
+    early = sdk.cluster_of(status_record(handle=None, labels=None, init_status_reason="boots"))
     assert (early.placement, early.head_ip, early.progress) == (None, "", "boots")
 
 
@@ -316,9 +316,9 @@ def test_the_names_that_are_matched_by_text_exist(home: Path):
     from sky.server.requests.requests import RequestStatus
 
     builtin = dir(__import__("builtins")) + dir(requests.exceptions)
-    assert [n for n in answers.UNKNOWN if not hasattr(exceptions, n) and n not in builtin] == []
-    assert {s.value for s in RequestStatus} >= answers.ENDED
-    assert {s.value for s in JobStatus} >= set(answers.JOBS)
+    assert [n for n in sdk.UNKNOWN if not hasattr(exceptions, n) and n not in builtin] == []
+    assert {s.value for s in RequestStatus} >= sdk.ENDED
+    assert {s.value for s in JobStatus} >= set(sdk.JOBS)
     assert {s.value for s in ClusterStatus} >= {"INIT", "UP", "STOPPED"}
     for name in ("ClusterDoesNotExist", "ResourcesUnavailableError", "CommandError",
                  "ClusterSetUpError", "RequestCancelled", "PermissionDeniedError"):  # fmt: skip
@@ -558,7 +558,7 @@ def test_an_api_server_of_another_skypilot_is_named_and_ended_only_when_idle(
     )
     sdk.api_stop.assert_not_called()
     sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="SUCCEEDED")]
-    assert installed.renew_server().endswith("it was idle, and is started anew")
+    assert installed.renew_server().endswith("it was idle, and was restarted")
     sdk.api_stop.assert_called_once()
     local.return_value = False
     assert installed.renew_server().endswith("is installed here")

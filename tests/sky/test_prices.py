@@ -188,4 +188,4 @@ def test_quotas_that_may_not_be_read_are_told_and_forbid_nothing(market: Market)
     market.provider.allowed = False
     assert len(market.prices.offers({"infra": "aws"})) == 1
     (said,) = market.prices.left_out()
-    assert said.endswith("since they cannot be read: UnauthorizedOperation")
+    assert said.endswith("cannot be read: UnauthorizedOperation")

@@ -176,5 +176,5 @@ def test_a_robot_without_credentials_launches_and_ends_through_a_server_elsewher
     assert told["before"] == ["provisioning", None]
     assert told["after"] == []
     assert told["audit"] == [[], []], "nobody but SkyPilot could be asked"
-    assert "SkyPilot's word" in told["unverified"], "and `up` says so"
+    assert "relies on SkyPilot's list" in told["unverified"], "and `up` says so"
     assert set(world.instances()) == {"terminated"}

@@ -201,7 +201,12 @@ def shell(home: Path, script: str, **environ: str) -> subprocess.CompletedProces
     return subprocess.run(
         ["bash", "-c", script],
         cwd=home,
-        env={"HOME": str(home), "PATH": "/usr/local/bin:/usr/bin:/bin", **environ},
+        env={
+            "HOME": str(home),
+            "PATH": "/usr/local/bin:/usr/bin:/bin",
+            "TMPDIR": str(home),  # what is killed leaves its files there
+            **environ,
+        },
         capture_output=True,
         text=True,
         timeout=LIMIT_S,
@@ -248,17 +253,29 @@ def new_vm(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def make_environments_quickly(python: Path, other: Path) -> None:
+    """Have a Python make environments whose pip is the tests' own: its own takes seconds.
+
+    Args:
+        python: The program that makes them.
+        other: Where the program itself goes.
+    """
+    python.rename(other)
+    python.write_text(
+        f'#!/bin/sh\nset -e\n[ "$1 $2" = "-m venv" ] || exec {other} "$@"\n'
+        f'{other} -m venv --without-pip "$3" "$4"\n'
+        f'ln -s {Path(pip.__file__).parent} "$(echo "$4"/lib/python*/site-packages)"\n'
+        'printf \'#!/bin/sh\\nexec %s/bin/python -m pip "$@"\\n\' "$4" >"$4/bin/pip"\n'
+        'chmod +x "$4/bin/pip"\n'
+    )
+    python.chmod(0o755)
+
+
 @pytest.fixture
-def made_vm(new_vm: Path) -> Path:
-    """The same, where fogft's environment was made, which takes seconds; pip is the tests' own."""
-    venv = new_vm / ".fogft/venv"
-    words = [sys.executable, "-m", "venv", "--without-pip", "--system-site-packages", venv]
-    subprocess.run(words, check=True)
-    (packages,) = venv.glob("lib/python*/site-packages")
-    (packages / "pip").symlink_to(Path(pip.__file__).parent)
-    program = venv / "bin/pip"
-    program.write_text(f'#!/bin/sh\nexec {venv}/bin/python -m pip "$@"\n')
-    program.chmod(0o755)
+def quick_vm(new_vm: Path) -> Path:
+    """The same, where it takes no seconds to make fogft's environment."""
+    programs = new_vm / "sky-user-env/bin"
+    make_environments_quickly(programs / "python3", programs / "python-itself")
     return new_vm
 
 
@@ -299,6 +316,7 @@ def conda(new_vm: Path) -> Path:
     for name in ("site-packages", "dist-packages"):  # Debian's Python looks into the other one
         (library / name).mkdir()
         (library / name / "condalib.py").write_text("version = '3.0'\n")
+    make_environments_quickly(root / "bin/python3", root / "bin/python-itself")
     return root
 
 
@@ -336,36 +354,38 @@ def installed(home: Path) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("first", ["", "pip install -q userlib==2.0"])
-def test_what_fogft_needs_comes_from_the_lock_but_for_what_setup_brought(made_vm: Path, first: str):
+def test_what_fogft_needs_comes_from_the_lock_but_for_what_setup_brought(
+    quick_vm: Path, first: str
+):
     """In the lock's version, be there a newer one; nothing is asked for that is not in it."""
-    wheel_of(made_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1", extra="rclpy")
-    lock(made_vm, userlib="1.0", rclpy="7.1")
-    done = on_skypilot(made_vm, built({"setup": first})["setup"])
+    wheel_of(quick_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1", extra="rclpy")
+    lock(quick_vm, userlib="1.0", rclpy="7.1")
+    done = on_skypilot(quick_vm, built({"setup": first})["setup"])
     assert done.returncode == 0, done.stdout + done.stderr
-    found = installed(made_vm)
+    found = installed(quick_vm)
     assert (found["userlib"], found["rclpy"]) == ("2.0" if first else "1.0", "7.1")
     assert "fogft" in found
     (told,) = [line for line in done.stdout.splitlines() if "is not locked" in line]
     assert ("userlib==2.0" in told) == bool(first)
 
 
-def test_a_file_that_the_lock_does_not_name_is_not_installed(made_vm: Path):
-    wheel_of(made_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1")
-    lock(made_vm, userlib="1.0", rclpy="7.1")
-    wheel_of(made_vm / "index", "userlib", "1.0", requires="evil")
-    done = on_skypilot(made_vm, built({})["setup"])
+def test_a_file_that_the_lock_does_not_name_is_not_installed(quick_vm: Path):
+    wheel_of(quick_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=1")
+    lock(quick_vm, userlib="1.0", rclpy="7.1")
+    wheel_of(quick_vm / "index", "userlib", "1.0", requires="evil")
+    done = on_skypilot(quick_vm, built({})["setup"])
     assert done.returncode != 0
     assert "DO NOT MATCH THE HASHES" in done.stderr + done.stdout
-    assert not (made_vm / ".fogft/venv/bin/fogft").exists()
+    assert not (quick_vm / ".fogft/venv/bin/fogft").exists()
 
 
-def test_a_version_that_does_not_go_with_fogft_is_told(made_vm: Path):
-    wheel_of(made_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=2")
-    done = on_skypilot(made_vm, built({"setup": "pip install -q userlib==1.0"})["setup"])
+def test_a_version_that_does_not_go_with_fogft_is_told(quick_vm: Path):
+    wheel_of(quick_vm / ".fogft/wheel", "fogft", "0.1.0", requires="userlib>=2")
+    done = on_skypilot(quick_vm, built({"setup": "pip install -q userlib==1.0"})["setup"])
     assert done.returncode != 0
     assert "what `setup` has installed does not go with what fogft needs" in done.stdout
     assert "userlib==1.0" in done.stdout
-    assert not (made_vm / ".fogft/venv/bin/fogft").exists()
+    assert not (quick_vm / ".fogft/venv/bin/fogft").exists()
 
 
 def test_a_machine_without_a_python_of_today_is_told(new_vm: Path):

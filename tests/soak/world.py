@@ -90,7 +90,7 @@ class Replica:
 
 
 class World(GatewayPool):
-    """The whole pool. To be made, changed and closed by the main thread.
+    """The status of a pool. To be made, changed and closed by the main thread.
 
     Args:
         folder: For everything that is written.

@@ -1,4 +1,4 @@
-"""Draw a plan: each offer's price against its distance, the chosen ones filled.
+"""Plot a plan: each offer's price over its round trip, chosen offers filled.
 
 Not here: what is drawn (`fogft.planning.explain`).
 """
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def draw(shown: PlanShown, path: Path) -> None:
-    """Draw a plan to a PNG, SVG or PDF file. Offers of unknown distance stand apart."""
+    """Plot a plan to a PNG, SVG or PDF file. Offers of unknown distance are drawn apart."""
     check(path)
     from matplotlib.figure import Figure
 

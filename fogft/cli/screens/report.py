@@ -1,4 +1,4 @@
-"""``fogft report``: a page about a pool's life: availability, latencies, events, cost by day."""
+"""``fogft report``: an HTML page of a pool's availability, latencies, events and cost by day."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; } td, th { text-align: left; padding: .2rem .8rem .2rem 0; }
 th { border-bottom: 1px solid; } td { vertical-align: top; } svg { max-width: 100%; height: auto; }
+td:not(:last-child) { white-space: nowrap; }
 @media (prefers-color-scheme: dark) { svg { filter: invert(1) hue-rotate(180deg); } }
 """
 
@@ -80,9 +81,9 @@ def _page(store: Any, now: float) -> str:
         f"{price(sum(one.usd for one in costs))} spent; written {utc(now)}.</p>",
         "<h2>Availability</h2>",
         f"<p>At least one replica was ready for {up_s / known_s:.4%} of the last {age(known_s)}, "
-        "of which events are kept.</p>"
+        "for which events are kept.</p>"
         if known_s
-        else "<p>No replica was ready so far.</p>",
+        else "<p>No replica has been ready yet.</p>",
         _figure(lambda axes: _draw_spans(axes, spans, now), 0.6 + 0.3 * len(spans))
         if spans
         else "",
@@ -108,7 +109,9 @@ def _page(store: Any, now: float) -> str:
             ),
         ),
         "<h2>Cost by day</h2>",
-        _figure(lambda axes: _draw_costs(axes, days), 2.4) if days else "<p>Nothing was spent.</p>",
+        _figure(lambda axes: _draw_costs(axes, days), 2.4)
+        if days
+        else "<p>Nothing has been spent.</p>",
         "<h2>Events</h2>",
         _table(
             ("time", "event", "replica", "location", "why"),
@@ -124,7 +127,7 @@ def _page(store: Any, now: float) -> str:
 
 
 def ready_spans(events: Iterable[Event], now: float) -> Iterator[tuple[str, float, float]]:
-    """Yield each time during which a replica was ready: ``slot.generation``, from, until."""
+    """Yield each period in which a replica was ready: ``slot.generation``, start, end."""
     from fogft.planning.observed.history import EventKind
 
     since: dict[str, float] = {}
@@ -161,7 +164,7 @@ def _draw_spans(axes: Any, spans: Sequence[tuple[str, float, float]], now: float
         row = names.index(name)
         axes.hlines(row, (at - now) / unit_s, (until - now) / unit_s, color="k", linewidth=6)
     axes.set_yticks(range(len(names)), names)
-    axes.set(xlabel=f"{unit} before this page was written", title="replicas that were ready")
+    axes.set(xlabel=f"{unit} before this page was written", title="ready replicas")
 
 
 def _draw_costs(axes: Any, days: dict[str, float]) -> None:

@@ -1,4 +1,4 @@
-"""``fogft top``: one pool on a full screen: status, trends of latencies, events and cost."""
+"""``fogft top``: a full-screen view of one pool: status, latencies over time, events and cost."""
 
 from __future__ import annotations
 
@@ -74,11 +74,7 @@ def _screen(
         [name, sparkline(values), status_text.milliseconds(values[-1])]
         for name, values in latencies.items()
     ]
-    parts: list[RenderableType] = [
-        status_text.rendered(seen, width=width),
-        "",
-        output.cell(f"spent {status_text.price(seen.status.usd_to_date)} so far"),
-    ]
+    parts: list[RenderableType] = [status_text.rendered(seen, width=width)]
     if trends:
         parts += ["", table(("LATENCY", "LAST MINUTE", "NOW"), trends, width=width, right=("NOW",))]
     events = event_rows(store, _EVENTS_SHOWN)[::-1]
@@ -89,6 +85,6 @@ def _screen(
 
 
 def sparkline(values: deque[float]) -> str:
-    """Return values as a line of bars, the highest for the greatest of them."""
+    """Return values as a sparkline, scaled to the largest."""
     most = max(values) or 1.0
     return "".join(_BARS[min(len(_BARS) - 1, int(len(_BARS) * one / most))] for one in values)

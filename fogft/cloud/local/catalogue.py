@@ -1,4 +1,4 @@
-"""What the local cloud pretends to sell: regions, zones, instances and their prices.
+"""The local cloud's catalogue: regions, zones, instance types and prices.
 
 Prices are made up, in the proportions of real ones. ``regions.yaml`` in the cloud's folder
 replaces any of it; docs/design/local-cloud.md shows one.
@@ -20,7 +20,7 @@ CLOUD = "local"
 
 @dataclass(frozen=True)
 class Zone:
-    """One zone."""
+    """A zone of the local cloud, with its capacity and price factor."""
 
     region: str
     name: str
@@ -38,7 +38,7 @@ class Zone:
 
 @dataclass(frozen=True)
 class Instance:
-    """A kind of machine. Prices in US dollars per hour, before a zone's factor."""
+    """An instance type. Prices in US dollars per hour, before a zone's factor."""
 
     name: str
     cpus: int
@@ -50,7 +50,7 @@ class Instance:
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Everything on sale."""
+    """All zones and instance types."""
 
     zones: tuple[Zone, ...]
     instances: tuple[Instance, ...]
@@ -98,7 +98,7 @@ _NAME = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
 def read(path: Path) -> Catalogue:
-    """Return what a file describes, or the built-in catalogue where there is none."""
+    """Return the catalogue in a file, or the built-in one if there is no file."""
     try:
         text = path.read_text()
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Make things go wrong on the local cloud, on purpose. What ``fogft chaos`` calls.
+"""Inject faults into the local cloud. Called by ``fogft chaos``.
 
 Everything is written to files that the machines watch, or is a signal; nothing here has to
 live on for a fault to last or to end.
@@ -37,7 +37,7 @@ class Chaos:
     # -- one machine; all raise CloudError if it does not exist ------------------------------
 
     def preempt(self, id: ReplicaId, notice_s: float | None = None) -> float:
-        """Give a machine notice (None: its zone's); return the seconds until its end.
+        """Preempt a machine with notice (None: its zone's); return the seconds until it ends.
 
         A second notice never puts the end off.
         """
@@ -52,7 +52,7 @@ class Chaos:
         ending.end(self._root, self._living(id))
 
     def freeze(self, id: ReplicaId) -> int:
-        """Stop every process of a machine (SIGSTOP); return how many. Its kernel still answers."""
+        """Stop all processes of a machine (SIGSTOP); return how many. Its kernel still answers."""
         self._living(id)
         pids = processes.find(machine=str(id))
         while not all(map(processes.stopped, pids)):  # what it forked meanwhile as well
@@ -62,7 +62,7 @@ class Chaos:
         return len(pids)
 
     def thaw(self, id: ReplicaId) -> int:
-        """Let a frozen machine go on (SIGCONT); return how many of its processes were frozen."""
+        """Resume a frozen machine (SIGCONT); return how many of its processes were frozen."""
         self._living(id)
         frozen = [pid for pid in processes.find(machine=str(id)) if processes.stopped(pid)]
         processes.send(frozen, signal.SIGCONT)
@@ -75,12 +75,12 @@ class Chaos:
         rate_bytes_per_s: float | None = None,
         for_s: float | None = None,
     ) -> None:
-        """Delay all that passes to and from a machine, each way, and limit its rate.
+        """Delay traffic to and from a machine, each way, and limit its rate.
 
         ``for_s=None`` lasts until `clear`.
         """
         if not 0 <= delay_s <= 3600 or not (rate_bytes_per_s is None or rate_bytes_per_s >= 1):
-            raise CloudError("a link cannot be slowed like that", "write a delay of 0 to 3600 s")
+            raise CloudError("the delay is out of range", "give a delay of 0 to 3600 s")
         until, rate = _deadline(for_s), rate_bytes_per_s
         self._change_link(
             id,
@@ -88,14 +88,14 @@ class Chaos:
         )
 
     def blackhole(self, id: ReplicaId, for_s: float | None = None) -> None:
-        """Let nothing pass to or from a machine; its connections stay. None: until `clear`."""
+        """Drop all traffic to and from a machine; connections stay open. None: until `clear`."""
         until = _deadline(for_s)
         self._change_link(id, lambda old: replace(old, blackhole=True, blackhole_until=until))
 
     # -- locations; `region`, `region/zone`, with or without `local/` before -----------------
 
     def outage(self, location: str, for_s: float | None = None) -> list[ReplicaId]:
-        """Cut off and then end all machines in a location; refuse launches there meanwhile."""
+        """Cut off, then end all machines in a location, and refuse launches there meanwhile."""
         place = self._location(location)
         until = _deadline(for_s)
         self._change_cloud(lambda old: replace(old, outages={**old.outages, place: until}))
@@ -109,14 +109,14 @@ class Chaos:
         return sorted(hit)
 
     def capacity(self, location: str, machines: int) -> None:
-        """Say how many machines fit into a location; those that run stay."""
+        """Set how many machines a location has room for; running ones stay."""
         place = self._location(location)
         if machines < 0:
-            raise CloudError(f"{machines} machines cannot fit into `{place}`", "write 0 or more")
+            raise CloudError(f"`{place}` cannot hold {machines} machines", "give 0 or more")
         self._change_cloud(lambda old: replace(old, capacity={**old.capacity, place: machines}))
 
     def clear(self) -> None:
-        """Undo what lasts: slow and dead links, frozen machines, outages, capacities."""
+        """Clear all lasting faults: slow and dead links, frozen machines, outages, capacities."""
         with ending.cloud_lock(self._root):
             faults.write(self._root / faults.FILE, CloudFaults())
         for folder, _ in self._cloud.living():

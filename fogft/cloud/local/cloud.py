@@ -1,4 +1,4 @@
-"""The local cloud: the port, over folders, locks and processes. See docs/design/local-cloud.md.
+"""The local cloud: replicas as folders, locks and processes. See docs/design/local-cloud.md.
 
 Not here: what a machine does (`machine`), how it ends (`ending`), what is sold (`catalogue`).
 """
@@ -56,15 +56,15 @@ class LocalCloud:
         return self.root / "machines"
 
     def catalogue(self) -> Catalogue:
-        """Return what is sold: ``regions.yaml``, or what is built in."""
+        """Return the catalogue: ``regions.yaml``, or the built-in one."""
         return catalogue.read(self.root / catalogue.FILE)
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """Return an offer for each zone that suits. Full zones stay: only a launch tells."""
+        """Return an offer for each matching zone. Full zones are included: only a launch tells."""
         return offers_for(self.catalogue(), resources)
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
-        """List the pool's machines, and clear away those that died."""
+        """List the pool's machines, and remove those that died."""
         self._reap()
         now = time.time()
         found = []

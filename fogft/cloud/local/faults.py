@@ -1,4 +1,4 @@
-"""Faults on purpose, as files that both sides can read at any time.
+"""Injected faults, as files that both sides can read at any time.
 
 A fault with a duration carries its deadline (seconds since the epoch), so it ends by
 itself, whoever set it.
@@ -9,18 +9,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 from fogft import disk
-from fogft.model.plain import Moment, stored, to_plain
+from fogft.model.plain import Moment, to_plain
 
-T = TypeVar("T")
 FILE = "faults.json"
 
 
 @dataclass(frozen=True)
 class LinkFaults:
-    """What is wrong with the path to one machine. A deadline of None is never."""
+    """Faults of the network path to one machine. A deadline of None is never."""
 
     delay_s: Moment = 0.0  # added to everything, each way
     rate_bytes_per_s: Moment | None = None  # the most that passes each way
@@ -29,7 +27,7 @@ class LinkFaults:
     blackhole_until: float | None = None
 
     def at(self, now: float) -> LinkFaults:
-        """Return what is in force at a time."""
+        """Return the faults active at a time."""
         slow = self.slow_until is None or now < self.slow_until
         black = self.blackhole and (self.blackhole_until is None or now < self.blackhole_until)
         return LinkFaults(
@@ -41,7 +39,7 @@ class LinkFaults:
 
 @dataclass(frozen=True)
 class CloudFaults:
-    """What is wrong with locations."""
+    """Faults of locations: outages and capacity limits."""
 
     outages: Mapping[str, float | None] = field(default_factory=dict)  # when each ends; None: never
     capacity: Mapping[str, int] = field(default_factory=dict)  # instead of the catalogue's numbers
@@ -53,18 +51,14 @@ class CloudFaults:
 
 def read_link(path: Path) -> LinkFaults:
     """Return a machine's link faults; none where there is no file."""
-    return _read(LinkFaults, path)
+    return disk.read_as(LinkFaults, path) or LinkFaults()
 
 
 def read_cloud(root: Path) -> CloudFaults:
     """Return the faults of locations; none where there is no file."""
-    return _read(CloudFaults, root / FILE)
-
-
-def _read(kind: type[T], path: Path) -> T:
-    return stored(kind, disk.read_json(path) or {}, f"`{path}` is damaged")
+    return disk.read_as(CloudFaults, root / FILE) or CloudFaults()
 
 
 def write(path: Path, faults: LinkFaults | CloudFaults) -> None:
-    """Replace what stands in a file. Raises StateError: it cannot be written."""
+    """Replace a file's faults. Raises StateError: it cannot be written."""
     disk.write_json(path, to_plain(faults), durable=False)

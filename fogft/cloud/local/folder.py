@@ -1,4 +1,4 @@
-"""The folder of one machine: what was ordered, what became of it, and whether it lives.
+"""The folder of one machine: its order, its state, and whether it is alive.
 
 ===============  ==========================================================  ==============
 ``machine.json``  the order, written once before the process exists          the launcher
@@ -24,14 +24,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import TypeVar
 
 from fogft import disk
 from fogft.cloud.local import processes
 from fogft.cloud.local.catalogue import Zone
 from fogft.cloud.port import Launch
 from fogft.errors import CloudError, StateError
-from fogft.model.plain import stored, to_plain
+from fogft.model.plain import to_plain
 from fogft.model.reason import Reason
 from fogft.model.replica import MachinePhase, ReplicaId
 
@@ -52,11 +51,8 @@ SLOW_START_LIMIT_S = 60.0
 _NAME = re.compile(r"(?P<uid>[0-9a-f]{16})-(?P<slot>\d{1,6})\.(?P<generation>\d{1,9})")
 
 
-T = TypeVar("T")
-
-
 class Life(Enum):
-    """Whether a machine lives, by its files and its lock."""
+    """Whether a machine is alive, judged by its files and its lock."""
 
     ORDERED = "ordered"  # its process has shown no sign of life yet
     ALIVE = "alive"
@@ -66,7 +62,7 @@ class Life(Enum):
 
 @dataclass(frozen=True)
 class Record:
-    """What was ordered, and how its zone was then: ``machine.json``."""
+    """A machine's order, with its zone at that time: ``machine.json``."""
 
     order: Launch  # without its files
     zone: Zone
@@ -76,7 +72,7 @@ class Record:
 
 @dataclass(frozen=True)
 class State:
-    """What became of it: ``state.json``, which is there once the machine's process ran."""
+    """A machine's state: ``state.json``, which exists once its process has run."""
 
     phase: MachinePhase
     endpoint: str | None = None
@@ -102,7 +98,7 @@ class MachineFolder:
 
     @classmethod
     def at(cls, path: Path) -> MachineFolder | None:
-        """Return the machine whose folder this is by its name; None if it is none's."""
+        """Return the machine that a folder's name stands for; None if it is not a machine's."""
         match = _NAME.fullmatch(path.name)
         if match is None:
             return None
@@ -122,13 +118,10 @@ class MachineFolder:
     @property
     def locked(self) -> bool:
         """Whether the machine's process, or its guard, lives."""
-        try:
-            return disk.is_locked(self.path / LOCK)
-        except FileNotFoundError:  # the folder has just gone
-            return False
+        return disk.is_locked(self.path / LOCK)
 
     def life(self, now: float) -> Life:
-        """Judge whether the machine lives. Looks twice: it may start or end meanwhile."""
+        """Return whether the machine is alive. Looks twice: it may start or end meanwhile."""
         if self.locked:
             return Life.ALIVE
         state = self.state()
@@ -146,20 +139,22 @@ class MachineFolder:
         return age_s < SLOW_START_LIMIT_S and bool(processes.find(machine=str(self.id)))
 
     def lives(self, now: float) -> bool:
-        """Whether the machine takes up room: it is ordered or alive."""
+        """Whether the machine counts against capacity: it is ordered or alive."""
         return self.life(now) in (Life.ORDERED, Life.ALIVE)
 
     def record(self) -> Record:
         """Return the order."""
-        return self._stored(Record, RECORD, disk.read_json(self.path / RECORD))
+        found = disk.read_as(Record, self.path / RECORD)
+        if found is None:
+            raise StateError(f"`{self.path / RECORD}` is missing")
+        return found
 
     def state(self) -> State | None:
-        """Return how far the machine has come; None if its process never ran."""
-        raw = disk.read_json(self.path / STATE)
-        return None if raw is None else self._stored(State, STATE, raw)
+        """Return the machine's state; None if its process never ran."""
+        return disk.read_as(State, self.path / STATE)
 
     def write_state(self, state: State) -> None:
-        """Say how far the machine has come. Raises `StateError` on a full disk."""
+        """Store the machine's state. Raises `StateError` on a full disk."""
         disk.write_json(self.path / STATE, to_plain(state), durable=False)
 
     def notice_at(self) -> float | None:
@@ -167,11 +162,11 @@ class MachineFolder:
         return self._at(NOTICE)
 
     def end_at(self) -> float | None:
-        """Return when the machine shall end; None if nobody said so."""
+        """Return when the machine is to end; None if no end was requested."""
         return self._at(END)
 
     def ask_end(self, at: float, *, notice: bool = False) -> float:
-        """Have the machine end at a time, or earlier if that was asked before. Returns when."""
+        """Request the machine's end at a time; an earlier request wins. Returns the time."""
         known = self._at(NOTICE if notice else END)
         if known is not None and known <= at:
             return known
@@ -180,11 +175,8 @@ class MachineFolder:
         return at
 
     def _at(self, name: str) -> float | None:
-        raw = disk.read_json(self.path / name)
-        return None if raw is None else self._stored(_Moment, name, raw).at
-
-    def _stored(self, kind: type[T], name: str, raw: object) -> T:
-        return stored(kind, raw, f"`{self.path / name}` is damaged")
+        found = disk.read_as(_Moment, self.path / name)
+        return None if found is None else found.at
 
 
 @dataclass(frozen=True)
@@ -196,7 +188,7 @@ def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes])
     """Make a machine's folder, whole or not at all. It must not exist."""
     wrong = [n for n in files if n in OWN_FILES or n != os.path.basename(n) or n.startswith(".")]
     if wrong:
-        raise CloudError(f"a machine cannot be given a file of the name `{wrong[0]}`")
+        raise CloudError(f"a machine cannot be given a file named `{wrong[0]}`")
     beside = folder.path.with_name(f".new-{folder.path.name}")
     try:
         disk.make_folder(beside.parent)
@@ -211,7 +203,7 @@ def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes])
             remove(beside)
         reason = error.message if isinstance(error, StateError) else str(error)
         raise CloudError(
-            f"machine `{folder.id.short}` cannot be made: {reason}",
+            f"machine `{folder.id.short}` cannot be created: {reason}",
             "check the disk's free space and the folder's owner",
         ) from error
 

@@ -4,7 +4,7 @@ It ends when it is told to (``end.json``, ``notice.json``, a signal) or when wha
 has ended, and takes everything that ran on it along. One thread: the kernel ties children to
 the thread that started them.
 
-Not here: the path to it (`relay`), cleaning up after it (`guard`, `ending`).
+Not here: the path to it (`relay`), cleaning up after it (`processes`, `ending`).
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft import child, disk, logfile
-from fogft.cloud.local import faults, guard, processes, task_commands
+from fogft.cloud.local import faults, processes, task_commands
 from fogft.cloud.local.ending import sweep_shared_memory
 from fogft.cloud.local.folder import LINK, LOCK, NOTICE, MachineFolder, Record, State
-from fogft.cloud.local.reservations import Reservation, own_domain, reserve_domain, reserve_port
 from fogft.errors import FogftError, StateError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from fogft.process import ENDING_SIGNALS, start_log
 from fogft.reason_words import words
+from fogft.ros.reservations import Reservation, own_domain, reserve_domain, reserve_port
 
 if TYPE_CHECKING:
     from fogft.cloud.local.relay import Relay
@@ -53,7 +53,7 @@ class _Failed(Exception):
 
 
 def main(arguments: list[str]) -> int:
-    """Run a machine until its end."""
+    """Run a machine until it ends."""
     folder = MachineFolder.at(Path(arguments[0]).absolute())
     if folder is None or os.environ.get(processes.MACHINE) != str(folder.id):
         print("error: this is started by the local cloud only", file=sys.stderr)
@@ -88,9 +88,9 @@ class Machine:
         self._relay: Relay | None = None
 
     def run(self) -> None:
-        """Live and die. Leaves a FAILED state behind if the machine could never run."""
+        """Run the machine to its end. Leaves a FAILED state if it could not run."""
         self._say(State(MachinePhase.PROVISIONING, progress="booting"))
-        self._guard = guard.start(lambda: self._end_the_rest(set()))
+        self._guard = processes.start(lambda: self._end_the_rest(set()))
         for number in ENDING_SIGNALS:
             signal.signal(number, self._on_signal)
         try:
@@ -127,13 +127,13 @@ class Machine:
             workdir.mkdir(exist_ok=True)
             return workdir
         if not isinstance(wanted, str) or not Path(wanted).is_dir():
-            raise _Failed(Cause.ERROR, f"`workdir` is not a folder of this computer: {wanted}")
+            raise _Failed(Cause.ERROR, f"`workdir` is not a folder on this computer: {wanted}")
         return Path(wanted)
 
     def _set_up(self, workdir: Path) -> None:
         for key in ("file_mounts", "volumes"):
             if self._record.order.task.get(key):
-                log.warning("task_key_ignored key=%s reason='not made on the local cloud'", key)
+                log.warning("task_key_ignored key=%s reason='local cloud'", key)
         command = self._record.order.task.get("setup")
         if not command:
             return
@@ -141,7 +141,9 @@ class Machine:
         turn = disk.Lock(task_commands.turn_file(self._folder.path.parent.parent, workdir))
         self._say(
             State(
-                MachinePhase.PROVISIONING, progress="waiting for another's setup", setting_up=True
+                MachinePhase.PROVISIONING,
+                progress="waiting for another machine's setup",
+                setting_up=True,
             )
         )
         self._wait(lambda: turn.acquire(wait=False))
@@ -289,7 +291,9 @@ class Machine:
 
 
 def _in_words(code: int) -> str:
-    return f"died of {signal.Signals(-code).name}" if code < 0 else f"ended with status {code}"
+    if code < 0:
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"exited with status {code}"
 
 
 if __name__ == "__main__":

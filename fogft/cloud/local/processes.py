@@ -1,20 +1,28 @@
-"""Find every process of a machine or a pool, and end it for sure.
+"""Find and end all processes of a machine or a pool, and tie a machine's together.
 
 All of them carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in their environment, which
 ``/proc`` shows as it was when they began, whatever session or parent they have since. A
 process that was started with a clean environment is found as a descendant of one that was not.
+
+None outlives the others. The process that the cloud started forks: the child is the machine, the
+parent its guard, which waits and then kills whatever is left. Both are subreapers, so even an
+orphan with a clean environment stays below one of them. The guard shares the machine's lock: the
+machine counts as alive until all of it is gone. If the guard is killed, the machine sees that its
+parent changed, and ends.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import logging
 import os
 import signal
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 
-from fogft.errors import CloudUnreachable
+from fogft.errors import CloudUnreachable, FogftError
 
 MACHINE = "FOGFT_MACHINE"
 POOL = "FOGFT_POOL_UID"
@@ -58,7 +66,7 @@ def end(pids: Iterable[int], limit_s: float = _LIMIT_S) -> None:
     while left := {pid for pid in left if alive(pid)}:
         if time.monotonic() > deadline:
             raise CloudUnreachable(
-                f"these processes do not end: {', '.join(map(str, sorted(left)))}",
+                f"these processes do not exit: {', '.join(map(str, sorted(left)))}",
                 "they belong to another user, or hang in the kernel",
             )
         time.sleep(_POLL_S)
@@ -122,3 +130,34 @@ def _with_descendants(roots: set[int], parents: dict[int, int]) -> set[int]:
             found.add(pid)
             waiting += children.get(pid, [])
     return found
+
+
+log = logging.getLogger(__name__)
+
+_PR_SET_CHILD_SUBREAPER = 36
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+def become_subreaper() -> None:
+    """Inherit every orphan below this process, so that it stays a descendant."""
+    _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def start(end_the_rest: Callable[[], None]) -> int:
+    """Become the machine, before there are threads; return the process id of the guard above it."""
+    become_subreaper()
+    guard = os.getpid()
+    machine = os.fork()
+    if machine == 0:
+        become_subreaper()  # it is not inherited
+        return guard
+    try:
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+        while os.waitpid(-1, 0)[0] != machine:
+            pass
+        end_the_rest()
+    except FogftError as error:
+        log.error("guard_failed reason=%r", error.message)
+    finally:
+        os._exit(0)

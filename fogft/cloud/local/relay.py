@@ -36,7 +36,7 @@ class Shaper:
         self._free_at = 0.0
 
     def set(self, delay_s: float, rate_bytes_per_s: float | None) -> None:
-        """Change the path; what is under way already keeps its time."""
+        """Change the path; data already on it keeps its arrival time."""
         self.delay_s = delay_s
         self.rate = rate_bytes_per_s or math.inf
 
@@ -47,7 +47,7 @@ class Shaper:
 
     @property
     def room_bytes(self) -> int:
-        """How much one connection may hold before the reading stops."""
+        """How much one connection may hold before reading stops."""
         if self.rate == math.inf:
             return MAX_HELD_BYTES if self.delay_s else 0
         return int(min(MAX_HELD_BYTES, self.rate * (self.delay_s + _CHUNK_S) + _SLACK_BYTES))
@@ -147,7 +147,7 @@ class Relay:
             self._passes.set()
 
     def step(self, for_s: float) -> None:
-        """Pass on what comes, for so long."""
+        """Relay data for a given time."""
         self._loop.run_until_complete(asyncio.sleep(for_s))
 
     def close(self) -> None:

@@ -55,7 +55,7 @@ def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[st
     lists = [key for key in ("any_of", "ordered") if resources.get(key) is not None]
     if len(lists) == 2:
         raise SpecError.of_key(
-            "resources.ordered", "cannot stand beside `any_of`", "keep one of them"
+            "resources.ordered", "cannot be combined with `any_of`", "keep one of them"
         )
     entries = resources[lists[0]] if lists else [{}]
     path = f"resources.{lists[0]}" if lists else "resources"
@@ -120,7 +120,7 @@ def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: 
     names = [instance.name for instance in catalogue.instances]
     if named is not None and named not in names:
         what = f"the local cloud has no {shown(named)}"
-        hint = f"{nearest(str(named), names)}; or ask with `cpus: 4+` instead"
+        hint = f"{nearest(str(named), names)}; or ask for `cpus: 4+` instead"
         raise SpecError.of_key(f"{where}.instance_type", what, hint)
     fitting = [i for i in catalogue.instances if named in (None, i.name)]
     for key in ("accelerators", "cpus", "memory"):

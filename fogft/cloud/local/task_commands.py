@@ -1,4 +1,4 @@
-"""What a machine needs to run a task's commands here: environment, domain, whose turn it is."""
+"""How a machine runs a task's commands: environment, ROS domain, and taking turns."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def environment(task: Mapping[str, Any]) -> dict[str, str]:
 
 
 def server_environment(task: Mapping[str, Any], domain: int) -> dict[str, str]:
-    """Return the environment of the server proxy: the task's variables hold for it, too.
+    """Return the environment of the server proxy, which includes the task's variables.
 
     So both ends on a machine have one `RMW_IMPLEMENTATION`, as on a VM.
     """

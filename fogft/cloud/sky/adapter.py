@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.port import Audit, Launch
-from fogft.cloud.sky import bake, listing, task, wheel
+from fogft.cloud.sky import bake, presence, task, wheel
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.following import Following
@@ -196,7 +196,7 @@ class SkyCloud:
             if at is not None and (until is None or at < until):
                 hours = max(0.0, at - self.clock()) / 3600
                 found.append(
-                    f"the credentials of `{provider.cloud}` end in {hours:.1f} h: from then on "
+                    f"the credentials of `{provider.cloud}` expire in {hours:.1f} h: after that, "
                     "nothing is launched, replaced or ended until they are renewed"
                 )
         return [one for one in found if one]
@@ -214,7 +214,10 @@ class SkyCloud:
         try:
             self._locks.renew(self.make_wheel(self.folder / "wheels"))
         except CloudError as error:
-            found.append(f"each VM chooses what fogft needs itself, unlocked: {error.message}")
+            found.append(
+                "the packages that fogft needs are not pinned, and each VM resolves them itself: "
+                f"{error.message}"
+            )
         if files is None:
             found.append(
                 "the API server elsewhere decides which of its credentials every VM gets: let it "
@@ -223,8 +226,8 @@ class SkyCloud:
         elif files:
             listed = ", ".join(f"`{file}`" for file in files)
             found.append(
-                f"SkyPilot gives every VM these files of yours, and its own ssh key: {listed}. It "
-                "has no setting against that: move them away where a replica must not have them"
+                f"SkyPilot gives every VM these files of yours, and its own ssh key: {listed}. No "
+                "setting prevents that: move away what a replica must not have"
             )
         held = GROUP[:1] if allow_from else ()
         world = ", ".join(f"`{one}`" for one in clouds if one not in held)
@@ -233,9 +236,9 @@ class SkyCloud:
             found.append(
                 f"on {world}, {port}ssh's port (keys only) are open to the world: "
                 + (
-                    "SkyPilot cannot hold `fogft.allow_from` there"
+                    "SkyPilot cannot enforce `fogft.allow_from` there"
                     if allow_from
-                    else "`fogft.allow_from` names who may connect, on AWS"
+                    else "on AWS, `fogft.allow_from` limits who may connect"
                 )
             )
         return [one for one in found if one]
@@ -262,7 +265,7 @@ class SkyCloud:
         instances, asked = self._census.everywhere(pool_uid)
         for instance in instances:
             if pool_uid or self._mine(instance.labels):
-                machines.setdefault(instance.id, listing.of_instance(instance))
+                machines.setdefault(instance.id, presence.of_instance(instance))
         return Audit(tuple(machines[id] for id in sorted(machines)), asked)
 
     def close(self) -> None:
@@ -292,8 +295,8 @@ class SkyCloud:
             return provider.firewall(place.region, ports, order.allow_from)
         except NotAllowedError as error:
             raise CloudError(
-                f"`fogft.allow_from` cannot be held in `{place.location}`: {error}",
-                "allow what docs/how-to/clouds.md lists, on the computer of the manager too",
+                f"`fogft.allow_from` cannot be enforced in `{place.location}`: {error}",
+                "grant the permissions that docs/how-to/clouds.md lists, also to the manager",
             ) from error
 
     # -- launches under way -------------------------------------------------------------------

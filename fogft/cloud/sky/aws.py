@@ -1,4 +1,4 @@
-"""AWS by its own interface (boto3, which comes with SkyPilot's AWS support). See `provider`.
+"""AWS through its own API (boto3, which comes with SkyPilot's AWS support). See `provider`.
 
 Only `describe` calls, `TerminateInstances` on instances whose tags were just read and are ours,
 and security groups that are named for what they let in. Credentials and regions come from the
@@ -88,8 +88,8 @@ class Aws:
         for group in self._ask(region, functools.partial(_firewalls, name, rules)):
             raise CloudError(
                 f"the security group `{name}` ({group}) in `aws/{region}` was changed: it no "
-                "longer lets in exactly what `fogft.allow_from` names",
-                "delete it, and fogft makes it anew",
+                "longer matches `fogft.allow_from`",
+                "delete it, and fogft creates a new one",
             )
         return name
 
@@ -188,8 +188,8 @@ class Aws:
             return ""
         if names is None:
             return (
-                f"AWS has no role `{ROLE}`: at the first launch SkyPilot makes one for every VM, "
-                "with full access to EC2 and S3. Make the one of docs/how-to/clouds.md before"
+                f"AWS has no role `{ROLE}`: at the first launch SkyPilot creates one for every VM, "
+                "with full access to EC2 and S3. Create the one in docs/how-to/clouds.md before"
             )
         mighty = [f"`{n}`" for n in names if n.endswith("FullAccess") or n in _MIGHTY]
         if not mighty:
@@ -229,7 +229,7 @@ class Aws:
                     self._session = None
                     self.clients.clear()
                 hint = "renew the AWS credentials; `sky check aws` tests them"
-            raise CloudUnreachable(f"AWS cannot tell about `{region}`: {error}", hint) from error
+            raise CloudUnreachable(f"AWS gave no answer about `{region}`: {error}", hint) from error
 
 
 def _moment(text: str) -> float:

@@ -1,4 +1,4 @@
-"""Give calls of SkyPilot's a limit, though its client has none.
+"""Calls to SkyPilot with a time limit, which its client lacks.
 
 A call that is given up still runs, here and on the API server. Until it has ended the same
 question is not asked again, so that a slow server is not buried under repetitions; its late
@@ -13,21 +13,21 @@ from collections.abc import Callable
 from concurrent.futures import Future, wait
 from typing import Any, TypeVar
 
-from fogft.cloud.sky.answers import translated
+from fogft.cloud.sky.sdk import translated
 from fogft.errors import CloudUnreachable
 
 T = TypeVar("T")
 
 
 class Calls:
-    """Runs calls, and remembers those that were given up, by subject."""
+    """Runs calls, and remembers those that timed out, by subject."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._given_up: dict[str, Future[Any]] = {}
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
-        """Run a call on a thread of its own, for so long at most; turn its errors into ours.
+        """Run a call on its own thread with a time limit; translate its errors.
 
         `subject` says what it is about: the same words are the same question.
         """
@@ -52,7 +52,7 @@ class Calls:
             self._given_up[subject] = running
         raise CloudUnreachable(
             f"SkyPilot did not answer within {limit_s:.0f} s about {subject}",
-            "`sky api info` and `sky api logs` tell how its API server is doing",
+            "`sky api info` and `sky api logs` show the state of its API server",
         )
 
 

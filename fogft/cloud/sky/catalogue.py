@@ -1,4 +1,4 @@
-"""What SkyPilot's catalogue sells for a task as it will be launched, and which clouds cannot.
+"""What SkyPilot's catalogue offers for a task as launched, and which clouds cannot run it.
 
 SkyPilot chooses one machine without accelerators; one type alone often has no capacity. So others
 of a cloud's general families are offered beside it: as many vCPUs, no less memory.
@@ -33,7 +33,7 @@ _MISSING = {
     "autodown": "a machine there cannot end itself",
     "docker_image": "it runs no `docker:` images",
     "custom_disk_tier": "it has no choice of `disk_tier`",
-    "image_id": "it takes no images of one's own",
+    "image_id": "it takes no custom images",
 }
 
 
@@ -64,7 +64,7 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
 
 
 def missing(cloud: Any, resources: Any) -> str:
-    """Return which features of a launch a cloud does not have; empty where it has all."""
+    """Return the features of a launch that a cloud lacks; empty if it has all."""
     features = importlib.import_module("sky.clouds").CloudImplementationFeatures
     no = importlib.import_module("sky.exceptions").NotSupportedError
     lacking = []

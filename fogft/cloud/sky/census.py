@@ -1,4 +1,4 @@
-"""Ask the providers which machines exist: SkyPilot may have forgotten some.
+"""Ask the providers which machines exist, because SkyPilot may have lost some.
 
 A machine's absence counts only where the provider has listed it before. The credentials here may be
 of another account than those that SkyPilot, or its API server elsewhere, launches with.
@@ -40,7 +40,7 @@ class Census:
         self._seen: set[ReplicaId] = set()
 
     def of(self, id: ReplicaId, entry: Entry | None) -> list[Instance] | None:
-        """Return a replica's instances, asked now; None where SkyPilot's word has to do.
+        """Return a replica's instances, asked now; None if only SkyPilot can be asked.
 
         Args:
             id: The replica.
@@ -64,11 +64,11 @@ class Census:
             raise CloudUnreachable(f"{instance.key} may not be ended: {error}") from error
 
     def vouches(self, cloud: str) -> bool:
-        """Whether a cloud's own list can be had, as far as is known."""
+        """Whether a cloud's own list is available, as far as known."""
         return cloud in self.providers and cloud not in self._refused
 
     def latest(self, pool_uid: str, regions: Mapping[str, Iterable[str]]) -> Sequence[Instance]:
-        """Return what the last census of a pool found, and take another when it is old.
+        """Return the last census of a pool, and start another if it is old.
 
         The first one looks everywhere, later ones where machines of the pool can be, if known.
         """
@@ -96,20 +96,20 @@ class Census:
             self._found[id.pool_uid] = [i for i in kept if i.id != id]
 
     def unverified(self, cloud: str) -> str:
-        """Return why a cloud's own list cannot be had; empty when it can. Asks for it: seconds."""
+        """Return why a cloud's own list is not available, else empty. Takes seconds."""
         provider = self.providers.get(cloud)
         if provider is None:
             return (
-                f"fogft cannot ask `{cloud}` itself: what exists there is SkyPilot's word, and a "
-                "VM whose launch loses this computer and SkyPilot's API server runs until "
+                f"fogft cannot ask `{cloud}` itself and relies on SkyPilot's list of machines: a "
+                "VM whose launch outlives this computer and SkyPilot's API server runs until "
                 "`fogft sweep`"
             )
         try:
             self._ask(provider, None, NOBODY)
         except CloudUnreachable as error:
-            return f"`{cloud}` does not say what exists there: {error.message}"
+            return f"`{cloud}` cannot list its machines: {error.message}"
         reason = self._refused.get(cloud, "")
-        return f"{reason}; what exists in `{cloud}` is SkyPilot's word" if reason else ""
+        return f"{reason}; fogft relies on SkyPilot's list for `{cloud}`" if reason else ""
 
     def _take(self, pool_uid: str, regions: Mapping[str, Iterable[str]] | None) -> None:
         found: list[Instance] = []

@@ -1,4 +1,4 @@
-"""End a replica for certain: abort its launch, take it down, and look whether it is gone.
+"""End a replica reliably: abort its launch, take it down, and verify that it is gone.
 
 "Down" that returned without an error is not believed. SkyPilot's list is read again with a
 refresh from the cloud, and the provider is asked itself where it can be. What SkyPilot has

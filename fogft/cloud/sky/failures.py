@@ -60,7 +60,7 @@ def classify(kind: str, texts: Iterable[str]) -> Reason:
 
 
 def told_last(log: str) -> Reason | None:
-    """Return the last failure that a launch's log has a cloud's code of; None where it has none."""
+    """Return the last failure in a launch's log that has a cloud's error code; None without one."""
     found = (classify("", [line]) for line in reversed(log.splitlines()))
     return next((failure for failure in found if failure.cause is not Cause.ERROR), None)
 
@@ -73,12 +73,12 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
 def plain(text: str) -> str:
-    """Return a text of SkyPilot's without colours, line breaks and what only AWS can read."""
+    """Return a text of SkyPilot's without colours, line breaks and encoded AWS messages."""
     return " ".join(_COLOUR.sub("", text).partition(_FOR_AWS)[0].split())
 
 
 def tail(log: str, lines: int = 20, width: int = 200) -> str:
-    """Return the last lines of a log that say something, each cut to `width` characters."""
+    """Return the last non-empty lines of a log, each cut to `width` characters."""
     lines_of_log = (_SPEAKER.sub("", line.rstrip()) for line in _COLOUR.sub("", log).splitlines())
     told = [line for line in lines_of_log if line.strip() and not line.startswith(_DECORATION)]
     return "\n".join(line[:width] for line in told[-lines:])

@@ -77,7 +77,7 @@ class Following:
         if requests:
             self._move(entry, stage=Stage.LAUNCHING, request=requests[-1].id)
         elif self._age(entry) > ASK_LIMIT_S:
-            self._fail(entry, Reason(Cause.ERROR, words="SkyPilot never heard of this launch"))
+            self._fail(entry, Reason(Cause.ERROR, words="SkyPilot has no record of this launch"))
 
     def _launching(self, entry: Entry) -> None:
         request = self.sky.request(entry.request)
@@ -141,7 +141,7 @@ class Following:
         elif job is JobState.MISSING:
             self._fail(entry, Reason(Cause.ERROR, words="SkyPilot started no job on the machine"))
         elif job is JobState.ENDED:
-            words = "`fogft serve` ended on the machine" + self._job_tail(entry)
+            words = "`fogft serve` exited on the machine" + self._job_tail(entry)
             self._fail(entry, Reason(Cause.ERROR, words=words))
         elif self._age(entry) > SETUP_LIMIT_S:  # it was asked: who hears nothing concludes nothing
             self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "setting up"))

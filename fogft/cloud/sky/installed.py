@@ -16,10 +16,20 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
 
 from fogft.cloud.sky import catalogue
-from fogft.cloud.sky.answers import JOBS, as_answer, cluster_of, request_of, told_reasons
 from fogft.cloud.sky.calls import Calls
 from fogft.cloud.sky.naming import replica_of
-from fogft.cloud.sky.sdk import Cluster, JobState, RefusedError, Request, Sale
+from fogft.cloud.sky.sdk import (
+    JOBS,
+    Cluster,
+    JobState,
+    RefusedError,
+    Request,
+    Sale,
+    as_answer,
+    cluster_of,
+    request_of,
+    told_reasons,
+)
 from fogft.cloud.sky.settings import Settings, report_nothing
 from fogft.errors import CloudError
 
@@ -196,7 +206,7 @@ class InstalledSky:
         reasons = told_reasons(told.getvalue())
         asked = {cloud.lower() for cloud in clouds} or usable | set(reasons)
         return {
-            cloud: "" if cloud in usable else reasons.get(cloud, "SkyPilot may not use it")
+            cloud: "" if cloud in usable else reasons.get(cloud, "SkyPilot has no access to it")
             for cloud in sorted(asked)
         }
 
@@ -219,9 +229,9 @@ class InstalledSky:
         if not importlib.import_module("sky.server.common").is_api_server_local():
             return both
         if any(request_of(one).active for one in sdk.api_status()):
-            return f"{both}: it is busy; `sky api stop` when it is not, and the next one is new"
+            return f"{both}: it is busy; `sky api stop` once it is idle replaces it"
         sdk.api_stop()
-        return f"{both}: it was idle, and is started anew"
+        return f"{both}: it was idle, and was restarted"
 
     @_limited(REFRESH_LIMIT_S, "the credentials that a VM would get")
     def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:

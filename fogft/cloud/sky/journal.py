@@ -1,4 +1,4 @@
-"""What was asked of SkyPilot, on disk: one small file a replica, until it is gone.
+"""The journal of launches requested from SkyPilot: one small file for each replica.
 
 SkyPilot's own list misses a launch in its first seconds, and forgets why one failed. The
 journal is written before SkyPilot is asked, so a replica is listed from then on, even
@@ -21,9 +21,9 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.sky.naming import cluster_name, replica_of
-from fogft.disk import locked, make_folder, read_json, write_json, write_whole
+from fogft.disk import locked, make_folder, read_as, write_json, write_whole
 from fogft.model.names import LINK_PORT
-from fogft.model.plain import stored, to_plain
+from fogft.model.plain import to_plain
 from fogft.model.reason import Reason
 from fogft.model.replica import Placement, ReplicaId
 
@@ -110,8 +110,7 @@ class Journal:
 
     def get(self, id: ReplicaId) -> Entry | None:
         """Return an entry, or None."""
-        value = read_json(self._path(id))
-        return None if value is None else stored(Entry, value, f"`{self._path(id)}` is damaged")
+        return read_as(Entry, self._path(id))
 
     def entries(self, pool_uid: str = "") -> list[Entry]:
         """Return the entries of one pool, or of all, ordered by id; a damaged one is an error."""

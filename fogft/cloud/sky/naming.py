@@ -1,4 +1,4 @@
-"""How a replica is named in a cloud, and read back from there. Pure.
+"""Names and labels of a replica's machine in a cloud. Pure.
 
 A cluster's name and its labels each carry the pool's uid, the slot and the generation. What
 does not match is not ours, and nothing that is not ours is ever touched: every name that

@@ -166,7 +166,8 @@ class Prices:
             where = f"{place.cloud}/{place.region}"
             left_out[
                 f"`{place.instance}` {kind} in `{where}` is left out: the quota {asked(offer)[2]} "
-                f"allows {limit:g} vCPUs, and it has {sale.vcpus[place.instance]:g}; ask for more"
+                f"allows {limit:g} vCPUs, and it needs {sale.vcpus[place.instance]:g}; request an "
+                "increase"
             ] = None
         return kept
 
@@ -182,7 +183,9 @@ class Prices:
                 log.info("quota_unknown region=%s reason=%r", key[0], str(error))
                 value = None
             except NotAllowedError as error:
-                said = f"what `{cloud}`'s quotas forbid is not left out, since they cannot be read"
+                said = (
+                    f"offers above the quotas of `{cloud}` are not left out: those cannot be read"
+                )
                 self._unread[cloud], value = f"{said}: {error}", None
             self._quotas[key] = self.clock(), value
         return value

@@ -1,18 +1,25 @@
-"""The plain values that SkyPilot's answers become: no object of its own gets past `installed`."""
+"""Plain values for SkyPilot's answers and errors. Pure.
+
+No object of its own gets past `installed`. The line that matters: "nobody knows" (the API server,
+the network, the credentials) against "the answer is no". From the first nothing may be concluded.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import Any
 
-from fogft.cloud.sky.failures import classify
-from fogft.errors import CloudError
+from fogft.cloud.sky.failures import classify, plain
+from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.replica import Offer, Placement
 
 
 class RefusedError(CloudError):
-    """SkyPilot answered, and the answer is no; see `classify`."""
+    """SkyPilot refused a request; see `classify`."""
 
     def __init__(self, kind: str, texts: Sequence[str]) -> None:
         super().__init__(texts[0] if texts else kind)
@@ -58,7 +65,7 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Sale:
-    """What SkyPilot could launch for a `resources` section.
+    """The offers that SkyPilot has for a `resources` section.
 
     Attributes:
         offers: Of each location several machines that would do, at the catalogue's prices.
@@ -82,3 +89,123 @@ class JobState(Enum):
     SETUP_FAILED = "setup failed"
     ENDED = "ended"
     MISSING = "missing"
+
+
+# Their meaning is "nobody knows": the server, the network or the credentials, not the cluster.
+UNKNOWN = frozenset(
+    (
+        *("ApiServerConnectionError", "ApiServerAuthenticationError", "APIVersionMismatchError"),
+        *("ServerTemporarilyUnavailableError", "RequestInterruptedError", "NetworkError"),
+        *("ClusterStatusFetchingError", "FetchClusterInfoError", "KubeAPIUnreachableError"),
+        *("ConcurrentWorkerExhaustedError", "ExecutionRetryableError", "ExecutionPoolFullError"),
+        *("SkyletUnavailableError", "CloudUserIdentityError", "InvalidCloudCredentials"),
+        *("NoCloudAccessError", "CloudError"),
+        *("ConnectionError", "ConnectTimeout", "ReadTimeout", "Timeout", "TimeoutError"),
+        *("HTTPError", "ChunkedEncodingError"),
+    )
+)
+JOBS = {
+    "INIT": JobState.PENDING, "PENDING": JobState.PENDING, "SETTING_UP": JobState.SETTING_UP,
+    "RUNNING": JobState.RUNNING, "FAILED_SETUP": JobState.SETUP_FAILED,
+}  # fmt: skip
+
+
+ENDED = frozenset(("SUCCEEDED", "FAILED", "CANCELLED"))
+_QUEUED = frozenset(("PENDING", "WAITING"))
+_SAID_BY_SERVER = ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
+                   "InvalidCloudCredentials")  # fmt: skip
+
+
+def translated(error: BaseException, subject: str) -> CloudError:
+    """Return what an exception out of SkyPilot means: `CloudUnreachable` or `RefusedError`."""
+    if isinstance(error, CloudError):
+        return error
+    kind = type(error).__name__
+    if _is_unknown(error):
+        words = plain(str(error)) or kind
+        return CloudUnreachable(f"SkyPilot gave no answer about {subject}: {words}", _hint(kind))
+    return RefusedError(kind, _texts(error))
+
+
+@contextlib.contextmanager
+def as_answer() -> Iterator[None]:
+    """Take an exception as SkyPilot's answer, except those that say nothing is known."""
+    try:
+        yield
+    except Exception as error:
+        kind = type(error).__name__
+        if kind not in _SAID_BY_SERVER and _is_unknown(error):
+            raise
+        raise RefusedError(kind, _texts(error)) from error
+
+
+def _is_unknown(error: BaseException) -> bool:
+    if type(error).__name__ in UNKNOWN or isinstance(error, OSError):
+        return True
+    # A bare RuntimeError may speak of the API server, as SkyPilot's `get` words it.
+    return type(error) is RuntimeError and str(error).startswith(
+        ("Failed to get request", "Failed to connect", "SkyPilot API server")
+    )
+
+
+def _texts(error: BaseException) -> list[str]:
+    history = getattr(error, "failover_history", None) or []
+    return [plain(str(text)) for text in (error, *history)]
+
+
+def _hint(kind: str) -> str:
+    if kind in ("CloudUserIdentityError", "InvalidCloudCredentials", "NoCloudAccessError"):
+        return (
+            "renew the credentials of this cloud; `sky check` tests them. SkyPilot's API server "
+            "stays: `sky api stop` ends it"
+        )
+    if kind in ("ConnectionError", "ConnectTimeout", "MaxRetryError", "NameResolutionError"):
+        return "see that this machine reaches the internet; `sky check` tests each cloud"
+    if kind == "APIVersionMismatchError":
+        return "the API server has another version: `sky api stop` ends it once it is idle"
+    return "`sky api info` and `sky check` show what is wrong"
+
+
+def cluster_of(record: Any) -> Cluster:
+    """Return a `StatusResponse` of SkyPilot's as our record."""
+    state = getattr(record.status, "value", str(record.status))
+    chosen = getattr(record.handle, "launched_resources", None)
+    placement = None
+    if chosen is not None and chosen.cloud is not None and chosen.region is not None:
+        placement = Placement(
+            str(chosen.cloud).lower(),
+            chosen.region,
+            chosen.zone or "",
+            chosen.instance_type or "",
+            bool(chosen.use_spot),
+        )
+    return Cluster(
+        name=record.name,
+        state=ClusterState(state) if state in ClusterState.__members__ else ClusterState.OTHER,
+        placement=placement,
+        head_ip=getattr(record.handle, "head_ip", None) or "",
+        launched_at=float(record.launched_at or 0.0),
+        progress=plain(record.init_status_reason or record.last_event or ""),
+        labels=dict(record.labels or getattr(chosen, "labels", None) or {}),
+    )
+
+
+def request_of(payload: Any) -> Request:
+    """Return a `RequestPayload` of SkyPilot's as our record."""
+    return Request(
+        payload.request_id, active=payload.status not in ENDED, queued=payload.status in _QUEUED
+    )
+
+
+def told_reasons(output: str) -> dict[str, str]:
+    """Return cloud -> reason, out of what ``sky check`` prints of clouds that do not work."""
+    reasons: dict[str, str] = {}
+    cloud = ""
+    for line in map(plain, output.splitlines()):
+        heading = re.fullmatch(r"(\w[\w ]*): (enabled|disabled).*", line)
+        if heading:
+            cloud = heading[1].lower() if heading[2] == "disabled" else ""
+        elif cloud and line:
+            text = re.sub(r"^Reason \[[^]]*\]: ", "", line)
+            reasons[cloud] = " ".join(part for part in (reasons.get(cloud, ""), text) if part)
+    return reasons

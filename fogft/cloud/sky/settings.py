@@ -1,4 +1,4 @@
-"""What fogft has SkyPilot do at a launch, where the user's own settings do not say otherwise.
+"""SkyPilot settings that fogft applies to a launch, unless the user has set them.
 
 A VM gets no credentials: by SkyPilot's default it would get the files of every cloud that they
 exist for, and with any of them SkyPilot's own ssh key. Usage reports are off.

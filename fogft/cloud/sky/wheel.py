@@ -1,4 +1,4 @@
-"""What a VM installs: the very fogft that runs here, as a wheel, and a lock of what it needs.
+"""What a VM installs: the running fogft as a wheel, and a lock file of its dependencies.
 
 No build tool and no index is needed for the wheel: it is made of the imported package's own files
 and of what pip recorded of it, the same bytes each time.
@@ -24,9 +24,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from fogft.disk import locked, make_folder, read_json, write_json, write_whole
+from fogft.disk import locked, make_folder, read_as, write_json, write_whole
 from fogft.errors import CloudError
-from fogft.model.plain import stored, to_plain
+from fogft.model.plain import to_plain
 
 _PACKAGE = Path(__file__).resolve().parents[2]
 _EPOCH = (2020, 1, 1, 0, 0, 0)
@@ -105,7 +105,7 @@ def _digest(content: bytes) -> str:
 
 @dataclass(frozen=True)
 class Locks:
-    """By file name: without ROS 2, and with it. None where none could be made."""
+    """Lock files without and with ROS 2; None if they could not be created."""
 
     files: Mapping[str, str]
 
@@ -128,10 +128,10 @@ def _compiled(wanted: str) -> str:
             command, input=wanted, capture_output=True, text=True, timeout=_LIMIT_S, check=False
         )
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise CloudError(f"`uv` cannot resolve them here: {error}") from error
+        raise CloudError(f"`uv` cannot resolve the packages that fogft needs: {error}") from error
     if done.returncode:
         said = " ".join(done.stderr.split())[-_WORDS:]
-        raise CloudError(f"`uv` cannot resolve them here: {said}")
+        raise CloudError(f"`uv` cannot resolve the packages that fogft needs: {said}")
     return done.stdout
 
 
@@ -143,25 +143,25 @@ class LockFolder:
         self._resolve = resolve
 
     def renew(self, wheel: Path) -> Mapping[str, bytes]:
-        """Make the lock anew that the next generations of a wheel get; return it as files.
+        """Renew the lock for the next generations of a wheel; return it as files.
 
         Raises CloudError: it cannot be made, and there is none of before.
         """
         try:
             self._write(self._newest(wheel), self._resolve(wheel))
         except CloudError:
-            if self._read(self._newest(wheel)) is None:
+            if read_as(Locks, self._newest(wheel)) is None:
                 raise
-        return _as_files(self._read(self._newest(wheel)))
+        return _as_files(read_as(Locks, self._newest(wheel)))
 
     def of(self, generation: str, wheel: Path) -> Mapping[str, bytes]:
         """Return a generation's lock as files; none where none can be made at its first launch."""
         make_folder(self._folder)
         kept = self._folder / f"{generation}-{wheel.name}.json"
         with locked(self._folder / "locks.lock"):
-            found = self._read(kept)
+            found = read_as(Locks, kept)
             if found is None:
-                found = self._read(self._newest(wheel)) or Locks({})
+                found = read_as(Locks, self._newest(wheel)) or Locks({})
                 if not found.files:
                     with contextlib.suppress(CloudError):  # as `up` has told
                         found = self._resolve(wheel)
@@ -170,10 +170,6 @@ class LockFolder:
 
     def _newest(self, wheel: Path) -> Path:
         return self._folder / f"{wheel.name}.json"
-
-    def _read(self, path: Path) -> Locks | None:
-        value = read_json(path)
-        return None if value is None else stored(Locks, value, f"`{path}` is damaged")
 
     def _write(self, path: Path, locks: Locks) -> None:
         make_folder(self._folder)

@@ -69,7 +69,7 @@ class PriceTable:
         if not best:
             raise SpecError.of_key(
                 "resources",
-                f"nothing in `{self._file}` matches them",
+                f"no row of `{self._file}` matches",
                 "relax the resources, or name places in the table",
             )
         return sorted(best.values(), key=_order)
@@ -111,7 +111,7 @@ def _row(file: Path, number: int, raw: Mapping[str, str | None], usual: str) -> 
         except ValueError:
             value = -1.0
         if value < 0 or math.isinf(value):
-            what = f"{file}: row {number}: {key}: {shown(text)} is not a number from 0"
+            what = f"{file}: row {number}: {key}: {shown(text)} is not a number of at least 0"
             raise SpecError(what, "correct the row, or remove it")
         return value
 

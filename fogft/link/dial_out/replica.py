@@ -32,7 +32,11 @@ _GREETING_TIMEOUT_S = 5.0
 
 
 class DialOut:
-    """Keeps connections open to the dial-in ports of robots, for them to use."""
+    """Keeps connections open to the dial-in ports of robots, for them to use.
+
+    Args:
+        local: ``host:port`` of this replica's own listener.
+    """
 
     def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:
         host, port = host_and_port(local)
@@ -45,7 +49,7 @@ class DialOut:
         self._tunnels = Tunnels()
 
     def follow(self, doors: Iterable[str]) -> None:
-        """Wait at these doors (``host:port``) and at no others. What is in use goes on."""
+        """Connect to these dial-in ports (``host:port``) and no others; connections in use stay."""
         wanted = list(dict.fromkeys(doors))[:TARGETS_LIMIT]
         with self._lock:
             for door in [d for d in self._targets if d not in wanted]:
@@ -64,12 +68,12 @@ class DialOut:
                 ).start()
 
     def details(self) -> Mapping[str, str]:
-        """Return for each door what is wrong; empty where we wait or are in use."""
+        """Return each dial-in port's problem; empty while connected."""
         with self._lock:
             return dict(self._details)
 
     def close(self) -> None:
-        """Leave all doors and end what is in use. Repeatable."""
+        """Close all connections. Repeatable."""
         self.follow(())
         self._tunnels.close()
 

@@ -1,4 +1,4 @@
-"""The robot's side of dial-out: a port (the door) to which replicas connect that it cannot reach.
+"""The robot's side of dial-out: a port that replicas connect to if the robot cannot reach them.
 
 A replica dials the door, proves who it is, and waits. A link to that replica dials a port on
 this machine's loopback instead of a far address; the door then joins both connections. From
@@ -30,6 +30,7 @@ from fogft.model.credentials import Role, holder_of
 from fogft.model.names import host_and_port
 from fogft.model.replica import ReplicaId
 from fogft.records import frames
+from fogft.records.greetings import oldest_of_most
 from fogft.records.record import RecordError, Verify
 
 log = logging.getLogger(__name__)
@@ -55,7 +56,16 @@ class _Waiting:
 
 
 class DialIn:
-    """The dial-in port of one robot or gateway. Raises WireError: the port cannot be had."""
+    """The dial-in port of one robot or gateway.
+
+    Args:
+        listen: ``host:port``; port 0 for any that is free.
+        pool_uid: Replicas of other pools are turned away.
+        revoked: Common names that are turned away.
+
+    Raises:
+        WireError: The port cannot be had.
+    """
 
     def __init__(
         self,
@@ -75,7 +85,7 @@ class DialIn:
         self._waiting: dict[ReplicaId, deque[_Waiting]] = {}
         self._local: dict[ReplicaId, socket.socket] = {}
         self._tunnels = Tunnels()
-        self._greeting = 0
+        self._greeting: dict[socket.socket, str] = {}  # oldest first, with their hosts
         self._closed = False
         self._door = _listening(listen)
         host, port = listen.rpartition(":")[0], self._door.getsockname()[1]
@@ -93,15 +103,16 @@ class DialIn:
                     self._count("accept_failed", str(error))
                     time.sleep(0.1)
                 continue
+            host = str(address[0])
             with self._lock:
-                full = self._greeting >= GREETINGS_LIMIT
-                self._greeting += not full
-            if full:
-                self._count("refused_full", str(address[0]))
-                link.close()
-                continue
+                if len(self._greeting) >= GREETINGS_LIMIT:
+                    crowd = oldest_of_most(self._greeting)
+                    self._count("greeting_crowded", self._greeting.pop(crowd))
+                    with contextlib.suppress(OSError):  # its thread closes it
+                        crowd.shutdown(socket.SHUT_RDWR)
+                self._greeting[link] = host
             threading.Thread(
-                target=self._attend, args=(link, str(address[0])), name="fogft-greet", daemon=True
+                target=self._attend, args=(link, host), name="fogft-greet", daemon=True
             ).start()
 
     def _attend(self, link: socket.socket, host: str) -> None:
@@ -110,7 +121,7 @@ class DialIn:
                 id = self._greet(link, host)
             finally:
                 with self._lock:
-                    self._greeting -= 1
+                    self._greeting.pop(link, None)
         except RecordError as error:
             self._count(f"greeting_{error.reason}", f"{host}: {error}")
             hang_up(link)
@@ -134,7 +145,7 @@ class DialIn:
         except ValueError as error:
             raise RecordError("role", str(error)) from error
         if (holder.role, writer.role) != (Role.REPLICA, Role.REPLICA.value):
-            raise RecordError("role", f"`{writer.common_name}` is no replica")
+            raise RecordError("role", f"`{writer.common_name}` is not a replica")
         if holder.pool_uid != self._pool_uid:
             raise RecordError("pool", f"`{writer.common_name}` is another pool's")
         if writer.common_name in self._revoked():
@@ -174,9 +185,9 @@ class DialIn:
                         one.link.settimeout(0.0)
                         data = one.link.recv(64)
                         if data.strip(SIGN):
-                            return "it said something odd"
+                            return "it sent something unexpected"
                         if not data:
-                            return "it hung up"
+                            return "it closed the connection"
                         heard_at = time.monotonic()
                     else:
                         one.link.settimeout(0.5)
@@ -186,7 +197,7 @@ class DialIn:
             if self._closed:
                 return "the door is closed"
             if time.monotonic() - heard_at > SILENCE_S:
-                return "it is silent"
+                return "it sends nothing"
 
     def _forget(self, id: ReplicaId, one: _Waiting) -> None:
         with self._lock:
@@ -211,7 +222,7 @@ class DialIn:
             return f"127.0.0.1:{port.getsockname()[1]}"
 
     def keep(self, ids: Collection[ReplicaId]) -> None:
-        """Give back the loopback ports of all other replicas."""
+        """Close the loopback ports of all other replicas."""
         with self._lock:
             gone = [self._local.pop(id) for id in list(self._local) if id not in ids]
         for port in gone:
@@ -257,7 +268,7 @@ class DialIn:
     # -- the owner ----------------------------------------------------------------------------
 
     def waiting(self) -> Mapping[ReplicaId, int]:
-        """Return how many connections of each replica wait."""
+        """Return how many connections of each replica are waiting."""
         with self._lock:
             return {id: len(queue) for id, queue in self._waiting.items()}
 
@@ -265,7 +276,7 @@ class DialIn:
         self._counters.warn(log, event, "dial_in_refused event=%s detail=%r", event, detail[:200])
 
     def close(self) -> None:
-        """Close the door and all that came through it. Repeatable."""
+        """Close the port and all its connections. Repeatable."""
         self._closed = True
         hang_up(self._door)
         self.keep(())

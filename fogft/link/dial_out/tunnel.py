@@ -21,7 +21,7 @@ _LEAST_S = 0.01  # a time-out of 0 would mean none
 
 
 def receive(link: socket.socket, limit_bytes: int, within_s: float) -> dict[str, Any]:
-    """Return it, however its bytes come; who sends them one by one has no longer than others.
+    """Receive the first message; the time limit holds for the whole of it.
 
     Args:
         link: The connection. It is left with what remains of the time as its time-out.
@@ -40,7 +40,7 @@ def receive(link: socket.socket, limit_bytes: int, within_s: float) -> dict[str,
         link.settimeout(max(_LEAST_S, left_s))
         data = link.recv(4096)
         if not data:
-            raise EOFError("it left without a word")
+            raise EOFError("it closed the connection without a message")
         for message in unframer.feed(data):
             return message
 
@@ -49,7 +49,7 @@ _CHUNK = 64 << 10
 
 
 def keep_alive(link: socket.socket) -> None:
-    """Have the kernel give a connection up within seconds once its peer is gone."""
+    """Have the kernel drop a connection within seconds once its peer is gone."""
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
@@ -59,7 +59,7 @@ def keep_alive(link: socket.socket) -> None:
 
 
 def hang_up(link: socket.socket) -> None:
-    """End a connection whatever state it is in, also for a thread that waits on it."""
+    """End a connection in any state, also for a thread that waits on it."""
     with contextlib.suppress(OSError):
         link.shutdown(socket.SHUT_RDWR)
     link.close()
@@ -101,7 +101,7 @@ class Tunnels:
             target.close()
 
     def close(self) -> None:
-        """End all. Their threads close the sockets."""
+        """End all tunnels. Their threads close the sockets."""
         with self._lock:
             _end(self._open)
 

@@ -1,4 +1,4 @@
-"""Why a link does not open, in words. Zenoh only says "unable to connect".
+"""How long a link may take to open, and why it does not, in words. Zenoh says neither.
 
 Asks the endpoint again with plain TCP and TLS. Called after a failure only, never on the
 way to an answer; `fogft doctor` may call it too.
@@ -18,17 +18,18 @@ from typing import Any
 
 from fogft.errors import CredentialError
 from fogft.link.port import Peer
+from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import host_and_port
 
 # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
 _OUT_OF_TIME = (9, 10)
 _ALERTS = {
-    "unknown ca": "our certificate is of another CA than the replica's",
-    "decrypt error": "our certificate is of another CA than the replica's",
+    "unknown ca": "our certificate is from another CA than the replica's",
+    "decrypt error": "our certificate is from another CA than the replica's",
     "certificate expired": "our certificate has expired, by the replica's clock",
     "certificate required": "the replica asks for a certificate and we have none",
-    "unsupported certificate": "our certificate is not a robot's",
+    "unsupported certificate": "our certificate is not one for robots",
     "bad certificate": "the replica does not accept our certificate",
     "certificate unknown": "the replica does not accept our certificate",
 }
@@ -126,7 +127,7 @@ def _tls_words(error: ssl.SSLError) -> str:
     for alert, words in _ALERTS.items():
         if alert in text:
             return words
-    return f"TLS fails: {error.reason or error}"
+    return f"TLS failed: {error.reason or error}"
 
 
 @dataclass(frozen=True)
@@ -185,3 +186,45 @@ def judged_there(validity: Validity, now: datetime.datetime) -> str:
 
 def _utc(time: datetime.datetime) -> str:
     return f"{time:%Y-%m-%d %H:%M} UTC"
+
+
+_EXPLAIN_EVERY_S = 5.0
+_EXPLAIN_TIMEOUT_S = 0.5
+_NEARLY = 0.9  # of a time-out, as it is measured
+
+
+class Opening:
+    """The attempts to open one link's connection. Used by one thread."""
+
+    def __init__(self, peer: Peer, settings: LinkSettings) -> None:
+        self._peer = peer
+        self._settings = settings
+        self._timed_out = 0  # tries in a row
+        self._was_open = False
+        self._explained_at = float("-inf")
+
+    @property
+    def timeout_s(self) -> float:
+        """Time limit of the next attempt; longer after two time-outs: the replica may be slow."""
+        patient = self._timed_out % 3 == 2
+        return self._settings.long_open_timeout_s if patient else self._settings.open_timeout_s
+
+    def done(self) -> None:
+        """Note that an attempt succeeded."""
+        self._timed_out = 0
+        self._was_open = True
+
+    def failed(self, took_s: float, now: float, credentials: CredentialPaths) -> str:
+        """Note that an attempt failed; return the reason, or nothing if it was looked up lately."""
+        self._timed_out = self._timed_out + 1 if took_s >= self.timeout_s * _NEARLY else 0
+        interface = self._peer.interface
+        if interface and interface not in {name for _, name in socket.if_nameindex()}:
+            return f"there is no network interface `{interface}` here"
+        if took_s >= self._settings.open_timeout_s * _NEARLY:
+            if self._was_open:
+                return f"`{self._peer.endpoint}` no longer answers: frozen, cut off or overloaded"
+            return f"`{self._peer.endpoint}` does not answer yet"
+        if now - self._explained_at < _EXPLAIN_EVERY_S:
+            return ""
+        self._explained_at = now
+        return explain(self._peer, credentials, _EXPLAIN_TIMEOUT_S)

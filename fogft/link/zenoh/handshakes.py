@@ -1,4 +1,4 @@
-"""Count the handshakes that Zenoh refuses. It tells of them on standard output only.
+"""Count the handshakes that Zenoh refuses, which it reports on standard output only.
 
 One line each: of the target ``zenoh_link_tls`` with TLS's own reason, or, once TLS was
 satisfied, of Zenoh's own handshake. So in a process that
@@ -30,7 +30,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 
 class HandshakeLog:
-    """Zenoh's log, made before the first session. `stdout`: the descriptor it had."""
+    """Captures Zenoh's log; create it before any session. `stdout`: the original descriptor."""
 
     def __init__(self) -> None:
         import zenoh

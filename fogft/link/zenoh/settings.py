@@ -1,4 +1,18 @@
-"""Zenoh's configuration for both ends of a link: what is set, and why.
+"""Zenoh's configuration for both ends of a link, with reasons.
+
+Which of Zenoh's tasks run in which threads a variable says, which Zenoh reads once, when its first
+session opens. By default a message passes through three of Zenoh's thread pools on its way, and
+each hop wakes another thread. Callbacks need Python's lock anyway, so all that reads, routes and
+calls back runs in *one* thread, which loses little: a round trip of 8 bytes over loopback took
+168 us with one, 186 us with two and 257 to 271 us by default, and 133, 172 and 181 to 205 us of
+processor time (medians of 3000, on 2 cores). So a callback that blocked would stall every link of
+the process: none may.
+
+Sending and closing have threads of their own, although it costs nothing to do without them.
+Whoever sends something large holds a lock of its link while he waits for room there. When that
+link breaks, Zenoh's sending task and its closing of the link wait for that lock, and block their
+thread for up to `wait_before_close`: in the one thread, all other links would stand still as long.
+So each may be blocked by several links, and none by another.
 
 Owns: every Zenoh setting of fogft. Not here: sessions, and the certificates' contents
 (`fogft.pool.credentials.authority`).
@@ -7,6 +21,8 @@ Owns: every Zenoh setting of fogft. Not here: sessions, and the certificates' co
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import MutableMapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -64,11 +80,13 @@ def robot_settings(
 ) -> dict[str, Any]:
     """Return the settings of a robot's session towards one replica."""
     keys = f"{names.slot_prefix(peer.id.pool_uid, peer.id.slot)}/**"
+    # Of an IPv6 address in brackets Zenoh makes a name for TLS that is none; without, it reads it.
+    endpoint = peer.endpoint.replace("[", "").replace("]", "")
     return {
         **_common(settings),
         "mode": "client",
         "connect/endpoints": [
-            f"tls/{peer.endpoint}" + (f"#iface={peer.interface}" if peer.interface else "")
+            f"tls/{endpoint}" + (f"#iface={peer.interface}" if peer.interface else "")
         ],
         # One try: the link tries again, and knows when and why.
         "connect/timeout_ms": 0,
@@ -129,17 +147,15 @@ def replica_settings(
 
 
 def open_within(timeout_s: float) -> dict[str, Any]:
-    """Return the settings of a session that is given so long to open."""
+    """Return the settings with a time limit for opening the session."""
     return {"transport/unicast/open_timeout": round(timeout_s * 1e3)}
 
 
 def to_zenoh(settings: dict[str, Any]) -> zenoh.Config:
-    """Return settings as Zenoh takes them; call it before the process's first session."""
+    """Convert settings for Zenoh; call it before the process's first session."""
     import zenoh
 
-    from fogft.link.zenoh import runtime
-
-    runtime.prepare()
+    ask_for_threads()
     config: zenoh.Config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -190,3 +206,21 @@ def _access(
         "subjects": [{"id": "peer", **subject}],
         "policies": [{"rules": [rule[0] for rule in rules], "subjects": ["peer"]}],
     }
+
+
+VARIABLE = "ZENOH_RUNTIME"
+THREADS = (
+    "(rx: (worker_threads: 1), app: (handover: rx), acc: (handover: rx),"
+    " tx: (worker_threads: 8), net: (worker_threads: 8))"
+)
+
+
+def ask_for_threads(environ: MutableMapping[str, str] = os.environ) -> None:
+    """Configure these threads, unless the user has configured others."""
+    environ.setdefault(VARIABLE, THREADS)
+
+
+def forget_threads(environ: MutableMapping[str, str]) -> None:
+    """Remove our setting from the environment of another program that may use Zenoh."""
+    if environ.get(VARIABLE) == THREADS:
+        del environ[VARIABLE]

@@ -1,4 +1,4 @@
-"""This process's own TCP connections, seen beside Zenoh: whose they are, what flows, their end.
+"""This process's TCP connections, inspected and closed behind Zenoh's back.
 
 Zenoh opens the sockets and tells nothing of them. The kernel does: it lists the descriptors of
 this process and counts each connection's bytes. Where it does not (no Linux), nothing is found.
@@ -54,7 +54,7 @@ def _plain(host: str) -> str:
 
 
 def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
-    """Yield the connections whose own end is at a port: the peer, and a socket of ours to it."""
+    """Yield the connections at a local port: the peer, and a socket of ours to it."""
     for number in _numbers():
         connection = _duplicate(number)
         if connection is None:
@@ -67,7 +67,7 @@ def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
 
 
 def listening(port: int) -> socket.socket | None:
-    """Return a socket of ours to the one that listens at a port; None where there is none."""
+    """Return a socket that listens at a port; None if there is none."""
     for number in _numbers():
         connection = _duplicate(number)
         if connection is None:
@@ -87,7 +87,7 @@ def _listens(connection: socket.socket, port: int) -> bool:
 
 
 class OwnSocket:
-    """One connection of this process. It is looked up anew each time and held by nobody here."""
+    """One connection of this process. Looked up on each use and not kept open."""
 
     def __init__(self, own: Address, peer: Address) -> None:
         self._own = own
@@ -95,7 +95,7 @@ class OwnSocket:
         self._number = -1
 
     def borrow(self) -> socket.socket | None:
-        """Return a socket to it, to be closed at once: open, it holds the connection."""
+        """Return a duplicate of its socket, to be closed at once: it keeps the connection open."""
         for number in chain((self._number,), _numbers()):
             connection = _duplicate(number)
             if connection is None:
@@ -152,7 +152,7 @@ def _ends(connection: socket.socket) -> tuple[Address, Address] | None:
 
 
 def flow(connection: socket.socket) -> Flow | None:
-    """Return what the kernel counted on a connection; None where it does not tell."""
+    """Return the kernel's counters of a connection; None if it has none."""
     try:
         info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _WITH_UNSENT_BYTES)
         waiting = fcntl.ioctl(connection, termios.TIOCOUTQ, bytes(_COUNT.size))
@@ -176,20 +176,20 @@ def flow(connection: socket.socket) -> Flow | None:
 
 
 def takes_more(connection: socket.socket) -> bool:
-    """Whether the kernel would take more of what is sent now."""
+    """Whether the kernel's send buffer has room."""
     waiting = select.poll()
     waiting.register(connection, select.POLLOUT)
     return bool(waiting.poll(0))
 
 
 def keep_short(connection: socket.socket) -> None:
-    """Let little wait in the kernel, so that probes overtake what is large."""
+    """Limit unsent bytes in the kernel, so that probes overtake large messages."""
     with contextlib.suppress(OSError):
         connection.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
 
 
 def end_sending(connection: socket.socket) -> None:
-    """Send nothing more on a connection, whatever Zenoh is doing with it.
+    """Shut down sending on a connection, whatever Zenoh is doing with it.
 
     What its peer has not taken is dropped when the socket is closed: that is done by a thread of
     Zenoh's, which would wait for that peer up to 10 s (Zenoh's own SO_LINGER).
@@ -203,7 +203,7 @@ def end_sending(connection: socket.socket) -> None:
 
 
 def abort(connection: socket.socket) -> None:
-    """Abort a connection at both ends; where something is sent, see `end_sending`."""
+    """Abort a connection at both ends; while data is being sent, see `end_sending`."""
     _drop_when_closed(connection)
     _libc.connect(connection.fileno(), _NOWHERE, len(_NOWHERE))
 
@@ -214,7 +214,7 @@ def _drop_when_closed(connection: socket.socket) -> None:
 
 
 def abort_all(port: int, within_s: float) -> None:
-    """Abort the connections at a port of ours, once nothing flows or time is up."""
+    """Abort the connections at a local port once they are idle or time is up."""
     deadline = time.monotonic() + within_s
     seen: list[Flow | None] = []
     while time.monotonic() < deadline:
@@ -240,7 +240,7 @@ def _received(flows: list[Flow | None]) -> list[int]:
 
 
 def end(connection: socket.socket) -> None:
-    """End a connection at both of its ends at once. Where much flows, see `end_sending`."""
+    """Close a connection at both ends at once. Under load, see `end_sending`."""
     end_sending(connection)
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RD)

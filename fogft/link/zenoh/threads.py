@@ -1,4 +1,4 @@
-"""Zenoh's own threads, and ours that are inside Zenoh when the process ends.
+"""Zenoh's threads, and our threads inside Zenoh when the process exits.
 
 Zenoh's threads, which call our callbacks, must not send what might wait for room: only they can
 make room. They are few, and live as long as the process. So each keeps its Python thread state:
@@ -28,7 +28,7 @@ _idents: set[int] = set()
 
 
 def note() -> None:
-    """Note that this thread is Zenoh's. Called by each callback of requests and answers."""
+    """Mark this thread as Zenoh's. Called by each callback of requests and answers."""
     ident = threading.get_ident()
     if ident not in _idents:
         _idents.add(ident)
@@ -46,12 +46,12 @@ _leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
 
 
 def join_at_exit(thread: threading.Thread) -> None:
-    """Have the process wait for this thread when it ends. The thread must be about to end."""
+    """Have the process wait for this thread at exit. The thread must be about to end."""
     _leaving.add(thread)
 
 
 def close_session(session: Any) -> None:
-    """Close a Zenoh session. May take 10 s: so long Zenoh waits for a frozen peer."""
+    """Close a Zenoh session. May take 10 s, as Zenoh waits for a frozen peer."""
     try:
         session.close()
     except zenoh.ZError as error:  # that peer has data in flight
@@ -59,7 +59,7 @@ def close_session(session: Any) -> None:
 
 
 def close_aside(session: Any, name: str) -> threading.Thread:
-    """Close a Zenoh session in a thread of its own, which the process waits for when it ends."""
+    """Close a Zenoh session on its own thread, which the process waits for at exit."""
     closer = threading.Thread(target=close_session, args=(session,), name=name, daemon=True)
     closer.start()
     join_at_exit(closer)

@@ -1,4 +1,4 @@
-"""A worker thread for what Zenoh's threads must not do themselves.
+"""A worker thread for jobs that Zenoh's threads must not do themselves.
 
 Owns: what waits for it, and how much may. Not here: what there is to do (`control_queries`,
 `fogft.rmw_zenoh`).
@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import threading
+from collections import deque
 from collections.abc import Callable
+from functools import partial
 from queue import SimpleQueue
 
 import zenoh
@@ -17,44 +19,73 @@ from fogft.link.counters import Counters
 
 log = logging.getLogger(__name__)
 
-LIMIT = 1024  # probes, records and cancellations that wait; a robot has a few on the way
+LIMIT = 256  # jobs of one lane that wait; a robot has a few on the way
+LANES_LIMIT = 256
 
 
 class WorkQueue:
-    """A thread that does what it is given, in order. Only `join` blocks."""
+    """A thread that runs jobs: lanes take turns, each in its order. Only `join` blocks.
+
+    A lane belongs to whoever queues its jobs, so a busy sender delays only itself.
+    """
 
     def __init__(self, name: str, counters: Counters) -> None:
         self._counters = counters
         self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self.add = self._queue.put  # take a job in any case; the collector of garbage may, too
+        self._lock = threading.Lock()
+        self._lanes: dict[bytes, deque[Callable[[], None]]] = {}  # none is empty
+        self._closing = False
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
 
     def __len__(self) -> int:
-        return self._queue.qsize()
+        with self._lock:
+            return sum(map(len, self._lanes.values()))
 
     def start(self) -> None:
-        """Begin. What was given before waits until then."""
+        """Start the thread. Jobs queued earlier wait until then."""
         self._thread.start()
 
-    def offer(self, job: Callable[[], None]) -> bool:
-        """Take a job, unless too many wait: then count it; return whether it was taken."""
-        if len(self) >= LIMIT:
-            self._counters.add("control_queries_dropped")
-            return False
-        self._queue.put(job)
-        return True
+    def offer(self, job: Callable[[], None], lane: bytes = b"") -> bool:
+        """Queue a job; if its lane is full, count it and return False."""
+        with self._lock:
+            waiting = self._lanes.get(lane)
+            if waiting is not None and len(waiting) < LIMIT:
+                waiting.append(job)
+                return True
+            if waiting is None and len(self._lanes) < LANES_LIMIT and not self._closing:
+                self._lanes[lane] = deque((job,))
+                self._queue.put(partial(self._next, lane))
+                return True
+        self._counters.add("control_queries_dropped")
+        return False
+
+    def _next(self, lane: bytes) -> None:
+        """Run a lane's oldest job; its next one waits for the other lanes' turns."""
+        with self._lock:
+            waiting = self._lanes[lane]
+            job = waiting.popleft()
+            if waiting:
+                self._queue.put(partial(self._next, lane))
+            else:
+                del self._lanes[lane]
+        job()
 
     def close(self) -> None:
-        """Do what waits, then end."""
+        """Run the queued jobs, then end."""
+        self._closing = True
         self._queue.put(None)
 
     def join(self, timeout_s: float) -> None:
-        """Wait for its end, unless it is the worker that asks."""
+        """Wait for the thread to end, unless called by it."""
         if threading.current_thread() is not self._thread:
             self._thread.join(timeout_s)
 
     def _work(self) -> None:
-        while (job := self._queue.get()) is not None:
+        while (job := self._queue.get()) is not None or self._lanes:
+            if job is None:  # after what waits
+                self._queue.put(None)
+                continue
             try:
                 job()
             except zenoh.ZError as error:  # the session is closed, or who asked is gone

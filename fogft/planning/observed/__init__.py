@@ -1,4 +1,4 @@
-"""What observations mean: health, history, backoff, prices that expire. Pure.
+"""Conclusions from observations: health, history, backoff, expiring prices. Pure.
 
 Not here: what to do about them (`fogft.planning`).
 """

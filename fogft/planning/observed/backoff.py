@@ -1,4 +1,4 @@
-"""How long a location is left alone after failures. Pure.
+"""How long a location is avoided after failures. Pure.
 
 A location sells spot machines and on-demand ones; each supply backs off by itself. Failures are
 refused launches (no capacity, no quota), launches that failed, and replicas that died young. After
@@ -25,7 +25,6 @@ from operator import itemgetter
 from typing import NamedTuple
 
 from fogft.model.reason import Cause
-from fogft.planning.observed.expiring import Expiring
 from fogft.planning.observed.history import OWN_FAULTS, Failure, History
 
 BASE_S = 5.0
@@ -39,7 +38,7 @@ _AT = itemgetter(0)
 
 
 class Backoff(NamedTuple):
-    """A supply that must not be tried yet.
+    """A supply that is not to be tried yet.
 
     Attributes:
         since: Of the last failure, in seconds since the epoch.
@@ -54,29 +53,16 @@ class Backoff(NamedTuple):
     since: float = 0.0
 
 
-class _Outlook(NamedTuple):
-    """What a supply's failures and proofs say of it.
+class _Supply(NamedTuple):
+    """What happened at a supply within FORGIVE_S, in order of time.
 
     Attributes:
-        pause: Whatever was the pool file's fault is left out.
-        backoff_changes: When it ends or gets shorter; infinity where there is none.
-        setup: The failures that are the pool file's fault, those of late among them.
-        recent_failure: It has failed of late, and not proved itself since.
+        lately: Its failures.
+        bad: Those since it last proved itself.
     """
 
-    pause: Backoff | None
-    backoff_changes: float
-    setup: Sequence[Failure]
-    recent_failure: Backoff | None
-
-
-class _Supplies(NamedTuple):
-    """The outlooks of all supplies together."""
-
-    backing_off: Mapping[str, Backoff]
-    backoff_changes: float
-    setup: Sequence[Failure]
-    recently_failed: Mapping[str, Backoff]
+    lately: Sequence[Failure]
+    bad: Sequence[Failure]
 
 
 def backing_off(history: History, now: float) -> Mapping[str, Backoff]:
@@ -84,13 +70,9 @@ def backing_off(history: History, now: float) -> Mapping[str, Backoff]:
 
     The key `EVERYWHERE` means that nothing may be launched at all.
     """
-    supplies = history.of_places(history.failures, _outlook, _summed_up, now)
-    everywhere = _everywhere(history, supplies.setup, now) if supplies.setup else None
-    return (
-        supplies.backing_off
-        if everywhere is None
-        else {**supplies.backing_off, EVERYWHERE: everywhere}
-    )
+    supplies = _supplies(history, now)
+    pauses, everywhere = _pauses(supplies, now), _everywhere(history, supplies, now)
+    return pauses if everywhere is None else {**pauses, EVERYWHERE: everywhere}
 
 
 def recently_failed(history: History, now: float) -> Mapping[str, Backoff]:
@@ -98,49 +80,50 @@ def recently_failed(history: History, now: float) -> Mapping[str, Backoff]:
 
     Only the last failure counts.
     """
-    return history.of_places(history.failures, _outlook, _summed_up, now).recently_failed
+    return _recent(_supplies(history, now))
 
 
-def _outlook(history: History, supply: str, now: float) -> Expiring[_Outlook | None]:
-    lately, until = _lately(history.failures[supply], now)
-    if not lately:
-        return Expiring(None, until)
-    proven_at = history.proven_at(supply)
-    bad = lately if lately[0].at > proven_at else [f for f in lately if f.at > proven_at]
-    setup = [f for f in lately if f.cause in OWN_FAULTS]
-    pause = _backoff([f for f in bad if f.cause not in OWN_FAULTS] if setup else bad, now)
-    backoff_changes = NEVER if pause is None else min([pause.until, *_shortened(lately, pause)])
-    recent_failure = None
-    if bad:
-        last = bad[-1]
-        recent_failure = Backoff(last.at + FORGIVE_S, 1, last.cause, since=last.at)
-    if history.failures[supply][-1].at <= now:  # to forgive the others changes a pause at most
-        until = lately[-1].at + FORGIVE_S
-    until = min(until, backoff_changes)
-    return Expiring(_Outlook(pause, backoff_changes, setup, recent_failure), until)
+def _recent(supplies: Mapping[str, _Supply]) -> Mapping[str, Backoff]:
+    last = {supply: one.bad[-1] for supply, one in supplies.items() if one.bad}
+    return {
+        supply: Backoff(failure.at + FORGIVE_S, 1, failure.cause, since=failure.at)
+        for supply, failure in last.items()
+    }
 
 
-def _summed_up(outlooks: Mapping[str, _Outlook]) -> _Supplies:
-    backing_off, recently_failed = {}, {}
-    setup: list[Failure] = []
-    change = NEVER
-    for supply, one in outlooks.items():
-        if one.pause is not None:
-            backing_off[supply] = one.pause
-            change = min(change, one.backoff_changes)
-        if one.recent_failure is not None:
-            recently_failed[supply] = one.recent_failure
-        setup += one.setup
-    return _Supplies(backing_off, change, setup, recently_failed)
+def _supplies(history: History, now: float) -> Mapping[str, _Supply]:
+    """Return the supplies with a failure that is not forgiven."""
+    found = {}
+    for supply, failures in history.failures.items():
+        if failures[-1].at <= now - FORGIVE_S:  # as of most: there may be thousands
+            continue
+        first = bisect_right(failures, now - FORGIVE_S, key=_AT)
+        lately = failures[first : bisect_right(failures, now, key=_AT)]
+        if lately:
+            proven_at = history.proven_at(supply)
+            found[supply] = _Supply(lately, [f for f in lately if f.at > proven_at])
+    return found
 
 
-def _everywhere(history: History, setup: Sequence[Failure], now: float) -> Backoff | None:
-    proven_at = max(history.proven_at(place) for place in history.failures)
-    return backoff([f for f in setup if f.at > proven_at], now)
+def _pauses(supplies: Mapping[str, _Supply], now: float) -> dict[str, Backoff]:
+    """Return who backs off by itself: what was the pool file's fault is left out."""
+    found = {
+        supply: backoff([f for f in one.bad if f.cause not in OWN_FAULTS], now)
+        for supply, one in supplies.items()
+    }
+    return {supply: pause for supply, pause in found.items() if pause is not None}
+
+
+def _everywhere(history: History, supplies: Mapping[str, _Supply], now: float) -> Backoff | None:
+    setup = [f for one in supplies.values() for f in one.lately if f.cause in OWN_FAULTS]
+    if not setup:
+        return None
+    proven_at = max(map(history.proven_at, history.failures))
+    return backoff(sorted([f for f in setup if f.at > proven_at], key=_AT), now)
 
 
 def backing_off_longest(backing_off: Iterable[tuple[str, Backoff]], now: float) -> str | None:
-    """Return the supply to try although it backs off, as all do; None to wait.
+    """Return the supply to try although all are backing off; None to wait.
 
     Only what had no room is tried: a full account or a launch that fails does not get better by it.
     """
@@ -151,28 +134,7 @@ def backing_off_longest(backing_off: Iterable[tuple[str, Backoff]], now: float) 
     return min(full, default=(0.0, None))[1]
 
 
-def _lately(failures: Sequence[Failure], now: float) -> tuple[Sequence[Failure], float]:
-    """Return those that still count, of failures in order of time, and until when it is those."""
-    if not failures or failures[-1].at <= now - FORGIVE_S:
-        return (), NEVER
-    first = end = len(failures)
-    until = NEVER
-    while end and failures[end - 1].at > now:
-        end -= 1
-        until = failures[end].at
-    while first and failures[first - 1].at > now - FORGIVE_S:
-        first -= 1
-    if first < end:
-        until = min(until, failures[first].at + FORGIVE_S)
-    return failures[first:end], until
-
-
-def backoff(failures: list[Failure], now: float) -> Backoff | None:
-    """Return the pause that a run of failures earns, or None when it is over."""
-    return _backoff(sorted([f for f in failures if 0 <= now - f.at < FORGIVE_S], key=_AT), now)
-
-
-def _backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
+def backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
     """Return the pause that failures earn, of which none is forgiven, in order of time."""
     if not recent:
         return None
@@ -183,13 +145,13 @@ def _backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
 
 
 def backoff_s(failures: int, cause: Cause | None = None) -> float:
-    """Return how long so many failures in a row make a supply back off, in seconds."""
+    """Return how long a supply backs off after this many failures in a row, in seconds."""
     base_s = NO_ROOM_S if cause is Cause.CAPACITY else BASE_S
     return min(base_s * 2.0 ** min(max(failures, 1) - 1, 16), LIMIT_S)
 
 
 def lost_lately(history: History, now: float) -> Mapping[str, float]:
-    """Return where a replica was lost within NO_ROOM_S, and until when that counts.
+    """Return where replicas were lost within NO_ROOM_S, and until when that counts.
 
     Such a location is used only when no other is left: it has hardly room again.
     """
@@ -202,33 +164,29 @@ def lost_lately(history: History, now: float) -> Mapping[str, float]:
 
 
 def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:
-    """Return when, if nothing happens, another location may be chosen; infinity for never.
+    """Return when, without new events, another location may be chosen; infinity for never.
 
     Args:
         waits: For the end of a pause; see `Plan`.
         restless: Somebody could be better off elsewhere.
     """
-    supplies = history.of_places(history.failures, _outlook, _summed_up, now)
+    supplies = _supplies(history, now)
+    everywhere = _everywhere(history, supplies, now)
     times: list[float] = []
-    if supplies.setup:
-        times += _everywhere_changes(history, supplies.setup, now)
+    if everywhere is not None:
+        lately = [f for one in supplies.values() for f in one.lately]
+        times += [everywhere.until, *_shortened(lately, everywhere)]
     if waits:
-        pauses = backing_off(history, now)
-        last = max([pause.since for pause in pauses.values()], default=-NEVER)
-        times += [supplies.backoff_changes, last + EAGER_S]
+        pauses = _pauses(supplies, now)
+        for supply, pause in pauses.items():
+            times += [pause.until, *_shortened(supplies[supply].lately, pause)]
+        since = [pause.since for pause in (*pauses.values(), *filter(None, [everywhere]))]
+        times.append(max(since, default=-NEVER) + EAGER_S)
     if restless:
-        times += [pause.until for pause in supplies.recently_failed.values()]
+        times += [pause.until for pause in _recent(supplies).values()]
     if waits or restless:  # a stand-in does not return to where one was just lost
         times += lost_lately(history, now).values()
     return min([at for at in times if at > now], default=NEVER)
-
-
-def _everywhere_changes(history: History, setup: Sequence[Failure], now: float) -> Sequence[float]:
-    pause = _everywhere(history, setup, now)
-    if pause is None:
-        return ()
-    lately = [f for failures in history.failures.values() for f in _lately(failures, now)[0]]
-    return (pause.until, *_shortened(lately, pause))
 
 
 def _shortened(lately: Iterable[Failure], pause: Backoff) -> Sequence[float]:

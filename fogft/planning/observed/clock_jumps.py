@@ -1,4 +1,4 @@
-"""Tell when the clock on the wall was set, and when the machine slept. Pure: readings come in.
+"""Detect that the wall clock was set, or that the machine slept. Pure: readings come in.
 
 All that is remembered bears the time of the clock on the wall, for that outlives a process and a
 reboot. When somebody sets it, a launch under way would look late, a rest over, a stay long
@@ -41,7 +41,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Jump:
-    """What the clock on the wall gained between two looks, beyond the time that passed.
+    """How far the wall clock jumped between two readings.
 
     Attributes:
         set_s: By so much it was set: forward above 0, back below.
@@ -53,7 +53,7 @@ class Jump:
 
     @property
     def reason(self) -> Reason:
-        """What happened."""
+        """The jump as a reason: the clock was set, or the machine slept."""
         slept = Reason(Cause.SLEPT, seconds=self.slept_s)
         if not self.set_s:
             return slept
@@ -82,7 +82,7 @@ class Watch:
 
     @property
     def doubt_s(self) -> float:
-        """By how much the clock was set within the last minute: schedules go without it so long."""
+        """How far the clock was set within the last minute, in which schedules ignore it."""
         while self._last is not None and self._set:
             if self._last.awake_s - self._set[0][0] < DOUBT_S:
                 break

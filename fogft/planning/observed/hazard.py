@@ -1,4 +1,4 @@
-"""How often spot machines were lost at each location, learned from this pool's own past. Pure.
+"""Loss rates of spot machines at each location, learned from this pool's history. Pure.
 
 The rate is (PRIOR_LOSSES + losses) / (PRIOR_S + seconds lived there), what is longer ago
 counting for less: by half after HALF_LIFE_S. So a location that nobody was in has the
@@ -34,7 +34,7 @@ def hazards(history: History, now: float) -> Mapping[str, float]:
 
 
 def as_of(now: float) -> float:
-    """Return the time as of which rates are worked out."""
+    """Return the time as of which rates are computed."""
     return now // EVERY_S * EVERY_S
 
 
@@ -56,7 +56,7 @@ def _weight(age_s: float) -> float:
 
 
 def penalty(per_hour: float) -> float:
-    """Return what a rate adds to a score: the logarithm of what it makes an hour dearer by."""
+    """Return the penalty of a loss rate in a score: the logarithm of the added cost."""
     return math.log1p(LOSS_COSTS_H * per_hour)
 
 

@@ -1,4 +1,4 @@
-"""Judge every replica from what the cloud and the links say. Pure.
+"""Judge the health of every replica from its cloud and its links. Pure.
 
 The cloud says whether a machine exists; the links say whether it answers. Neither alone
 replaces anything: a machine that the cloud lists and that is silent may be behind a dead
@@ -39,7 +39,7 @@ HINT_PAUSE_S = 600.0
 
 
 class Verdict(str, Enum):
-    """What a replica is good for."""
+    """The verdict on a replica."""
 
     GOOD = "good"  # serves, will serve, or nothing can be said against it
     FAILED = "failed"  # its launch has failed, or took longer than `start_limit_s`
@@ -56,7 +56,7 @@ _RUNNING, _READY, _GOOD = MachinePhase.RUNNING, Phase.READY, Verdict.GOOD
 
 
 class Assessment(NamedTuple):
-    """One of our machines with all that is known and decided of it.
+    """A machine with everything known and decided about it.
 
     Attributes:
         record: What is remembered of it; None for nothing.
@@ -88,17 +88,17 @@ class Assessment(NamedTuple):
 
     @property
     def placement(self) -> Placement:
-        """Where it runs, and on what."""
+        """Its location and instance type."""
         return self.machine.placement
 
     @property
     def why(self) -> Reason | None:
-        """Why it is replaced, or what is wrong with it."""
+        """Why it is replaced, or its problem."""
         return self.unwanted or self.fault
 
     @property
     def is_outdated(self) -> bool:
-        """Whether it is replaced for its version alone."""
+        """Whether it is replaced only because of its version."""
         return self.unwanted is not None and self.unwanted.cause is Cause.OUTDATED
 
     @property
@@ -118,17 +118,17 @@ class Assessment(NamedTuple):
 
     @property
     def draining_since(self) -> float | None:
-        """When it was marked to go."""
+        """When it was marked to end."""
         return self.record.draining_since if self.record is not None else None
 
     @property
     def marked_at(self) -> float:
-        """When it was marked to go; infinity for never: who was marked first goes first."""
+        """When it was marked to end, for sorting; infinity for never."""
         return math.inf if self.draining_since is None else self.draining_since
 
 
 class Health(NamedTuple):
-    """The whole pool, judged; ordered by replica.
+    """The health of a pool's replicas, ordered by replica.
 
     Attributes:
         uplink_suspected: All links that once answered are silent together.
@@ -141,12 +141,12 @@ class Health(NamedTuple):
 
     @property
     def running(self) -> int:
-        """How many have not failed."""
+        """The number of replicas that have not failed."""
         return sum(judged.verdict is not Verdict.FAILED for judged in self.replicas)
 
 
 def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
-    """Judge what is observed. Machines of other pools are left out."""
+    """Judge the observed replicas. Machines of other pools are left out."""
     links = {report.id: report for report in observed.links or ()}
     ours, heard = [], []
     for machine in sorted(observed.machines or (), key=by_id):
@@ -174,7 +174,7 @@ def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -
 
 
 def was_heard(link: LinkReport, record: Record | None) -> bool:
-    """Whether this replica ever answered: by its link, or by an earlier proxy's report."""
+    """Whether this replica ever answered, by its link or an earlier proxy's report."""
     if link.state is not _CONNECTING:
         return True
     ever_ready = record is not None and record.first_ready_at is not None
@@ -182,7 +182,7 @@ def was_heard(link: LinkReport, record: Record | None) -> bool:
 
 
 def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
-    """Whether a replica answers all that it was launched for.
+    """Whether a replica answers all its services.
 
     An outdated one was launched for other services, so answering any counts. One of a changed file
     that lists none need answer what it offers itself, until most of its kind have told.

@@ -1,4 +1,4 @@
-"""What happened to each replica, as a list of events, and what follows from it.
+"""The history of a pool's replicas: events, and the facts derived from them.
 
 The cloud's list says what is; history says what was: which generations are used up,
 who was ever ready, which locations failed, and since when a replica drains. It is
@@ -16,21 +16,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from operator import itemgetter
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import ClassVar, NamedTuple
 
 from fogft.model.choices import MAX_REPLICAS
 from fogft.model.plain import Moment
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import supply
-from fogft.planning.observed.expiring import Expiring, TtlCache, outdate
 
-T = TypeVar("T")
-S = TypeVar("S")
 _AT = itemgetter(0)
 
 
 class EventKind(str, Enum):
-    """What can happen to a replica."""
+    """The kinds of events."""
 
     LAUNCH = "launch"  # written before the cloud is asked: the generation is used from here on
     REFUSED = "refused"  # the cloud said no: capacity, quota or an error
@@ -53,7 +50,7 @@ _ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
 
 @dataclass(frozen=True)
 class Event:
-    """One thing that happened.
+    """One event in the history.
 
     Attributes:
         at: Seconds since the epoch.
@@ -85,7 +82,7 @@ _PROOFS = 2 * MAX_REPLICAS  # of a version's failed launches
 
 @dataclass
 class Record:
-    """What the events say of one launch. Times in seconds since the epoch; None for never."""
+    """Facts about one launch. Times in seconds since the epoch; None for never."""
 
     slot: int
     generation: int
@@ -103,7 +100,7 @@ class Record:
     fault: Reason = _NO_FAULT
 
     def move(self, by_s: float) -> None:
-        """Let all of it be later."""
+        """Shift all times, because the clock was set."""
         self.launched_at += by_s
         self.closed_at += by_s
         if self.first_ready_at is not None:
@@ -115,19 +112,19 @@ class Record:
 
     @property
     def supply(self) -> str:
-        """What it was bought from; see `Placement.supply`."""
+        """The supply that it came from; see `Placement.supply`."""
         return supply(self.location, on_demand=self.on_demand)
 
 
 class Failure(NamedTuple):
-    """A location disappointed: it refused, a launch failed there, or a replica died young."""
+    """A failure of a location: it refused a launch, a launch failed, or a replica died early."""
 
     at: float
     cause: Cause
 
 
 def fault_of(reason: Reason | None) -> Cause:
-    """Return the cause of a failure: of a time-out, what did not come."""
+    """Return the cause of a failure; for a time-out, the phase that took too long."""
     if reason is None:
         return Cause.ERROR
     awaited = reason.because[0].cause if reason.because else reason.cause
@@ -152,9 +149,6 @@ class History:
         self._fruitless: dict[str, list[Record]] = {}  # by version: failed for a reason of its own
         self._ready_versions: set[str] = set()
         self._launches: dict[bool, list[Record]] = {False: [], True: []}  # by market, of late
-        # What follows from failures and proofs of each supply, and from losses at each location.
-        self._of_supplies: dict[Callable[..., Any], TtlCache[Any, Any]] = {}
-        self._of_losses: dict[Callable[..., Any], TtlCache[Any, Any]] = {}
         for event in events:
             self.add(event)
 
@@ -204,16 +198,16 @@ class History:
         }
         self._losses = {p: [at + by_s for at in losses] for p, losses in self._losses.items()}
         self._proven_at = {supply: at + by_s for supply, at in self._proven_at.items()}
-        self._of_supplies, self._of_losses, self._of_lives = {}, {}, {}
+        self._of_lives = {}
 
     def by_clock(self, instant: float) -> float:
-        """Return a time that was written down as the clock tells it now, if it was set since."""
+        """Convert a recorded time to today's clock, which may have been set since."""
         for old, by_s in self._set:
             instant += by_s if instant <= old else 0.0
         return instant
 
     def followed_by(self, events: Iterable[Event]) -> History:
-        """Return this history with launches and marks added; it stays as it is itself."""
+        """Return a copy of this history with launches and marks added."""
         later = History()
         later._records, later._open = dict(self._records), dict(self._open)
         later._generations = dict(self._generations)
@@ -221,12 +215,11 @@ class History:
         # Launches and marks change none of these.
         later._failures, later._proven_at = self._failures, self._proven_at
         later._losses, later._served = self._losses, self._served
-        later._of_supplies, later._of_losses = self._of_supplies, self._of_losses
         later._fruitless, later._ready_versions = self._fruitless, self._ready_versions
         later._launches = dict(self._launches)
         for event in events:
             if event.kind not in _ORDERS:
-                raise ValueError(f"`{event.kind.value}` is none of our own orders")
+                raise ValueError(f"`{event.kind.value}` is not an order of fogft")
             key = (event.slot, event.generation)
             if key in later._records:
                 later._records[key] = replace(later._records[key])
@@ -246,8 +239,6 @@ class History:
             if record.generation > self._served.get(record.slot, 0):
                 self._served[record.slot] = record.generation
             self._proven_at[record.supply] = event.at
-            if self._failures and record.supply in self._failures:
-                outdate(self._of_supplies, record.supply)
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
         elif kind is EventKind.DRAINING:
@@ -275,26 +266,23 @@ class History:
             if died_young(record, event):
                 self._fail(record, event)
             insort(self._losses.setdefault(record.location, []), event.at)
-            outdate(self._of_losses, record.location)
         record.closed = kind
         record.closed_at = event.at
 
     def _fail(self, record: Record, event: Event) -> None:
-        supply = record.supply
-        outdate(self._of_supplies, supply)
         failure = Failure(event.at, fault_of(event.reason))
-        insort(self._failures.setdefault(supply, []), failure, key=_AT)
+        insort(self._failures.setdefault(record.supply, []), failure, key=_AT)
 
     def record(self, slot: int, generation: int) -> Record | None:
-        """Return what is known of a launch."""
+        """Return the record of a launch."""
         return self._records.get((slot, generation))
 
     def open(self) -> list[Record]:
-        """Return the launches that have not ended, as far as was seen."""
+        """Return the launches that are not known to have ended."""
         return list(self._open.values())
 
     def places_alone(self) -> History:
-        """Return what is known of places alone, with which a pool begins anew."""
+        """Return the facts about locations alone, as for a new pool."""
         anew = History()
         anew._failures, anew._proven_at = self._failures, self._proven_at
         anew._lives, anew._losses = self._lives, self._losses
@@ -302,7 +290,7 @@ class History:
 
     @property
     def locations(self) -> frozenset[str]:
-        """Every location that anything was launched in."""
+        """Every location with a launch."""
         return frozenset(record.location for record in self._records.values())
 
     def generation(self, slot: int) -> int:
@@ -314,7 +302,7 @@ class History:
         return self._served.get(slot, 0)
 
     def fruitless(self, version: str) -> Sequence[Record]:
-        """Return the launches of a version that failed for a reason of its own, oldest first."""
+        """Return the launches of a version that failed by its own fault, oldest first."""
         return self._fruitless.get(version, ()) if version else ()
 
     def was_ready(self, version: str) -> bool:
@@ -322,7 +310,7 @@ class History:
         return version in self._ready_versions
 
     def proofs(self) -> set[tuple[int, int]]:
-        """Return the launches that tell whether a version ever served: slot and generation."""
+        """Return the launches that prove whether a version ever served: slot and generation."""
         failed = [record for records in self._fruitless.values() for record in records[-_PROOFS:]]
         ready = {r.version: r for r in self._records.values() if r.version in self._ready_versions
                  and r.first_ready_at is not None}  # fmt: skip
@@ -343,36 +331,13 @@ class History:
         return self._failures
 
     def proven_at(self, supply: str) -> float:
-        """Return when a replica from there last became ready; minus infinity for never."""
+        """Return when a replica there last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
-
-    def of_places(
-        self,
-        places: Mapping[str, Any],
-        work_out: Callable[[History, str, float], Expiring[T | None]],
-        sum_up: Callable[[Mapping[str, T]], S],
-        now: float,
-    ) -> S:
-        """Return what follows from the failures and proofs, or the losses, of places, summed up.
-
-        Args:
-            places: This history's `failures` or `losses`.
-            work_out: Pure, and looks at nothing else of a history. It is asked again only when
-                it may say something else. None says nothing.
-            sum_up: Pure; always the same for one `work_out`.
-            now: Seconds since the epoch.
-        """
-        caches = self._of_losses if places is self._losses else self._of_supplies
-        cache = caches.get(work_out)
-        if cache is None:
-            cache = caches[work_out] = TtlCache(set(places), sum_up)
-        whole: S = cache.at(now, lambda place: work_out(self, place, now))
-        return whole
 
     def of_lives(
         self, work_out: Callable[[Sequence[Record], float], float], at: float
     ) -> Mapping[str, float]:
-        """Return what follows from the spot machines that lived at each location, as of a time.
+        """Return the cached summary of spot machines' lives at each location, as of a time.
 
         Args:
             work_out: Pure, and always the same. It is asked again for another time, and after a
@@ -386,7 +351,7 @@ class History:
 
     @property
     def losses(self) -> Mapping[str, list[float]]:
-        """Location -> when replicas were lost there unasked, oldest first."""
+        """Location -> times of losses there, oldest first."""
         return self._losses
 
 
@@ -394,7 +359,7 @@ YOUNG_S = 60.0
 
 
 def died_young(record: Record, event: Event) -> bool:
-    """Whether a loss speaks against the location: never ready, or ready for under a minute."""
+    """Whether a loss counts against the location: never ready, or ready for under a minute."""
     return record.first_ready_at is None or event.at - record.first_ready_at < YOUNG_S
 
 
@@ -405,7 +370,7 @@ def compacted(
     *,
     history: History | None = None,
 ) -> list[Event]:
-    """Drop what no decision needs any more.
+    """Drop events that no decision needs any more.
 
     Kept whole: launches that are open, or to which something happened within `keep_s`.
     Kept in part: the latest launch of each slot, so that generations stay used; the latest failed

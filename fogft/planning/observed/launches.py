@@ -1,4 +1,4 @@
-"""Which version is not launched any more, and how many launches an hour there may be. Pure.
+"""Which versions are no longer launched, and the limit of launches per hour. Pure.
 
 A version (`replica_hash`) whose launches fail for its own reasons is given up: once a slot has had
 GIVE_UP_AFTER launches of it that failed so, and none of it was ever ready anywhere. Nothing of it
@@ -24,7 +24,7 @@ HOUR_S = 3600.0
 
 
 def given_up(history: History, version: str, since: float) -> Reason | None:
-    """Return why a version is not launched any more; None while it is.
+    """Return why a version is no longer launched; None while it is.
 
     Args:
         history: What happened.
@@ -40,7 +40,7 @@ def given_up(history: History, version: str, since: float) -> Reason | None:
 
 
 def within_an_hour(history: History, now: float, *, on_demand: bool) -> Sequence[Record]:
-    """Return the launches of one market within the last hour that have come to a machine."""
+    """Return the launches of one market within the last hour that got a machine."""
     return [
         record
         for record in history.launches(on_demand=on_demand)

@@ -1,4 +1,4 @@
-"""Whom a cloud with a memory is asked about: replicas whose links have fallen silent. Pure.
+"""Which replicas a caching cloud is asked about: those whose links fell silent. Pure.
 
 Such a cloud's list may still show what was preempted, so the silence of a link is a reason to
 look; and to look only, since the answer may well be that the machine is there. So nobody waits
@@ -49,7 +49,7 @@ class Silent:
         self._asked: dict[ReplicaId, _Asked] = {}
 
     def due(self, observed: Observed, history: History) -> list[ReplicaId]:
-        """Return whom to ask about now; they count as asked."""
+        """Return the replicas to ask about now; they count as asked."""
         silent = _silent(observed, history)
         self._asked = {
             id: asked

@@ -1,4 +1,4 @@
-"""Which services a pool offers whose file lists none: what most of its replicas advertise. Pure.
+"""Service discovery for pool files that list none: services most replicas advertise. Pure.
 
 One replica's word changes nothing: it may be broken, or in wrong hands. What was agreed on is kept
 as long as the pool's replicas run the same: a replica that dies, or all of them, takes no name from
@@ -23,7 +23,7 @@ from fogft.model.spec import ServiceSpec
 
 @dataclass(frozen=True)
 class Discovered:
-    """What was found.
+    """The discovered services.
 
     Attributes:
         spec_hash: Of the replicas that told it.
@@ -34,7 +34,7 @@ class Discovered:
     services: Mapping[Line, Line] = field(default_factory=dict)
 
     def specs(self, namespace: str = "") -> tuple[ServiceSpec, ...]:
-        """Return those below a namespace, with the policy of a service of which no file speaks."""
+        """Return the services below a namespace, with default policies."""
         return tuple(
             ServiceSpec(name, kind)
             for name, kind in sorted(self.services.items())
@@ -44,7 +44,7 @@ class Discovered:
 
 @dataclass(frozen=True)
 class Claims:
-    """What replicas of one hash say that they offer.
+    """The services that replicas of one hash advertise.
 
     Attributes:
         count: How many offer a service: its name and type.
@@ -55,11 +55,11 @@ class Claims:
     voters: int
 
     def agreed(self) -> dict[str, str]:
-        """Return name -> type of what more than half of the voters offer."""
+        """Return name -> type of the services that more than half of the replicas offer."""
         return {name: kind for (name, kind), n in self.count.items() if 2 * n > self.voters}
 
     def outvoted(self) -> list[str]:
-        """Return the names of which that cannot be said, sorted."""
+        """Return the names of the other services, sorted."""
         return sorted({name for name, _ in self.count} - self.agreed().keys())
 
 
@@ -70,7 +70,7 @@ def claims(
     links: Sequence[LinkReport],
     wanted: int,
 ) -> Claims:
-    """Return what the replicas of a hash offer now.
+    """Return the services that replicas of a hash advertise now.
 
     Where nothing is known yet, the machines that there are decide, for others may not be had; later
     on as many as are wanted, so that one that is left alone for a while cannot.
@@ -86,7 +86,7 @@ def claims(
 
 
 def grown(known: Discovered, spec_hash: str, now: Mapping[str, str]) -> Discovered:
-    """Return what is known after replicas of a hash agreed on this."""
+    """Return the discovered services extended by what replicas of a hash agree on."""
     if not now:
         return known
     before = known.services if known.spec_hash == spec_hash else {}

@@ -1,24 +1,32 @@
-"""Change what a pool aims for besides its file: `scale`, `drain`, `exclude`, `include`, `retry`.
+"""Change a running pool besides its file: scale, drain, exclude, retry, certificates.
 
-Each writes the new intent under the pool's lock and returns; the manager, now or when
-there is one again, acts on it.
+`scale`, `drain`, `exclude`, `include` and `retry` write the new intent under the pool's lock and
+return; the manager, now or when there is one again, acts on it. Certificates that are revoked or
+rotated are waited for until that has taken effect.
 
-Owns: reading, changing and writing the intent as one step.
-Not here: what the operations mean (`fogft.model.intent`).
+Owns: reading, changing and writing the intent as one step; revoking and rotating.
+Not here: what the operations mean (`fogft.model.intent`), bundles (`joining`), the CA and its
+ledger (`fogft.pool.credentials`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
 
 from fogft import disk
 from fogft.cloud.port import Cloud
 from fogft.errors import FogftError, PoolBusy, known_slots
 from fogft.model import intent
+from fogft.model.credentials import Holder, Role
 from fogft.model.intent import Intent
-from fogft.pool.commands.status import read
+from fogft.pool.commands.status import read, slots
+from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
+from fogft.pool.manager import configuration
+from fogft.pool.manager.process_control import wait_for
 from fogft.poolfile.tree import nearest
 
 
@@ -29,7 +37,7 @@ def change(store: PoolStore, step: Callable[[Intent], Intent]) -> tuple[Intent, 
         before = store.intent()
         if before.stopping:
             raise PoolBusy(
-                f"pool `{store.name}` is being ended",
+                f"pool `{store.name}` is being shut down",
                 "let `fogft down` finish, then start it again with `fogft up`",
             )
         after = step(before)
@@ -45,7 +53,7 @@ def drain(store: PoolStore, slot: int, now: float) -> int:
 
 
 def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
-    """Keep out of a location; return whether that is new."""
+    """Exclude a location; return whether that is new."""
     identity, place = store.identity(), intent.checked_location(location)
     resources = store.spec().task.get("resources") or {}
     sold = [offer.placement for offer in cloud.offers(resources)]
@@ -67,7 +75,7 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
     found = [replica.generation for replica in status.replicas if replica.slot == slot]
     if not found and any(replica.slot == slot for replica in status.by_hand):
         raise FogftError(
-            f"the replica in slot {slot} of `{status.pool}` was started by hand",
+            f"the replica in slot {slot} of `{status.pool}` was started manually",
             f"end it on its own machine; `fogft credentials revoke replica {slot}` locks it out",
         )
     if not found:
@@ -76,3 +84,57 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
             f"pool `{status.pool}` has no replica in slot {slot}", f"slots with a replica: {known}"
         )
     return max(found)
+
+
+PUBLISH_LIMIT_S = 10.0
+
+
+def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Holder], bool]:
+    """Revoke certificates; return their holders, and whether the pool has been told.
+
+    A replica that is revoked is replaced, too.
+    """
+    store.identity()
+    ledger = Ledger(store.paths.credentials)
+    holders = ledger.named(role, name)
+    ledger.revoke(holders)
+    for holder in holders if role is Role.REPLICA else ():
+        drained = partial(intent.drain, slot=int(holder.name), generation=holder.generation)
+        change(store, drained)
+    return holders, _published(store, holders)
+
+
+def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:
+    """Give this machine's client proxy new credentials, and revoke the old ones once the new
+    ones are in use; return the new holder, the old ones, and whether that has happened.
+    """
+    ledger = Ledger(store.paths.credentials)
+    holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
+    old = [h for h in ledger.named(Role.ROBOT, holder.name) if h != holder]
+    in_use = wait_for(lambda: _in_use(store.paths, holder), PUBLISH_LIMIT_S)
+    if in_use and old:
+        ledger.revoke(old)
+        _published(store, old)
+    return holder, old, in_use
+
+
+def _in_use(paths: PoolPaths, holder: Holder) -> bool:
+    """Whether the client proxy reports that all its links use this certificate."""
+    report = disk.read_json(paths.proxy_status)
+    return isinstance(report, dict) and report.get("certificate") == holder.common_name
+
+
+def rotate_replicas(store: PoolStore, slot: int | None = None) -> list[str]:
+    """Replace replicas, new before old, each with a new key; return which."""
+    chosen = slots(store.paths) if slot is None else [slot]
+    return [f"{one}.{drain(store, one, time.time())}" for one in chosen]
+
+
+def _published(store: PoolStore, holders: Sequence[Holder]) -> bool:
+    names = {holder.common_name for holder in holders}
+
+    def told() -> bool:
+        membership = store.membership()
+        return membership is not None and names <= membership.revoked
+
+    return told() or (disk.is_locked(store.paths.manager_lock) and wait_for(told, PUBLISH_LIMIT_S))

@@ -33,16 +33,16 @@ def pools() -> list[str]:
 
 
 def is_exported(name: str) -> bool:
-    """Tell whether another machine manages a pool that this one managed."""
+    """Whether a pool of this machine was exported to another one."""
     return PoolPaths.of(name).exported.exists()
 
 
 def paths_of(name: str | None = None) -> PoolPaths:
-    """Return where the pool that is named is kept, else the only one there is."""
+    """Return the paths of the named pool, or of the only one."""
     known = pools()
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
-        raise PoolNotFound(f"there are {len(known)} pools: {listed}", "say which one you mean")
+        raise PoolNotFound(f"there are {len(known)} pools: {listed}", "name the one you mean")
     if name is not None and name not in known and not is_exported(name):
         hint = f"there are: {listed}" if known else "start one with `fogft up FILE`"
         raise PoolNotFound(f"there is no pool `{name}`", hint)
@@ -52,7 +52,7 @@ def paths_of(name: str | None = None) -> PoolPaths:
 
 
 def store_of(name: str | None = None) -> PoolStore:
-    """Return the store of the pool that is named, else of the only one; see `paths_of`."""
+    """Return the store of the named pool, or of the only one; see `paths_of`."""
     return make_store(paths_of(name).folder.name)
 
 
@@ -70,7 +70,7 @@ def make_cloud(name: str, base: Path) -> Cloud:
         known = ", ".join(f"`{cloud}`" for cloud in CLOUDS)
         raise CloudError(
             f"there is no cloud `{name}`",
-            f"there are: {known}; `sky` stands for all real ones, which the pool file names",
+            f"there are: {known}; `sky` stands for all real clouds, which the pool file names",
         )
     if name == SKY:
         from fogft.cloud import sky
@@ -87,7 +87,7 @@ def cloud_of(identity: Identity) -> Cloud:
 
 
 def cloud_named_by(spec: PoolSpec, source: str, file: Path) -> str:
-    """Return the one of `CLOUDS` that a pool file's resources name, else `local`."""
+    """Return which of `CLOUDS` a pool file's resources name, else `local`."""
     from fogft.model.names import NO_VM_CLOUDS, VM_CLOUDS
     from fogft.poolfile import named_clouds
 

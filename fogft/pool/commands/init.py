@@ -21,7 +21,7 @@ POOL_FILE = "pool.yaml"
 
 
 def examples() -> dict[str, str]:
-    """Return what can be copied: name and one line of description, by name."""
+    """Return the examples: name and one line of description, by name."""
     found = {}
     for pool in sorted(template_files.folder().glob(f"*/{POOL_FILE}")):
         comments = pool.read_text(encoding="utf-8").split("\n", 3)

@@ -1,4 +1,4 @@
-"""What is in a join bundle, and how it becomes a part of the pool on this machine.
+"""Join bundles: their content, and how `fogft join` sets a machine up from one.
 
 The bundle brings all that a proxy needs: configuration, certificate and key, the CA, and
 the membership as it was. It is used once: the file is destroyed when it has been opened, a
@@ -26,7 +26,7 @@ from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.membership import Found, to_dict
 from fogft.model.names import Endpoint
-from fogft.model.plain import from_plain, stored
+from fogft.model.plain import from_plain
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.pool.credentials import bundle, claiming
@@ -45,7 +45,7 @@ _FLAT = (Role.REPLICA, Role.RENDEZVOUS)  # their credentials lie beside their co
 
 @dataclass(frozen=True)
 class Joined:
-    """What `join` has set up.
+    """The result of a `join`.
 
     Attributes:
         config: The configuration to start with: ``fogft <command> --config <config>``.
@@ -62,11 +62,11 @@ class Joined:
 def issue(
     store: PoolStore, role: Role, name: str, passphrase: str, now: float, *, open_for_s: float
 ) -> tuple[Holder, bytes]:
-    """Certify the next generation of a holder; return it, and its sealed bundle."""
+    """Certify the next generation of a holder; return it with its sealed bundle."""
     identity, spec = store.identity(), store.spec()
     if role is Role.REPLICA and not _is_by_hand(name):
         raise CredentialError(
-            f"`{name}` is no slot for a replica that is started by hand",
+            f"`{name}` is not a slot for a replica that is started manually",
             f"use {FIRST_BY_HAND} to {LAST_BY_HAND}: the manager launches those below, and "
             "certifies them itself",
         )
@@ -92,7 +92,7 @@ def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
     add = "add `fogft.rendezvous` to the pool file and run `fogft up`"
     if role is Role.REPLICA and Found.of(spec) is Found.BY_CLOUD:
         raise CredentialError(
-            f"nobody could find replica `{name}`: no rendezvous could tell where it is",
+            f"replica `{name}` could not be found: the pool has no rendezvous",
             f"{add}, or `fogft.dial_in`, where it dials the robot",
         )
     if role in (Role.ROBOT, Role.GATEWAY) and Found.of(spec) is Found.BY_DOOR:
@@ -141,7 +141,7 @@ def join(
     *,
     claim: Callable[[Holder, str, list[str], CredentialPaths], None] = claiming.claim,
 ) -> Joined:
-    """Set this machine up from a bundle, and destroy the bundle.
+    """Set this machine up from a bundle, and delete the bundle.
 
     `claim` sees that no other machine has joined with it.
 
@@ -173,11 +173,11 @@ def join(
 
 @contextlib.contextmanager
 def used_once(root: Path, label: Label) -> Iterator[None]:
-    """Remember a bundle as used on this machine, if what is done meanwhile succeeds."""
+    """Record a bundle as used on this machine if the body succeeds."""
     used = root / "joined" / "used.json"
     disk.make_folder(used.parent)
     with disk.locked(used.with_suffix(".lock")):
-        ids = stored(list[str], disk.read_json(used) or [], f"`{used}` is damaged")
+        ids = disk.read_as(list[str], used) or []
         if label.id in ids:
             raise CredentialError(
                 f"this bundle for `{label.holder.short}` was already used on this machine",
@@ -212,31 +212,31 @@ def read(file: Path) -> bytes:
 
 
 def check_name(name: str, depth: int = 2) -> None:
-    """See that a file's name stays below its folder."""
+    """Check that a file name stays below its folder."""
     parts = PurePosixPath(name).parts
     safe = parts and all(part.strip(".") and "\0" not in part for part in parts)
     if not safe or len(parts) > depth or name.startswith("/"):
-        raise ValueError(f"a file with an odd name: {name!r:.60}")
+        raise ValueError(f"a file with an unexpected name: {name!r:.60}")
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a bundle brings: files by their harmless names, and where a rendezvous is."""
+    """The content of a bundle: files by checked names, and the rendezvous."""
 
     files: Mapping[Annotated[str, check_name], str]
     rendezvous: tuple[Endpoint, ...] = ()
 
 
 def read_content(content: dict[str, Any]) -> Content:
-    """Return what a bundle brings."""
+    """Return the content of a bundle."""
     try:
         return from_plain(Content, content)
     except ValueError as error:
-        raise CredentialError(f"the bundle holds what cannot be used: {error}") from error
+        raise CredentialError(f"the bundle's content is invalid: {error}") from error
 
 
 def destroy(file: Path) -> None:
-    """Remove a bundle that was used."""
+    """Delete a used bundle."""
     try:
         file.unlink()
     except OSError as error:

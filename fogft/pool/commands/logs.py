@@ -1,4 +1,4 @@
-"""Which logs a pool has: its manager's, its client proxy's, and one for each launch.
+"""The logs of a pool: manager, client proxy, and one for each launch.
 
 Owns: finding them.
 Not here: reading and following them (`fogft.cli.status`).

@@ -1,4 +1,4 @@
-"""Move a pool to another machine: its CA, its history and what it aims for, in one sealed file.
+"""Move a pool to another machine: CA, history, spec and intent in one sealed file.
 
 Replicas are not touched and go on answering. From the export on no manager starts for the pool on
 the old machine and no command changes it. Managers on the new one take epochs of a later term, so
@@ -54,7 +54,7 @@ def export(
     open_for_s: float,
     told: Callable[[str], None] = lambda _: None,
 ) -> Identity:
-    """Seal a pool into a file, and manage it here no more; return what it is.
+    """Seal a pool into a file and stop managing it here; return its identity.
 
     The client proxy of this machine goes on, so that requests are answered meanwhile; where a
     service is stateful it ends, since only one robot may order its requests.
@@ -123,7 +123,7 @@ def _files(paths: PoolPaths, identity: Identity, root: Path) -> Iterator[tuple[s
 def import_(
     file: Path, passphrase: str, root: Path, now: float, *, pool_file: Path | None = None
 ) -> PoolStore:
-    """Take a pool over from its file, and destroy the file; return the pool, without a manager yet.
+    """Take over a pool from its file, and delete the file; return it, still without a manager.
 
     Args:
         root: The folder of all of fogft's state.
@@ -148,7 +148,8 @@ def import_(
         except PoolNotFound:
             pass
         except PoolBusy:  # exported from here
-            if stored(Identity, disk.read_json(paths.exported), "").uid != was.uid:
+            ours = disk.read_as(Identity, paths.exported)
+            if ours is None or ours.uid != was.uid:
                 raise
         else:
             raise FogftError(

@@ -1,4 +1,4 @@
-"""What became of an `up`: whether its pool answers, still starts, or cannot answer. Pure.
+"""The outcome of an `up`: the pool answers, is still starting, or cannot answer. Pure.
 
 Owns: the verdict on a status.
 Not here: looking and waiting (`fogft.cli.progress`).
@@ -18,7 +18,7 @@ HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
 
 
 class Outcome(Enum):
-    """What an `up` has led to."""
+    """The possible outcomes of an `up`."""
 
     PENDING = auto()
     ANSWERING = auto()
@@ -30,7 +30,7 @@ class Outcome(Enum):
 
 @dataclass(frozen=True)
 class Awaited:
-    """What an `up` waits for.
+    """The condition that an `up` waits for.
 
     Attributes:
         services: Their names; empty for those that will be discovered.
@@ -43,7 +43,7 @@ class Awaited:
     digest: str = ""
 
     def outcome(self, seen: Seen, *, is_last: bool = False) -> Outcome:
-        """Judge a status; `is_last` where no time is left to wait for the end of an update."""
+        """Return the outcome for a status; `is_last` if no time is left to wait for an update."""
         if self.is_updating(seen) and not is_last:
             hopeless = seen.status.applied == self.digest and keeps_ending(seen)
             return Outcome.RUN_KEEPS_ENDING if hopeless else Outcome.PENDING
@@ -58,7 +58,7 @@ class Awaited:
         return Outcome.ANSWERING if self.is_answering(seen) else Outcome.PENDING
 
     def is_updating(self, seen: Seen) -> bool:
-        """Whether the update that is waited for has yet to end."""
+        """Whether the awaited update is still in progress."""
         if not self.digest:
             return False
         update = seen.status.update
@@ -83,7 +83,7 @@ class Awaited:
 
 @dataclass(frozen=True)
 class Settled:
-    """What a `scale` or a `drain` waits for: the pool is whole, and nothing leaves any more.
+    """The condition that `scale` and `drain` wait for: all replicas ready, none leaving.
 
     Attributes:
         since: When the change was written, in seconds since the epoch.
@@ -94,7 +94,7 @@ class Settled:
     gone: tuple[int, int] | None = None
 
     def outcome(self, seen: Seen, *, is_last: bool = False) -> Outcome:
-        """Judge a status, the last one like any other."""
+        """Return the outcome for a status."""
         del is_last
         status = seen.status
         leaving = [
@@ -108,13 +108,13 @@ class Settled:
 
 
 def is_given_up(seen: Seen) -> bool:
-    """Whether nothing is launched any more, and nothing that was launched may still serve."""
+    """Whether launching was given up, and no launched replica may still become ready."""
     gave_up = any(reason.cause is Cause.NEVER_READY for reason in seen.status.reasons)
     return gave_up and not seen.status.replicas
 
 
 def keeps_ending(seen: Seen) -> bool:
-    """Whether `run` has ended so often on every replica that waiting longer is no use."""
+    """Whether `run` has exited so often on every replica that waiting is pointless."""
     replicas = seen.status.replicas
     return bool(replicas) and not any(
         replica.phase == Phase.READY.value or replica.restarts < HOPELESS_RESTARTS

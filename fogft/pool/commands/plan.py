@@ -1,4 +1,4 @@
-"""What a pool file would cost and give, explained. Nothing is launched."""
+"""Plan a pool file and explain its cost and availability. Nothing is launched."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LEAST_LAUNCHES = 5  # fewer say little
 
 @dataclass(frozen=True)
 class PlanShown:
-    """A plan with what it rests on.
+    """A plan with the data that it is based on.
 
     Attributes:
         cloud: The adapter or the table that the prices are from.
@@ -59,7 +59,7 @@ def plan_file(
     offline: bool = False,
     told: Callable[[str], None] = lambda _: None,
 ) -> PlanShown:
-    """Return the plan of a pool file, from nothing. Touches no cloud but for prices and distances.
+    """Plan a pool file from scratch. Queries clouds for prices and distances only.
 
     Prices are of the cloud that its resources name, else `local`, unless told; `prices` is a table
     in place of a cloud. Offline no distance is measured; `told` hears of what takes long.
@@ -156,14 +156,14 @@ LEAST_S = 60.0
 
 @dataclass(frozen=True)
 class Measured:
-    """What was counted of one service."""
+    """The measured traffic of one service."""
 
     traffic: TrafficSpec
     over_s: float
 
 
 def measured(proxy_status: Path, pool_uid: str) -> dict[str, Measured]:
-    """Return what was counted of each service; those of which nothing is known are left out."""
+    """Return the measured traffic of each service that has any."""
     report = proxy_report.read(proxy_status, pool_uid)
     if report is None or not report.uptime_s >= LEAST_S:
         return {}

@@ -1,4 +1,4 @@
-"""What `up` is about to do with a pool file, before anything is changed.
+"""Preview what `up` would do with a pool file, before anything is changed.
 
 Owns: the placements that a new pool would get, and what a changed file changes.
 Not here: doing it (`startup`) and saying it (`fogft.cli`).
@@ -36,7 +36,7 @@ from fogft.reason_words import words
 
 @dataclass(frozen=True)
 class Preview:
-    """What applying a pool file would do.
+    """The effect of applying a pool file.
 
     Attributes:
         launches: Of a new pool; by slot. Of one that exists: what it would get if it were new.
@@ -65,19 +65,19 @@ class Preview:
 
     @property
     def usd_per_hour(self) -> float:
-        """What the launches cost together."""
+        """The total price of the launches."""
         return sum(launch.offer.usd_per_hour for launch in self.launches)
 
     @property
     def digest(self) -> str:
-        """What names the file's text in a pool's status."""
+        """The digest that identifies the file's text in a pool's status."""
         return digest(self.source.encode())
 
 
 def order(
     file: Path, cloud: str | None = None, *, told: Callable[[str], None] = lambda _: None
 ) -> Preview:
-    """Read and judge a pool file, and find out what applying it would do. Changes nothing.
+    """Read and check a pool file, and preview its effect. Changes nothing.
 
     It runs on the cloud that its resources name, else `local`, unless told; `told` hears of what
     takes long.
@@ -108,12 +108,12 @@ def order(
                     allow_from=spec.allow_from,
                 )
             except CloudError as error:
-                notes.append(f"what a VM is given cannot be told now: {error.message}")
+                notes.append(f"it is unknown now which files a VM gets: {error.message}")
         try:
             sold = offers.ask(concrete, spec)
             notes += concrete.left_out() if isinstance(concrete, Accounts) else ()
         except CloudError as error:
-            notes.append(f"prices cannot be had now: {error.message}")
+            notes.append(f"prices are not available now: {error.message}")
     except SpecError as error:
         raise located(error, source, file) from None
     if before is None:
@@ -165,7 +165,7 @@ def _tested(
     except CloudError as error:
         if not may_fail:
             raise
-        return {}, [f"credentials cannot be tested now: {error.message}"]
+        return {}, [f"credentials cannot be checked now: {error.message}"]
     usable = sorted(name for name, problem in accounts.items() if not problem)
     if not usable and not may_fail:
         listed = "\n".join(f"  `{name}`: {problem}" for name, problem in accounts.items())
@@ -177,7 +177,7 @@ def _tested(
 
 
 def checks_here() -> Checks:
-    """Return what only this machine can tell: which types are installed, and what they hold."""
+    """Return the checks that depend on this machine: installed types and their fields."""
     from fogft.ros.comparison import check_tolerances
     from fogft.ros.messages import check_ok_field
     from fogft.ros.state_bytes import check_state
@@ -187,7 +187,7 @@ def checks_here() -> Checks:
 
 
 def mistakes(file: Path) -> list[SpecError]:
-    """Return all that is wrong in a pool file, by line.
+    """Return all mistakes in a pool file, by line.
 
     What real clouds think of `resources` is left to `fogft plan` and `fogft up`, which ask them.
     """

@@ -50,7 +50,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class Services:
-    """Where unit files are, and whose: the machine's, which starts them at boot, or this user's."""
+    """The folder of unit files and their owner: the system, or this user."""
 
     system: bool
     folder: Path
@@ -63,7 +63,7 @@ class Services:
                 ["systemctl", *scope, *words], capture_output=True, text=True, check=False
             )
         except FileNotFoundError:
-            raise FogftError("this machine has no systemd", "start each process by hand") from None
+            raise FogftError("this machine has no systemd", "start each process yourself") from None
 
 
 def services(*, system: bool, environ: Mapping[str, str] = os.environ) -> Services:
@@ -142,7 +142,7 @@ def environment(environ: Mapping[str, str] = os.environ) -> str:
 
 
 def install(where: Services, units: Sequence[Unit]) -> list[str]:
-    """Write units and their environment, have them started now and at each boot.
+    """Write units and their environment, and have them started now and at each boot.
 
     Returns what systemd said against it; nothing where they were started.
     """
@@ -160,17 +160,17 @@ def install(where: Services, units: Sequence[Unit]) -> list[str]:
 
 
 def yield_to(paths: PoolPaths) -> None:
-    """End the manager and the standby that systemd did not start: its own take their places."""
+    """End the manager and the standby not started by systemd; its own replace them."""
     for lock in (paths.manager_lock, paths.standby_lock):
         process_control.end_holder(lock)
 
 
 def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
-    """Have the client proxy that systemd did not start give way to one that it did.
+    """Have the client proxy not started by systemd hand over to one that was.
 
     Told to end, it hands over to whoever stands by: that one is waited for, so no request is lost.
     """
-    old = process_control.lock_holder(paths.proxy_lock)
+    old = disk.holder(paths.proxy_lock)
     if old is None:
         return
     if process_control.wait_for(lambda: disk.is_locked(paths.standby_lock), STANDBY_LIMIT_S):
@@ -186,11 +186,11 @@ def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
 
 
 def installed(where: Services, names: Sequence[str] = ()) -> list[str]:
-    """Return the units that `install` wrote, or those of these names that are there."""
+    """Return the installed units, or those of these names that exist."""
     if not where.folder.is_dir():
         return []
     found = sorted(where.folder.glob("fogft-*.service"))
-    ours = [path.name for path in found if path.read_text().startswith(MARK)]
+    ours = [path.name for path in found if (disk.read_bytes(path) or b"").startswith(MARK.encode())]
     return [name for name in ours if not names or name in names]
 
 

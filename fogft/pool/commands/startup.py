@@ -1,4 +1,4 @@
-"""What `up` does: lay the pool's folder down, or change what is in it, and start its manager.
+"""What `up` does: create or change the pool's folder, and start its manager.
 
 Everything is written before the identity, which comes last: a pool exists once that
 stands. So an `up` that was cut short is an `up` that never was.
@@ -47,7 +47,7 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
     disk.make_folder(paths.folder)
     with disk.locked(paths.intent_lock):
         if not paths.intent_lock.exists():
-            raise PoolBusy(f"pool `{spec.name}` has just been ended", "run `fogft up` again")
+            raise PoolBusy(f"pool `{spec.name}` has just been shut down", "run `fogft up` again")
         try:
             identity = read_identity(paths)
         except PoolNotFound:
@@ -96,33 +96,47 @@ def _check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> N
         )
 
 
-def manager_version(paths: PoolPaths) -> str:
-    """Return by which version of fogft a pool's manager runs; empty where it has said nothing."""
+def manager_version(paths: PoolPaths, pid: int | None = None) -> str:
+    """Return the fogft version of a pool's manager; empty if unknown.
+
+    Args:
+        pid: Its process: what another one has written does not count.
+    """
     said = disk.read_json(paths.status)
-    if not isinstance(said, dict):
+    if not isinstance(said, dict) or (pid is not None and said.get("manager_pid", pid) != pid):
         return ""
     return str(said.get("manager_version", "before 0.2.0"))
 
 
 def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None = None) -> bool:
-    """See to it that the pool has a manager of this version; return whether one was started."""
+    """Ensure that the pool has a manager of this version; return whether one was started.
+
+    What has only just started is asked for its version first: it may be what another `up`, which
+    ended the same old manager, has started.
+    """
     paths = store.paths
-    if disk.is_locked(paths.manager_lock):
-        if manager_version(paths) in ("", __version__):
-            return False
-        process_control.end_holder(paths.manager_lock)
     name = paths.folder.name
     words = command(name) if command else [sys.executable, "-m", "fogft", "manager", name]
-    child = detached(words, paths.manager_log)
+    child = None
     end = time.monotonic() + MANAGER_LIMIT_S
     while time.monotonic() < end:
-        if process_control.lock_holder(paths.manager_lock) == child.pid:
+        pid = disk.holder(paths.manager_lock)
+        if child is not None and pid == child.pid:
             return True
-        if child.poll() is not None:
-            if disk.is_locked(paths.manager_lock):  # another `up` was faster
+        if pid is not None:
+            version = manager_version(paths, pid)
+            if version == __version__:
                 return False
+            if version:
+                process_control.end_holder(paths.manager_lock, only=pid)
+                continue
+        elif child is None:
+            child = detached(words, paths.manager_log)
+        elif child.poll() is not None:
             break
         time.sleep(process_control.POLL_S)
+    if disk.is_locked(paths.manager_lock):  # it cannot write its status: `status` says why
+        return False
     raise FogftError(
         f"the manager of `{name}` did not start:\n{logfile.tail(paths.manager_log)}",
         f"see `{paths.manager_log}`, and run `fogft doctor`",

@@ -1,4 +1,4 @@
-"""What is known of a pool now, each part from whoever knows it.
+"""The status of a pool now, each part from its best source.
 
     status.json (manager) ──► machines, prices, what is wanted ──┐
     proxy-status.json (client proxy) ──► links, counters ────────┼──► Seen
@@ -15,12 +15,16 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+import typing
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from enum import Enum
+from types import NoneType, UnionType
 from typing import Any
 
 from fogft import disk
 from fogft.errors import PoolNotFound, StateError
+from fogft.model.reason import Reason
 from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import proxy_report, status
@@ -34,7 +38,7 @@ STALE_AFTER_S = 15.0
 
 @dataclass(frozen=True)
 class Seen:
-    """A status with what its reader must know of it.
+    """A status with its age and the processes that are alive.
 
     Attributes:
         age_s: Since the manager observed the pool; None when it has not yet.
@@ -54,18 +58,18 @@ class Seen:
 
     @property
     def lease_left_s(self) -> float | None:
-        """Seconds until the first replica shuts down where no manager runs; None if not known."""
+        """Seconds until the first replica shuts down without a manager; None if unknown."""
         rows = (*self.status.replicas, *self.status.by_hand)
         known = [one.lease_left_s for one in rows if one.lease_left_s is not None]
         return min(known, default=None)
 
     @property
     def stale(self) -> bool:
-        """Whether what the manager last saw says nothing of now."""
+        """Whether the manager's last observation is too old."""
         return self.age_s is None or self.age_s > STALE_AFTER_S
 
     def to_json(self) -> dict[str, Any]:
-        """Return `status.json`'s schema with the keys that this adds."""
+        """Return the JSON form: that of `status.json` with the keys added here."""
         own = {name: value for name, value in vars(self).items() if name != "status"}
         return {**self.status.to_json(), **own, "unanswered": list(self.unanswered)}
 
@@ -79,7 +83,7 @@ def current(
     now: float,
     heard_since: float | None = None,
 ) -> Seen:
-    """Return what is known now.
+    """Return the status now.
 
     Args:
         heard_since: Only a link whose replica has answered a probe since then counts as up;
@@ -114,7 +118,7 @@ def _heard(link: LinkReport, written_at: float, since: float) -> LinkReport:
 
 
 def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> Seen:
-    """Return what is known of a pool now; `heard_since` is as of `current`."""
+    """Return the status of a pool now; `heard_since` as in `current`."""
     raw = disk.read_json(paths.status)
     seen = _unobserved(paths) if raw is None else status.from_json(raw, paths.status)
     return current(
@@ -128,7 +132,7 @@ def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> S
 
 
 def checked(paths: PoolPaths, limit_s: float) -> Seen:
-    """Wait until each link has had its probe answered from now on, and return what holds then.
+    """Wait until each link has answered a new probe, and return the status then.
 
     The client proxy probes all links by itself, at least once a second; a link that has not had
     an answer within `limit_s` counts as suspect.
@@ -146,7 +150,7 @@ def checked(paths: PoolPaths, limit_s: float) -> Seen:
 
 
 def every(names: Iterable[str], now: float) -> Iterator[tuple[str, Seen | StateError]]:
-    """Yield what is known of each pool; an error of one hides no other."""
+    """Yield the status of each pool; an error in one does not hide others."""
     for name in names:
         try:
             yield name, read(PoolPaths.of(name), now)
@@ -157,7 +161,7 @@ def every(names: Iterable[str], now: float) -> Iterator[tuple[str, Seen | StateE
 
 
 def renewed(paths: PoolPaths, limit_s: float = 15.0) -> Seen:
-    """Have the manager look again, and return what it saw; without one what was seen last."""
+    """Have the manager observe the pool again; return its status, or without one the last."""
     asked_at = time.time()
     deadline = time.monotonic() + limit_s
     with contextlib.suppress(OSError):
@@ -185,3 +189,57 @@ def _unobserved(paths: PoolPaths) -> PoolStatus:
 
     identity = read_identity(paths)
     return PoolStatus(identity.name, identity.uid, identity.cloud, identity.file)
+
+
+_PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
+
+
+def status_schema() -> dict[str, Any]:
+    """Return the schema."""
+    definitions: dict[str, Any] = {}
+    own = _object(PoolStatus, definitions)
+    of_reader = _object(Seen, definitions)
+    properties = {**own["properties"], **of_reader["properties"]}
+    del properties["status"]  # what it holds stands beside the others
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "fogft status --json",
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "$defs": definitions,
+    }
+
+
+def _object(cls: type[Any], definitions: dict[str, Any]) -> dict[str, Any]:
+    hints = typing.get_type_hints(cls)
+    # A reason has the data that belongs to its cause; everything else has all of its keys.
+    required = ["cause"] if cls is Reason else [field.name for field in fields(cls)]
+    properties = {}
+    for field in fields(cls):
+        properties[field.name] = _form(hints[field.name], definitions)
+        words = field.metadata.get("words")
+        if words is not None:
+            properties[field.name]["enum"] = list(words)
+    return {"type": "object", "properties": properties, "required": required}
+
+
+def _form(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
+    if hint in _PLAIN:
+        return {"type": _PLAIN[hint]}
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return {"anyOf": [_form(one, definitions) for one in arguments]}
+    if origin in (Sequence, tuple):
+        return {"type": "array", "items": _form(arguments[0], definitions)}
+    if origin is Mapping:
+        return {"type": "object"}
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return {"type": "string", "examples": [one.value for one in hint]}
+    if isinstance(hint, type) and is_dataclass(hint):
+        name = hint.__name__
+        if name not in definitions:
+            definitions[name] = {}  # a name for those that contain themselves
+            definitions[name] = _object(hint, definitions)
+        return {"$ref": f"#/$defs/{name}"}
+    raise TypeError(f"`{hint}` has no JSON form")

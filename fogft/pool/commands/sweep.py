@@ -1,4 +1,4 @@
-"""Machines of this user's pools that no manager owns, and their end on request.
+"""Find and end machines of this user's pools that no manager owns.
 
 A manager owns a machine while it holds its pool's lock on this computer. Whatever else is
 listed costs money that nobody watches: the pool's folder was lost, its manager was ended for
@@ -27,7 +27,7 @@ _NAMED = 5  # in a sentence
 
 @dataclass(frozen=True)
 class Unowned:
-    """A machine that nobody looks after."""
+    """A machine without a manager."""
 
     machine: Machine
     why: str
@@ -36,7 +36,7 @@ class Unowned:
 
 @dataclass(frozen=True)
 class Swept:
-    """What was found in one cloud.
+    """The machines found in one cloud.
 
     Attributes:
         cloud: Its name, one of `composition.CLOUDS`.
@@ -48,17 +48,17 @@ class Swept:
 
 
 def clouds_used() -> list[str]:
-    """Return the clouds where this user's machines can be, as far as is known here."""
+    """Return the clouds known to this machine that may have this user's machines."""
     return [LOCAL, *([SKY] if (home() / SKY).exists() else [])]
 
 
 def sweep_cloud(name: str) -> Swept:
-    """Return the machines of this user's pools in a cloud that no manager owns."""
+    """Return the machines in a cloud that belong to this user's pools but have no manager."""
     return swept(name, make_cloud(name, Path.cwd()))
 
 
 def swept(name: str, cloud: Cloud) -> Swept:
-    """Do the same with the cloud of that name."""
+    """Do the same for a cloud given by name."""
     if not isinstance(cloud, Auditing):
         raise FogftError(f"cloud `{name}` cannot be swept")
     audit = cloud.audit()
@@ -73,7 +73,7 @@ def swept(name: str, cloud: Cloud) -> Swept:
 
 
 def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
-    """Return, for who starts a pool, what still runs of one of this name whose folder is lost.
+    """Return a warning about running machines of an earlier pool of this name; else empty.
 
     Its keys were in that folder: no manager can take these machines over.
     """
@@ -94,7 +94,7 @@ def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
 
 
 def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
-    """End machines, one after the other; return what went wrong.
+    """End machines one by one; return the errors.
 
     One that a manager has taken over meanwhile is left alone.
     """

@@ -51,7 +51,7 @@ class Credential:
 
 @dataclass(frozen=True)
 class Description:
-    """What a certificate says, for people. Times are in UTC; the serial is hexadecimal."""
+    """The fields of a certificate, for people. Times are in UTC; the serial is hexadecimal."""
 
     common_name: str
     role: str
@@ -60,7 +60,7 @@ class Description:
     not_after: datetime.datetime
 
     def problem(self, now: datetime.datetime) -> str:
-        """Return what is wrong with its validity at `now`, or an empty text."""
+        """Return the problem with its validity at `now`, or an empty text."""
         if now < self.not_before:
             return f"not valid before {self.not_before:%Y-%m-%d %H:%M} UTC"
         if now >= self.not_after:
@@ -69,7 +69,7 @@ class Description:
 
 
 def create_authority(folder: Path, pool_uid: str) -> None:
-    """Make the pool's CA in a folder, which is made too. An existing CA is kept."""
+    """Create the pool's CA in a folder, which is created too. An existing CA is kept."""
     from cryptography.hazmat.primitives.asymmetric import ec
 
     if (folder / AUTHORITY_CERTIFICATE).exists():
@@ -86,7 +86,7 @@ def create_authority(folder: Path, pool_uid: str) -> None:
 
 
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
-    """Make a key and have the folder's CA certify it, under a name of 1 to 64 characters.
+    """Create a key, certified by the folder's CA under a name of 1 to 64 characters.
 
     Args:
         days: How long it is valid from now; never beyond the CA's own end.
@@ -119,12 +119,12 @@ def write(credential: Credential, folder: Path, stem: str) -> None:
 
 
 def describe(path: Path) -> Description:
-    """Return what a certificate file says of itself."""
+    """Return the fields of a certificate file."""
     return _described(_load_certificate(path))
 
 
 def is_good(path: Path, now: datetime.datetime, revoked: frozenset[str] = frozenset()) -> bool:
-    """Whether a certificate is there, is not revoked, and lasts for two months more."""
+    """Whether a certificate exists, is not revoked, and is valid for two more months."""
     try:
         said = describe(path)
     except CredentialError:
@@ -133,7 +133,7 @@ def is_good(path: Path, now: datetime.datetime, revoked: frozenset[str] = frozen
 
 
 def describe_pem(pem: bytes) -> Description:
-    """Return what a certificate says of itself."""
+    """Return the fields of a PEM certificate."""
     from cryptography import x509
 
     try:
@@ -244,7 +244,7 @@ def _load_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePri
         raise CredentialError(
             f"the key of the pool's CA, `{path}`, cannot be used: {_reason(error)}",
             "without it no replica can be launched; recreate the pool "
-            "with `fogft down` and `fogft up`",
+            "with `fogft down`, then `fogft up`",
         ) from None  # the cause could quote the file
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise CredentialError(f"`{path}` is not an EC key")

@@ -39,7 +39,7 @@ _Name = Annotated[str, only(lambda text: text.isprintable() and 0 < len(text) <=
 
 @dataclass(frozen=True)
 class Label:
-    """What a bundle says of itself before it is opened. Times in seconds since the epoch."""
+    """The label of a bundle, readable before it is opened. Times in seconds since the epoch."""
 
     id: _Name
     pool: _Name
@@ -49,17 +49,17 @@ class Label:
 
     @property
     def holder(self) -> Holder:
-        """Whom it is for."""
+        """The holder that the bundle is for."""
         return holder_of(self.common_name)
 
 
 def new_passphrase() -> str:
-    """Return a passphrase of 98 random bits that can be read out over the telephone."""
+    """Return a passphrase of 98 random bits that is easy to dictate."""
     return "-".join("".join(secrets.choice(_ALPHABET) for _ in range(4)) for _ in range(5))
 
 
 def check_passphrase(passphrase: str) -> None:
-    """See that a passphrase is long enough."""
+    """Check that a passphrase is long enough."""
     if len(passphrase.strip()) < PASSPHRASE_LEAST:
         raise CredentialError(
             f"the passphrase is shorter than {PASSPHRASE_LEAST} characters",
@@ -87,7 +87,7 @@ def seal(label: Label, content: Mapping[str, Any], passphrase: str) -> bytes:
 
 
 def read_label(data: bytes) -> Label:
-    """Return what a bundle says of itself. Nothing of it is proved before it is opened."""
+    """Return a bundle's label. It is unverified until the bundle is opened."""
     return _parse(data)[0]
 
 
@@ -107,14 +107,14 @@ def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[s
             "it was shown by the command that made this file",
         ) from None
     except ValueError:
-        raise CredentialError("the bundle's content cannot be read") from None
+        raise CredentialError("the bundle's content is unreadable") from None
     if now >= label.open_until:
         raise CredentialError(
             f"this bundle for `{label.holder.short}` expired at {_utc(label.open_until)}",
             f"by this machine's clock it is {_utc(now)}; if that is right, have a new one issued",
         )
     if not isinstance(content, dict):
-        raise CredentialError("the bundle's content cannot be read")
+        raise CredentialError("the bundle's content is unreadable")
     return label, content
 
 
@@ -124,7 +124,7 @@ def _parse(data: bytes) -> tuple[Label, dict[str, Any], bytes]:
             raise ValueError("it is too large")
         raw = json.loads(data)
         if not isinstance(raw, dict) or type(raw.get("fogft_bundle")) is not int:
-            raise ValueError("it says so nowhere")
+            raise ValueError("it has no `fogft_bundle`")
         if raw["fogft_bundle"] != VERSION:
             raise ValueError(f"it is of version {raw['fogft_bundle']}, not {VERSION}")
         label = from_plain(Label, raw)

@@ -1,4 +1,4 @@
-"""Use a join bundle up for everybody: who opens it says so at the rendezvous, before all else.
+"""Claim a join bundle at the rendezvous before it is used, so that it is used only once.
 
 The claim is the holder's own record, signed with the key that the bundle brings: whoever
 joined has spoken under that name and generation, and everybody keeps that. A second machine
@@ -18,7 +18,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.errors import CredentialError
 from fogft.model.credentials import CredentialPaths, Holder, Role
-from fogft.model.plain import stored, to_plain
+from fogft.model.plain import to_plain
 from fogft.records.client import RendezvousClient
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import DialIn, SlotState
@@ -37,7 +37,7 @@ _KINDS = {
 
 
 def new_token(now: float) -> str:
-    """Return what tells one claim from another; of two, the earlier is the greater text.
+    """Return a token that identifies a claim; of two, the earlier is the greater text.
 
     Records of one order are told apart by their bytes, and the greater stands (`record_set`).
     """
@@ -45,8 +45,8 @@ def new_token(now: float) -> str:
 
 
 def own_token(claims: Path, id: str, now: float) -> str:
-    """Return this machine's claim to a bundle: the same again where it was ended in between."""
-    known = stored(dict[str, str], disk.read_json(claims) or {}, f"`{claims}` is damaged")
+    """Return this machine's claim to a bundle; the same one after an interruption."""
+    known = disk.read_as(dict[str, str], claims) or {}
     if id not in known:
         latest = dict(list(known.items())[-_KEPT:])
         disk.write_json(claims, known := {**latest, id: new_token(now)})

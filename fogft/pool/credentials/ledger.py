@@ -1,4 +1,4 @@
-"""Which certificates a pool's CA has issued, and which of them were taken back.
+"""The certificates that a pool's CA has issued and revoked.
 
 Every issue is on disk before its certificate leaves this module, so nothing that the CA
 ever signed is missing from the list, and no generation of a name is used twice. Keys are
@@ -21,13 +21,13 @@ from fogft import disk
 from fogft.errors import CredentialError
 from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND
-from fogft.model.plain import Line, Moment, stored, to_plain
+from fogft.model.plain import Line, Moment, to_plain
 from fogft.model.replica import ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Credential
 
 _DAY_S = 86_400.0
-_WAY_OUT = "without it nobody knows what was revoked; `fogft down` and `up` begin anew"
+_WAY_OUT = "without it, revocations are lost; recreate the pool with `fogft down`, then `fogft up`"
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Entry:
 
     @property
     def holder(self) -> Holder:
-        """Whom it names."""
+        """The holder that it names."""
         return holder_of(self.common_name)
 
     def state(self, now: float) -> str:
@@ -68,17 +68,15 @@ class Ledger:
 
     def entries(self) -> tuple[Entry, ...]:
         """Return all certificates, oldest first."""
-        raw = disk.read_json(self.path)
-        if raw is None:
-            return ()
-        return stored(_Issued, raw, f"`{self.path}` is damaged", _WAY_OUT).issued
+        found = disk.read_as(_Issued, self.path, _WAY_OUT)
+        return () if found is None else found.issued
 
     def revoked(self) -> frozenset[str]:
-        """Return the common names that were taken back."""
+        """Return the revoked common names."""
         return frozenset(e.common_name for e in self.entries() if e.revoked_at is not None)
 
     def by_hand(self) -> frozenset[ReplicaId]:
-        """Return the replicas that people start themselves, and whose certificates are good."""
+        """Return the manually started replicas with valid certificates."""
         good = [e.holder for e in self.entries() if e.state(self._clock()) == "good"]
         return frozenset(
             ReplicaId(h.pool_uid, int(h.name), h.generation)
@@ -87,7 +85,7 @@ class Ledger:
         )
 
     def gateways(self) -> dict[str, tuple[int, ...]]:
-        """Return the good generations of each gateway's certificates, by name."""
+        """Return the generations of each gateway's valid certificates, by name."""
         found: dict[str, tuple[int, ...]] = {}
         for entry in self.entries():
             holder = entry.holder
@@ -96,14 +94,14 @@ class Ledger:
         return found
 
     def issue(self, holder: Holder, *, days: float = authority.LEAF_DAYS) -> Credential:
-        """Certify a holder, and remember it."""
+        """Certify a holder, and record it."""
         with disk.locked(self._lock):
             return self._issue(holder, self.entries(), days)
 
     def issue_next(
         self, role: Role, name: str, pool_uid: str, *, days: float
     ) -> tuple[Holder, Credential]:
-        """Certify the next generation of a name, and remember it."""
+        """Certify the next generation of a name, and record it."""
         with disk.locked(self._lock):
             entries = self.entries()
             used = [e.holder.generation for e in entries if _is(e, role, name)]
@@ -132,7 +130,7 @@ class Ledger:
         return issued
 
     def revoke(self, holders: Iterable[Holder]) -> None:
-        """Take certificates back, for good. Repeatable."""
+        """Revoke certificates permanently. Repeatable."""
         names, now = {holder.common_name for holder in holders}, self._clock()
         with disk.locked(self._lock):
             self._write(
@@ -148,7 +146,7 @@ class Ledger:
             known = ", ".join(f"`{h.short}`" for h in holders if h.role is role) or "none"
             raise CredentialError(
                 f"there is no certificate of {role.value} `{name}` to revoke",
-                f"those of this role that are not revoked: {known}",
+                f"valid certificates of this role: {known}",
             )
         return found
 

@@ -1,4 +1,4 @@
-"""What a pool's machines have cost so far, by replica and day (UTC), as its manager saw them.
+"""The cost of a pool's machines so far, by replica and day (UTC), as seen by its manager.
 
 Each look charges the time since the last one at the price of that time: the present price of a spot
 machine where it is known, else what it was ordered for. A machine that went while no manager looked
@@ -17,7 +17,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.errors import StateError
-from fogft.model.plain import from_plain, to_plain
+from fogft.model.plain import to_plain
 from fogft.model.reason import Cause
 from fogft.model.replica import Machine, Offer, Placement
 
@@ -32,7 +32,7 @@ _DAYS_KEPT = 400
 
 @dataclass(frozen=True)
 class Spent:
-    """What one replica has cost on one day.
+    """The cost of one replica on one day.
 
     Attributes:
         day: As in ``2026-11-23``, of UTC.
@@ -51,7 +51,7 @@ class Spent:
 
 @dataclass(frozen=True)
 class Running:
-    """A machine that was seen last: until when it is charged, and its price then."""
+    """A running machine: until when it has been charged, and its price."""
 
     until: float
     usd_per_hour: float
@@ -60,7 +60,7 @@ class Running:
 
 @dataclass(frozen=True)
 class Costs:
-    """What one pool has cost. Earlier days that are not kept any more are in `before_usd`."""
+    """The cost of one pool. Days no longer kept are summed up in `before_usd`."""
 
     pool: str
     uid: str
@@ -70,7 +70,7 @@ class Costs:
 
     @property
     def usd(self) -> float:
-        """All of it."""
+        """The total, in US dollars."""
         return self.before_usd + sum(one.usd for one in self.spent)
 
 
@@ -91,7 +91,7 @@ class CostBook:
     def look(
         self, now: float, machines: Sequence[Machine], offers: Sequence[Offer], alone_s: float
     ) -> None:
-        """Charge what runs, up to now, and write it down from time to time.
+        """Charge running machines up to now, and save from time to time.
 
         Args:
             alone_s: For how long a machine runs on of which no manager has heard.
@@ -131,7 +131,7 @@ class CostBook:
 
     @property
     def usd(self) -> float:
-        """All that it has cost."""
+        """The total cost, in US dollars."""
         return self._before_usd + sum(one.usd for one in self._days.values())
 
     def _charge(self, name: str, place: Placement, begun: float, end: float, price: float) -> None:
@@ -170,9 +170,8 @@ def path_of(folder: Path, pool: str, uid: str) -> Path:
 
 def _read(path: Path) -> Costs | None:
     try:
-        raw = disk.read_json(path)
-        return None if raw is None else from_plain(Costs, raw)
-    except (StateError, ValueError) as error:
+        return disk.read_as(Costs, path)
+    except StateError as error:
         log.warning("costs_damaged file=%s reason=%r", path, str(error))
         return None
 

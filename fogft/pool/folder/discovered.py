@@ -10,38 +10,28 @@ from functools import partial
 from pathlib import Path
 
 from fogft import disk
-from fogft.errors import StateError
 from fogft.model import ros_names
 from fogft.model.choices import Speaks
-from fogft.model.plain import as_line, stored, to_plain
+from fogft.model.plain import as_line, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.services import Discovered, claims, grown
 
-
-def read(path: Path) -> Discovered:
-    """Return what was found; nothing where the file is missing or damaged."""
-    try:
-        return stored(Discovered, disk.read_json(path) or {}, "")
-    except StateError:
-        return Discovered()
-
-
 _NOTED = 5  # of what is not offered
 
 
 class Discovery:
-    """Keeps the file of one pool. The manager's."""
+    """Maintains the file of one pool. Used by the manager."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._known = read(path)
+        self._known = disk.read_or(path, Discovered())
         self._refused: dict[tuple[str, str], str] = {}
         self.notes: list[Reason] = []
 
     def look(self, spec: PoolSpec, observed: Observed, wanted: int) -> bool:
-        """Take up what most replicas offer; return whether that changed the file."""
+        """Add the services that most replicas offer; return whether that changed the file."""
         self.notes = []
         if spec.services:
             return False

@@ -1,4 +1,4 @@
-"""What happened in a pool, as lines of a file: an event is on disk before anything follows from it.
+"""The history of a pool in a file: events are on disk before anything acts on them.
 
 A launch is written before the cloud is asked, so that its generation is never used twice.
 
@@ -33,14 +33,14 @@ class HistoryFile:
         self._appended = 0
 
     def history(self) -> History:
-        """Return what happened so far."""
+        """Return the history so far."""
         with self._lock:
             if self._history is None:
                 self._history = History(self._load())
             return self._history
 
     def append(self, event: Event) -> None:
-        """Remember an event, on disk before this returns."""
+        """Append an event; it is on disk when this returns."""
         history = self.history()
         with self._lock:
             try:
@@ -92,21 +92,13 @@ def _read_events(path: Path) -> list[Event]:
     A line that cannot be read is skipped but its generation cannot be: the cloud's list
     then still keeps generations from being used twice.
     """
-    try:
-        lines = path.read_bytes().splitlines()
-    except FileNotFoundError:
-        return []
-    events: list[Event] = []
-    for line in lines:
-        event = _event(line)
-        if event is not None:
-            events.append(event)
-    return events
+    lines = (disk.read_bytes(path) or b"").splitlines()
+    return [event for event in map(_event, lines) if event is not None]
 
 
 def _event(line: bytes) -> Event | None:
     try:
         value: Any = json.loads(line)
         return from_plain(Event, value)
-    except (ValueError, StateError):
+    except (ValueError, RecursionError):
         return None

@@ -1,4 +1,4 @@
-"""The manager's lease: one holder a pool, an epoch for each, a beat while it works.
+"""The manager's lease: one holder per pool, an epoch for each holder, and a heartbeat.
 
 The lock keeps two managers of one folder apart; the epoch, which goes into every
 membership, fences off what an earlier one may still write; the beat tells the proxies
@@ -14,8 +14,8 @@ import secrets
 from dataclasses import dataclass
 
 from fogft import disk
-from fogft.errors import PoolBusy, StateError
-from fogft.model.plain import Count, stored, to_plain
+from fogft.errors import PoolBusy
+from fogft.model.plain import Count, to_plain
 from fogft.pool.folder.paths import PoolPaths
 
 TERM = 1 << 20  # epochs of one machine; as many terms may be skipped
@@ -38,24 +38,28 @@ class Lease:
 
     @classmethod
     def take(cls, paths: PoolPaths, *, at_least: int = 0) -> Lease:
-        """Take the lease under an epoch above all earlier ones, and above `at_least`."""
+        """Take the lease with an epoch above all earlier ones, and above `at_least`."""
         lock = disk.Lock(paths.manager_lock)
-        if not lock.acquire(wait=False):
-            said = paths.manager_lock.read_text()
-            who = f" (pid {said})" if said.isdecimal() else ""
-            raise PoolBusy(f"pool `{paths.folder.name}` has a manager already{who}")
-        lease = cls(paths, lock, max(_read(paths).epoch, at_least) + 1)
+        try:
+            taken = lock.acquire(wait=False)
+        except OSError as error:
+            raise disk.not_opened(paths.manager_lock, error) from error
+        if not taken:
+            said = (disk.read_bytes(paths.manager_lock) or b"").decode("latin-1")
+            who = f" (pid {said})" if said.isascii() and said.isdecimal() else ""
+            raise PoolBusy(f"pool `{paths.folder.name}` already has a manager{who}")
+        lease = cls(paths, lock, max(read_epoch(paths), at_least) + 1)
         lease._write()
         return lease
 
     def beat(self) -> None:
-        """Show that the manager works.
+        """Write the heartbeat.
 
         Raises:
             PoolBusy: A later manager has it: this one must stop at once.
         """
-        if _read(self._paths).epoch > self.epoch:
-            raise PoolBusy(f"pool `{self._paths.folder.name}` has a later manager")
+        if read_epoch(self._paths) > self.epoch:
+            raise PoolBusy(f"a later manager has taken over pool `{self._paths.folder.name}`")
         self._beat += 1
         self._write()
 
@@ -69,23 +73,15 @@ class Lease:
 
 
 def read_epoch(paths: PoolPaths) -> int:
-    """Return the epoch of the manager that held the lease last; 0 for none."""
-    return _read(paths).epoch
+    """Return the epoch of the manager that held the lease last; 0 for none, or a damaged file."""
+    return disk.read_or(paths.lease, _Held()).epoch
 
 
 def next_term(after: int) -> int:
-    """Return the epoch from which a machine counts that imports a pool."""
+    """Return the first epoch of a machine that imports a pool."""
     return (after // TERM + 1 + secrets.randbelow(TERM)) * TERM
 
 
 def supersedes(heard: int, ours: int) -> bool:
-    """Whether an epoch is that of a machine which took the pool over later than ours did."""
+    """Whether an epoch belongs to a machine that imported the pool later than ours."""
     return heard // TERM > ours // TERM
-
-
-def _read(paths: PoolPaths) -> _Held:
-    """Return what the file says; a damaged one says nothing, as where there is none."""
-    try:
-        return stored(_Held, disk.read_json(paths.lease) or {}, "")
-    except StateError:
-        return _Held()

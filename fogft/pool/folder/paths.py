@@ -1,4 +1,4 @@
-"""Where everything of a pool lies on disk, and nothing else about it.
+"""Paths of a pool's files on disk.
 
 ``$FOGFT_HOME``, else ``$XDG_STATE_HOME/fogft``, else ``~/.local/state/fogft``. Folders
 are 0700 and files 0600. Every file is written whole and renamed into place.
@@ -101,10 +101,10 @@ class PoolPaths:
 
     @property
     def standby_lock(self) -> Path:
-        """Held by the client proxy that is to take over from the one that holds `proxy_lock`."""
+        """Held by the standby client proxy, which takes over from the holder of `proxy_lock`."""
         return disk.standby_lock(self.proxy_lock)
 
     @property
     def costs(self) -> Path:
-        """What all pools of this user have cost, a file each, which stays when one has ended."""
+        """The folder with the cost files of all pools, kept after a pool ends."""
         return self.folder.parent.parent / "costs"

@@ -1,4 +1,4 @@
-"""What a pool remembers on disk, as the manager and the commands read and write it.
+"""A pool's state on disk, as read and written by the manager and the commands.
 
 Owns: identity, spec, intent and membership: their files.
 Not here: what to remember (`fogft.planning`), what happened (`history_file`) and how a file is
@@ -17,19 +17,19 @@ from fogft.errors import PoolBusy, PoolNotFound, SpecError, StateError
 from fogft.model.intent import Intent
 from fogft.model.membership import from_dict, to_dict
 from fogft.model.names import PoolUid
-from fogft.model.plain import Count, from_plain, stored, to_plain
+from fogft.model.plain import Count, to_plain
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import Event, History
+from fogft.planning.observed.services import Discovered
 from fogft.planning.rollout import Trial
-from fogft.pool.folder import discovered
 from fogft.pool.folder.history_file import HistoryFile
 from fogft.pool.folder.paths import PoolPaths
 
 
 @dataclass(frozen=True)
 class Identity:
-    """What a pool is, for good.
+    """The permanent identity of a pool.
 
     Attributes:
         first_epoch: Managers on this machine take epochs above it; see `lease`.
@@ -44,10 +44,10 @@ class Identity:
 
 
 class Store(Protocol):
-    """What the reconciler needs to remember and to be told."""
+    """The state that the reconciler reads and writes."""
 
     def identity(self) -> Identity:
-        """Return what the pool is."""
+        """Return the pool's identity."""
 
     def spec(self) -> PoolSpec:
         """Return the pool file in force: as applied last, or the good one after a rollback."""
@@ -56,28 +56,28 @@ class Store(Protocol):
         """Return the digest of the pool file that was applied last."""
 
     def good(self) -> PoolSpec | None:
-        """Return the last file with which the pool was wholly ready; None for none yet."""
+        """Return the last file with which all replicas were ready; None for none yet."""
 
     def keep_good(self, spec: PoolSpec) -> bool:
-        """Keep the file that `spec` was read from as the good one, if it was read last."""
+        """Store the file of `spec` as the last good one, if it was the last one read."""
 
     def trial(self) -> Trial:
-        """Return what is remembered of the file applied last, or of an earlier one."""
+        """Return the trial of the last applied file, or of an earlier one."""
 
     def write_trial(self, trial: Trial) -> None:
-        """Remember it."""
+        """Store the trial of the applied file."""
 
     def intent(self) -> Intent:
-        """Return what the user wants besides the file."""
+        """Return the user's changes besides the file."""
 
     def history(self) -> History:
-        """Return what happened so far, `append`ed events included."""
+        """Return the history so far, `append`ed events included."""
 
     def append(self, event: Event) -> None:
-        """Remember an event; when this returns it survives a crash."""
+        """Append an event; it survives a crash once this returns."""
 
     def membership(self) -> Membership | None:
-        """Return the membership as last written."""
+        """Return the last written membership."""
 
     def write_membership(self, membership: Membership) -> None:
         """Publish a membership."""
@@ -111,7 +111,7 @@ class PoolStore:
         return self.paths.folder.name
 
     def identity(self) -> Identity:
-        """Return what the pool is."""
+        """Return the pool's identity."""
         return read_identity(self.paths)
 
     def spec(self) -> PoolSpec:
@@ -134,7 +134,7 @@ class PoolStore:
         """Add what was discovered to a spec that lists no services; the same object if known."""
         raw, spec = read
         if not spec.services:
-            found = discovered.read(self.paths.discovered)
+            found = disk.read_or(self.paths.discovered, Discovered())
             services = found.specs(spec.namespace)
             if (services, found.spec_hash) != (spec.discovered, spec.discovered_by):
                 known = replace(spec, discovered=services, discovered_by=found.spec_hash)
@@ -152,20 +152,19 @@ class PoolStore:
         return self._parse(text, self.identity().file)
 
     def _applied(self) -> bytes:
-        try:
-            return self.paths.spec.read_bytes()
-        except FileNotFoundError:
-            raise PoolNotFound(f"pool `{self.paths.folder.name}` has no spec") from None
+        raw = disk.read_bytes(self.paths.spec)
+        if raw is None:
+            raise PoolNotFound(f"pool `{self.paths.folder.name}` has no spec")
+        return raw
 
     def applied(self) -> str:
         """Return the digest of the pool file that was applied last."""
         return digest(self._applied())
 
     def good(self) -> PoolSpec | None:
-        """Return the last file with which the pool was wholly ready; None for none yet."""
-        try:
-            raw = self.paths.good_spec.read_bytes()
-        except FileNotFoundError:
+        """Return the last file with which all replicas were ready; None for none yet."""
+        raw = disk.read_bytes(self.paths.good_spec)
+        if raw is None:
             return None
         if self._good is None or self._good[0] != raw:
             try:
@@ -176,39 +175,34 @@ class PoolStore:
         return self._good[1]
 
     def keep_good(self, spec: PoolSpec) -> bool:
-        """Keep the file that `spec` was read from as the good one, if it was read last."""
+        """Store the file of `spec` as the last good one, if it was the last one read."""
         if self._spec is None or self._spec[1] is not spec:
             return False
         disk.write_whole(self.paths.good_spec, self._spec[0])
         return True
 
     def trial(self) -> Trial:
-        """Return what is remembered of the file applied last, or of an earlier one."""
-        try:
-            raw = disk.read_json(self.paths.trial)
-            return Trial() if raw is None else from_plain(Trial, raw)
-        except (StateError, ValueError):
-            return Trial()  # damaged: the file is tried again
+        """Return the trial of the last applied file, or of an earlier one."""
+        return disk.read_or(self.paths.trial, Trial())  # damaged: the file is tried again
 
     def write_trial(self, trial: Trial) -> None:
-        """Remember it."""
+        """Store the trial of the applied file."""
         disk.write_json(self.paths.trial, to_plain(trial))
 
     def intent(self) -> Intent:
-        """Return what the user wants besides the file; nothing where nothing was asked."""
-        raw = disk.read_json(self.paths.intent)
-        return Intent() if raw is None else stored(Intent, raw, "not an intent")
+        """Return the user's changes besides the file; empty if there are none."""
+        return disk.read_as(Intent, self.paths.intent) or Intent()
 
     def write_intent(self, intent: Intent) -> None:
-        """Store the user's wishes; the caller holds `intent_lock`."""
+        """Store the user's changes; the caller holds `intent_lock`."""
         disk.write_json(self.paths.intent, to_plain(intent))
 
     def history(self) -> History:
-        """Return what happened so far."""
+        """Return the history so far."""
         return self._events.history()
 
     def append(self, event: Event) -> None:
-        """Remember an event, on disk before this returns."""
+        """Append an event; it is on disk when this returns."""
         self._events.append(event)
         self.heard(event)
 
@@ -217,7 +211,7 @@ class PoolStore:
         return self._events.recent(count)
 
     def membership(self) -> Membership | None:
-        """Return the membership as last written; None where it is missing or damaged."""
+        """Return the last written membership; None if it is missing or damaged."""
         try:
             raw = disk.read_json(self.paths.membership)
             return None if raw is None else from_dict(raw)
@@ -230,24 +224,24 @@ class PoolStore:
 
 
 def digest(source: bytes) -> str:
-    """Return 16 hexadecimal digits that name a pool file's text."""
+    """Return 16 hexadecimal digits that identify a pool file's text."""
     return hashlib.sha256(source).hexdigest()[:16]
 
 
 def read_identity(paths: PoolPaths) -> Identity:
-    """Return what the pool in a folder is."""
-    raw = disk.read_json(paths.identity)
-    if raw is None and paths.exported.exists():
+    """Return the identity of the pool in a folder."""
+    found = disk.read_as(Identity, paths.identity)
+    if found is None and paths.exported.exists():
         name = paths.folder.name
         raise PoolBusy(
             f"pool `{name}` was exported from this machine, or imported on another later",
-            f"manage it where it was imported last; `fogft down {name}` ends what is left here",
+            f"manage it where it was imported last; `fogft down {name}` removes what is left here",
         )
-    if raw is None:
+    if found is None:
         raise PoolNotFound(f"there is no pool `{paths.folder.name}`", "`fogft up FILE` starts one")
-    return stored(Identity, raw, f"`{paths.identity}` is damaged")
+    return found
 
 
 def write_identity(paths: PoolPaths, identity: Identity) -> None:
-    """Store what a pool is; the caller holds `intent_lock`."""
+    """Store a pool's identity; the caller holds `intent_lock`."""
     disk.write_json(paths.identity, to_plain(identity))

@@ -1,4 +1,4 @@
-"""What the manager signs: whom it admits, whose certificates it took back, and its lease.
+"""The manager's signed records: membership, revocations and its lease.
 
 The same membership goes to the client proxy of this machine as a file, and to everybody else
 as signed records. Without a rendezvous in the pool file only what was taken back and the lease are
@@ -52,7 +52,7 @@ class ManagerRecords:
     def look(
         self, endpoints: tuple[str, ...], membership: Membership | None, lease: ServingLease
     ) -> None:
-        """Publish what is new, to these rendezvous."""
+        """Publish changes to these rendezvous."""
         self._announce(self._revoked if membership is None else membership.revoked, lease)
         if endpoints != self._endpoints:
             self.close()
@@ -73,7 +73,7 @@ class ManagerRecords:
             self._said_lease = self._lease
 
     def announcements(self, lease: ServingLease) -> bytes:
-        """Return what a launch takes along: what was taken back up to now, and a lease, signed."""
+        """Return the signed records for a launch: revocations so far, and a lease."""
         self._announce(Ledger(self._paths.credentials).revoked(), lease)
         return self._announced
 
@@ -126,13 +126,13 @@ class ManagerRecords:
 
     @property
     def newest_epoch(self) -> int:
-        """Return the newest manager's epoch that a rendezvous knows; 0 where none does."""
+        """Return the newest manager epoch known to a rendezvous; 0 if none."""
         known = [] if self._client is None else self._client.known.of(RecordKind.LEASE)
         return max((lease.generation for lease in known), default=0)
 
     @property
     def trouble(self) -> Reason | None:
-        """Return what is wrong; None when at least one rendezvous is there."""
+        """Return the problem; None if at least one rendezvous can be reached."""
         if self._client is None or self._client.known.connected:
             return None
         said = self._client.status()["rendezvous"]

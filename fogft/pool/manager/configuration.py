@@ -1,4 +1,4 @@
-"""What the manager writes for the proxies: their configurations and certificates.
+"""The proxies' configurations and certificates, written by the manager.
 
 Owns: the values in `proxy.yaml` and `replica.yaml`, and who gets which certificate.
 Not here: reading them (`fogft.proxy.config`) and signing (`credentials`).
@@ -33,7 +33,7 @@ from fogft.poolfile import config_file
 MARGIN_DAYS = 30.0
 _CLIENT_HEADING = (
     "A client proxy, or a gateway. It is read again whenever it changes. Paths are relative to\n"
-    "this file's folder; what is not set here has its default."
+    "this file's folder; keys not set here have their defaults."
 )
 _RENDEZVOUS_HEADING = (
     "A rendezvous, for `fogft rendezvous --config`. It needs a port that robots and replicas can\n"
@@ -41,25 +41,25 @@ _RENDEZVOUS_HEADING = (
 )
 _REPLICA_HEADING = (
     "The server proxy of one replica. Options of `fogft serve` override it. Paths are relative to\n"
-    "this file's folder; what is not set here has its default."
+    "this file's folder; keys not set here have their defaults."
 )
 
 
 def certificate_days(spec: PoolSpec) -> float:
-    """Return how long a certificate lasts: a year, and a month more than `max_hours`."""
+    """Return the validity of a certificate: a year, and at least a month past `max_hours`."""
     return max(authority.LEAF_DAYS, (spec.max_hours or 0.0) / 24 + MARGIN_DAYS)
 
 
 def robot_name() -> str:
-    """Return this machine's name, fit for a certificate."""
+    """Return this machine's name in a form valid in certificates."""
     name = re.sub(r"[^A-Za-z0-9-]", "-", socket.gethostname())[:NAME_LIMIT].strip("-")
     return name or "robot"
 
 
 def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> bool:
-    """Bring the client proxy's configuration up to date; return whether it changed."""
+    """Update the client proxy's configuration; return whether it changed."""
     content = proxy_config(paths, identity, spec)
-    if paths.proxy_config.exists() and paths.proxy_config.read_text() == content:
+    if disk.read_bytes(paths.proxy_config) == content.encode():
         return False
     disk.write_whole(paths.proxy_config, content)
     return True
@@ -107,7 +107,7 @@ def proxy_config(
 def certify_robot(
     paths: PoolPaths, identity: Identity, spec: PoolSpec, now: datetime.datetime
 ) -> bool:
-    """See to it that the client proxy has a certificate that is good; return whether it is new."""
+    """Ensure that the client proxy has a valid certificate; return whether it is new."""
     revoked = Ledger(paths.credentials).revoked()
     if authority.is_good(paths.credentials / "robot.crt", now, revoked):
         return False
@@ -116,7 +116,7 @@ def certify_robot(
 
 
 def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
-    """Give this machine's client proxy new credentials; it takes them into use by itself."""
+    """Issue new credentials to this machine's client proxy, which switches to them itself."""
     holder, issued = Ledger(paths.credentials).issue_next(
         Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
     )
@@ -155,7 +155,7 @@ def build_order(
 def replica_config(
     identity: Identity, spec: PoolSpec, id: ReplicaId, *, announcements: bool = False
 ) -> str:
-    """Return a replica's configuration. Address, domain and folder are the machine's to add.
+    """Return a replica's configuration. The machine adds address, domain and folder.
 
     With `announcements`, what the manager has signed lies beside it.
     """
@@ -211,7 +211,7 @@ def _absolute(path: str, base: Path) -> str:
 
 
 def with_build(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a task that builds its workspace, where it has one and says nothing of `setup`."""
+    """Return a task that builds its workspace if it has one and no `setup`."""
     workdir = task.get("workdir")
     if task.get("setup") or not isinstance(workdir, str) or not is_workspace(Path(workdir)):
         return dict(task)

@@ -1,18 +1,22 @@
-"""How far regions are from the robot, by the first of these that is known.
+"""Round trips from the robot to regions, from the best known source.
 
     the pool file's `rtt_s`, links to replicas, connects to regional endpoints, great circles
 
-A connect is timed on its own, after the name is resolved; the fastest of a few counts, for
+A provider's public endpoint of a region ends TCP in that region, so the time to connect is one
+round trip. It is timed on its own, after the name is resolved; the fastest of a few counts, for
 everything slower is somebody's queue. Measurements are kept in the home folder for a day and
 renewed in the background. A link refines what is known of a region otherwise: where nothing
-else is known, a region with a replica would look nearer than all others.
+else is known, a region with a replica would look nearer than all others. Positions stand in
+`templates/regions.csv`.
 
 Owns: measuring, keeping, and the order above.
-Not here: what answers where (`fogft.cloud.geography`), what they are for (`fogft.model.scoring`).
+Not here: what they are for (`fogft.planning.listing`).
 """
 
 from __future__ import annotations
 
+import csv
+import functools
 import math
 import socket
 import statistics
@@ -25,14 +29,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from fogft import disk
-from fogft.cloud import geography
+from fogft import disk, template_files
 from fogft.errors import StateError
 from fogft.model.choices import PlacementSpec
 from fogft.model.plain import Moment, stored, within
 from fogft.model.replica import LinkReport, LinkState, Machine, Offer
 from fogft.model.spec import PoolSpec
 
+_ENDPOINTS = {
+    "aws": "ec2.{region}.amazonaws.com",
+    "azure": "{region}.api.cognitive.microsoft.com",
+    "gcp": "storage.{region}.rep.googleapis.com",
+}
+PORT = 443
+
+_EARTH_KM = 6371.0
+_FIBRE_KM_PER_S = 200_000.0
+_DETOUR = 1.6  # cables do not follow great circles
+_ACCESS_S = 0.008  # a robot's own way to the Internet, and a data centre's
 FRESH_S = 86_400.0
 RETRY_S = 900.0
 CONNECTS = 3
@@ -42,9 +56,38 @@ REMEMBERED_RTTS = 31
 Endpoint = Callable[[str], "tuple[str, int] | None"]
 
 
+def endpoint(region: str) -> tuple[str, int] | None:
+    """Return the host and port of an endpoint in a ``cloud/region``; None if none is known."""
+    cloud, _, name = region.partition("/")
+    pattern = _ENDPOINTS.get(cloud)
+    return None if pattern is None or not name else (pattern.format(region=name), PORT)
+
+
+def position(region: str) -> tuple[float, float] | None:
+    """Return latitude and longitude of a ``cloud/region`` in degrees; None where not known."""
+    return positions().get(region)
+
+
+@functools.cache
+def positions() -> dict[str, tuple[float, float]]:
+    """Return the positions of all regions that are known, by ``cloud/region``."""
+    lines = template_files.read_text("regions.csv").splitlines()
+    rows = csv.DictReader(line for line in lines if not line.startswith("#"))
+    return {row["region"]: (float(row["latitude"]), float(row["longitude"])) for row in rows}
+
+
+def estimated_rtt_s(here: tuple[float, float], there: tuple[float, float]) -> float:
+    """Return an estimated round trip between two positions in seconds, along a great circle."""
+    a, b = (math.radians(here[0]), math.radians(there[0]))
+    turn = math.radians(there[1] - here[1])
+    part = math.sin((b - a) / 2) ** 2 + math.cos(a) * math.cos(b) * math.sin(turn / 2) ** 2
+    km = 2 * _EARTH_KM * math.asin(math.sqrt(min(1.0, part)))
+    return _ACCESS_S + 2 * km * _DETOUR / _FIBRE_KM_PER_S
+
+
 @dataclass(frozen=True)
 class Distance:
-    """A round trip, and how it is known.
+    """A round trip and its source.
 
     Attributes:
         source: ``pool file``, ``links``, ``measured`` or ``estimated``.
@@ -71,14 +114,14 @@ def connect_time(host: str, port: int) -> float:
 
 
 class Latencies:
-    """What is known of distances on this machine, by ``cloud/region``, and kept in a file."""
+    """This machine's round trips by ``cloud/region``, cached in a file."""
 
     def __init__(
         self,
         file: Path,
         *,
         clock: Callable[[], float] = time.time,
-        endpoint: Endpoint = geography.endpoint,
+        endpoint: Endpoint = endpoint,
         connect: Callable[[str, int], float] | None = None,
     ) -> None:
         self._file = file
@@ -87,14 +130,14 @@ class Latencies:
         self._connect = connect or connect_time
 
     def measured(self) -> Mapping[str, Distance]:
-        """Return what was measured here, whatever its age. A damaged file holds nothing."""
+        """Return the measured round trips, whatever their age. A damaged file counts as empty."""
         try:
             return stored(dict[str, Distance], disk.read_json(self._file) or {}, "")
         except StateError:
             return {}
 
     def stale(self, regions: Collection[str]) -> list[str]:
-        """Return the regions that should be measured: never, or a day ago, or in the future."""
+        """Return the regions to measure: never measured, a day ago, or in the future."""
         kept, now = self.measured(), self._clock()
         return sorted(
             region
@@ -104,7 +147,7 @@ class Latencies:
         )
 
     def measure(self, regions: Iterable[str]) -> Mapping[str, str]:
-        """Measure regions side by side and keep the results; return what failed, with why."""
+        """Measure regions in parallel and store the results; return failures with reasons."""
         wanted = [(r, e) for r in sorted(set(regions)) if (e := self._endpoint(r)) is not None]
         if not wanted:
             return {}
@@ -126,7 +169,7 @@ class Latencies:
     def known(
         self, regions: Iterable[str], placement: PlacementSpec, links: Mapping[str, float]
     ) -> dict[str, Distance]:
-        """Return the best that is known of each region of which anything is."""
+        """Return the best known round trip of each region that has one."""
         measured, out = self.measured(), {}
         for region in regions:
             told = placement.rtt_s.get(region, placement.rtt_s.get(region.split("/")[0]))
@@ -146,7 +189,7 @@ class Latencies:
 
 
 class Distances:
-    """What the manager hands to its planner each tick. Measures in the background."""
+    """The manager's round trips for its planner. Measures in the background."""
 
     def __init__(
         self, latencies: Latencies, submit: Callable[[Callable[[], object]], object]
@@ -198,7 +241,7 @@ def regions_of(offers: Iterable[Offer]) -> set[str]:
 
 
 def _estimated(region: str, placement: PlacementSpec) -> Distance | None:
-    there = geography.position(region)
+    there = position(region)
     if placement.robot_at is None or there is None:
         return None
-    return Distance(geography.estimated_rtt_s(placement.robot_at, there), "estimated")
+    return Distance(estimated_rtt_s(placement.robot_at, there), "estimated")

@@ -1,4 +1,4 @@
-"""The manager: one process a pool that ticks, once a second or when something changes.
+"""The manager: one process per pool that reconciles once a second or on a change.
 
 SIGTERM ends the managing, never the pool: replicas and the client proxy run on, and the
 next manager takes over what it finds.

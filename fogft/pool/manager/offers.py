@@ -1,4 +1,4 @@
-"""Ask a cloud what is sold for each group of a pool.
+"""Get a cloud's offers for each group of a pool.
 
 Owns: telling whose offer is whose.
 Not here: what a cloud sells (`fogft.cloud`) and which is chosen (`fogft.planning.placement`).
@@ -18,14 +18,14 @@ from fogft.planning.cost import GB, egress_bytes_per_s, egress_price
 
 
 class Seller(Protocol):
-    """What has prices: a cloud, or a table of them."""
+    """A source of offers: a cloud, or a price table."""
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """See `fogft.cloud.port.Cloud`."""
 
 
 def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
-    """Return all offers for a pool, each with the name of the group that it is for."""
+    """Return all offers for a pool, each with its group's name."""
     found: list[Offer] = []
     places = {group.name: f"fogft.groups[{n}]." for n, group in enumerate(spec.groups)}
     for name, resources in sales(spec):

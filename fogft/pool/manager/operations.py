@@ -1,4 +1,4 @@
-"""Cloud calls that take long, off the manager's loop: never two at once on one replica.
+"""Slow cloud calls, off the manager's loop; never two at once for one replica.
 
 An operation stays in the list until its outcome was collected, so whoever takes the list
 *before* asking the cloud what exists misses nothing: an order is either still in the list
@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Outcome(Generic[T]):
-    """How an operation ended: `error` is None when it was done."""
+    """The outcome of an operation; `error` is None on success."""
 
     id: ReplicaId
     subject: T
@@ -35,7 +35,7 @@ class Outcome(Generic[T]):
 
 
 class Operations(Generic[T]):
-    """Operations under way, each with what it is about; `on_done` is called when one has ended."""
+    """Running operations, each for one replica; `on_done` is called when one ends."""
 
     def __init__(self, submit: Submit, on_done: Callable[[], None] = lambda: None) -> None:
         self._submit = submit
@@ -45,7 +45,7 @@ class Operations(Generic[T]):
         self._outcomes: list[Outcome[T]] = []
 
     def busy(self) -> Mapping[ReplicaId, T]:
-        """Return what is under way, or ended and not yet collected."""
+        """Return the operations that run, or have ended but are not collected."""
         with self._lock:
             return dict(self._busy)
 
@@ -58,7 +58,7 @@ class Operations(Generic[T]):
             return outcomes
 
     def start(self, id: ReplicaId, subject: T, operation: Callable[[], None]) -> bool:
-        """Begin one, or return False when this replica has one under way."""
+        """Start an operation, or return False if this replica has one running."""
         with self._lock:
             if id in self._busy:
                 return False

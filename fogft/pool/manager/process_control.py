@@ -1,4 +1,4 @@
-"""Find who holds a lock, and end a process for sure.
+"""End a process reliably.
 
 Owns: ending by process id. Never by name: only a process that holds one of our locks is ever
 signalled.
@@ -21,45 +21,29 @@ POLL_S = 0.05
 
 
 def wait_for(condition: Callable[[], bool], limit_s: float) -> bool:
-    """Wait until a condition holds; return whether it does in time."""
+    """Wait for a condition; return whether it came true in time."""
     end = time.monotonic() + limit_s
     while not (found := condition()) and time.monotonic() < end:
         time.sleep(POLL_S)
     return found
 
 
-def lock_holder(lock: Path) -> int | None:
-    """Return the process that holds a lock; None for nobody.
-
-    By the kernel's own list; in a container, whose overlays that list may know by another device,
-    by what the holder wrote.
-    """
-    try:
-        stat = lock.stat()
-        lines = Path("/proc/locks").read_text().splitlines()
-    except OSError:
-        return None
-    wanted = f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
-    for line in lines:
-        fields = line.split()
-        if len(fields) >= 6 and fields[1] == "FLOCK" and fields[5] == wanted:
-            pid = int(fields[4])
-            return pid if pid > 0 else None
-    try:
-        said = int(lock.read_text())
-    except (OSError, ValueError):
-        return None
-    return said if disk.is_locked(lock) else None
-
-
-def end_holder(lock: Path, *, patience_s: float = 10.0) -> int | None:
-    """End the process that holds a lock: SIGTERM, then SIGKILL. Return its pid; None for nobody.
+def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0) -> int | None:
+    """End the process that holds a lock by SIGTERM, then SIGKILL; return its pid.
 
     Returns when it is gone, not only its lock: a process lets go of what it holds, and may
     hang only then. Another that waited for the lock may hold it by then.
+
+    Args:
+        lock: The lock's file.
+        only: End no other process than this one.
+        patience_s: How long each signal is given.
+
+    Returns:
+        The pid; None if nobody, or another process, holds the lock.
     """
-    pid = lock_holder(lock)
-    if pid is None or pid == os.getpid():
+    pid = disk.holder(lock)
+    if pid is None or pid == os.getpid() or only not in (None, pid):
         return None
     with _opened(pid) as process:
         for number in (signal.SIGTERM, signal.SIGKILL):
@@ -67,7 +51,7 @@ def end_holder(lock: Path, *, patience_s: float = 10.0) -> int | None:
                 process.send(number)
                 process.send(signal.SIGCONT)  # one that is stopped would never hear of it
             end = time.monotonic() + patience_s
-            while process.alive or (disk.is_locked(lock) and lock_holder(lock) in (None, pid)):
+            while process.alive or (disk.is_locked(lock) and disk.holder(lock) in (None, pid)):
                 if time.monotonic() > end:
                     break
                 time.sleep(POLL_S)
@@ -77,7 +61,7 @@ def end_holder(lock: Path, *, patience_s: float = 10.0) -> int | None:
 
 
 def call_at_end(pid: int, call: Callable[[], None]) -> None:
-    """Call a function, on a thread of its own, when a process has ended; its parent need not be us.
+    """Call a function on its own thread when a process, child or not, has ended.
 
     At once where it has gone; never where the kernel cannot tell (older than 5.3).
     """

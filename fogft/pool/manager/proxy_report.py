@@ -1,4 +1,4 @@
-"""Read what the client proxy reports. An old or damaged report means: nothing is known.
+"""The client proxy's report. An old or damaged report counts as unknown.
 
 Owns: `proxy-status.json` as the manager sees it.
 Not here: writing it (`fogft.proxy.robot.process`) and judging it
@@ -23,7 +23,7 @@ STALE_S = 5.0
 
 @dataclass(frozen=True)
 class GatewayLink:
-    """How the robot's link to a gateway does."""
+    """The state of the robot's link to a gateway."""
 
     name: str
     generation: int
@@ -39,7 +39,7 @@ class _Order:
 
 @dataclass(frozen=True)
 class Counted:
-    """The counters of a service that people are shown; a report has further ones."""
+    """The counters of a service that are shown to people."""
 
     received: Count = 0
     answered: Count = 0
@@ -65,7 +65,7 @@ Counters = Annotated[Mapping[str, Any], partial(from_plain, Counted)]
 
 @dataclass(frozen=True)
 class TopicCounted:
-    """What became of a topic's messages.
+    """The counters of a topic's messages.
 
     Attributes:
         messages: Published by the robot's nodes; or by replicas', each replica's counted.
@@ -105,11 +105,11 @@ class ProxyReport:
     manager_epoch: Count = 0
 
     def fresh(self, now: float) -> bool:
-        """Whether it still says something about now. A clock that jumped makes it say nothing."""
+        """Whether the report is recent. After a clock jump it is not."""
         return abs(now - self.written_at) <= STALE_S
 
     def digest(self) -> object:
-        """Return what a manager should react to at once; counters and ages are left out."""
+        """Return the fields that a manager reacts to at once, without counters and ages."""
         return frozenset(
             (k.id, k.state, k.doubted, k.ready, k.leaving, k.at_risk, k.disagrees, k.offered)
             for k in self.links
@@ -117,7 +117,7 @@ class ProxyReport:
 
 
 def read(path: Path, pool_uid: str) -> ProxyReport | None:
-    """Return the last report, or None where there is none or it is damaged."""
+    """Return the last report; None if there is none or it is damaged."""
     try:
         raw = disk.read_json(path)
     except StateError:

@@ -1,11 +1,11 @@
-"""Keep the client proxy running, and another one in line behind it.
+"""Keep a client proxy and its standby running.
 
 The death of one is no reason to touch a replica, and its life needs no manager: each is started
 in a session of its own and lives on when the manager goes. The one in line takes over by itself,
 in the instant in which the first ends; here both are started, and adopted where they run already.
 
-Owns: starting them again, with backoff; and `manager.json`, by which a client proxy starts a
-manager again that was killed (`fogft.proxy.robot.manager_restart`).
+Owns: starting them again, with backoff, and killing what hangs; and `manager.json`, by which a
+client proxy starts a manager again that was killed (`fogft.proxy.robot.manager_restart`).
 Not here: its configuration (`configuration`).
 """
 
@@ -26,13 +26,14 @@ from fogft.child import detached
 from fogft.model.reason import Cause, Reason
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
+from fogft.process import Hanging
 
 log = logging.getLogger(__name__)
 
 BACKOFF_S = 1.0
 BACKOFF_LIMIT_S = 30.0
-STEADY_S = 30.0  # one that ran so long is no failure
-CALM_S = 3.0  # so long a proxy works before another one is put in line: its start takes a core
+STEADY_S = 5.0  # one that ran so long is no failure
+HANGS_AFTER_S = 10.0
 START_LIMIT_S = 20.0  # one that has neither place by then will not get one
 
 
@@ -42,7 +43,7 @@ class _Child(NamedTuple):
 
 
 class ProxySupervisor:
-    """Looks after a pool's client proxies; `look` is called with each tick.
+    """Supervises a pool's client proxies; `look` is called in each tick.
 
     Args:
         command: What to start, alone; ``python -m fogft proxy --config ...`` unless told.
@@ -67,12 +68,13 @@ class ProxySupervisor:
         self._children: list[_Child] = []
         self._watched: set[int] = set()
         self._ending: set[int] = set()
-        self._works_since: tuple[int | None, float] = (None, 0.0)
+        locks = paths.proxy_lock, paths.standby_lock
+        self._hanging = {lock: Hanging(HANGS_AFTER_S, clock) for lock in locks}
         self._next_at = 0.0
         self._failures = 0
 
     def look(self, *, outdated: bool = False) -> bool:
-        """Start what is missing; return whether a proxy works, or starts.
+        """Start missing proxies; return whether one works or is starting.
 
         One of ours takes over from one that is outdated: of another version of fogft.
         """
@@ -80,20 +82,20 @@ class ProxySupervisor:
         for child in [one for one in self._children if one.process.poll() is not None]:
             self._children.remove(child)
             self._ended(child.process.returncode, now - child.started_at)
+        self._end_hanging()
         working = self._holder(self._paths.proxy_lock)
         waiting = self._holder(self._paths.standby_lock)
         if working is None and waiting is not None:
             return True  # it is about to take over
-        if working is not None and self._works_since[0] != working:
-            self._works_since = working, now
+        if waiting == working:  # it has just taken over
+            waiting = None
         if outdated:
             self._hand_over(working, waiting)
         placed = {working, waiting}
         for child in self._children:
             if child.process.pid not in placed and now - child.started_at < START_LIMIT_S:
                 return True
-        calm = now - self._works_since[1] >= CALM_S
-        complete = waiting is not None or self._alone or not calm
+        complete = waiting is not None or self._alone
         if (working is not None and complete) or now < self._next_at:
             return working is not None
         process = detached(self._command, self._paths.proxy_log)
@@ -101,6 +103,12 @@ class ProxySupervisor:
         self._watch(process.pid)
         log.info("proxy_started pid=%d standby=%s", process.pid, working is not None)
         return True
+
+    def _end_hanging(self) -> None:
+        for lock, hanging in self._hanging.items():
+            pid = disk.holder(lock, said=False)
+            if hanging.end(pid):
+                log.error("proxy_hangs pid=%d", pid)
 
     def _hand_over(self, working: int | None, waiting: int | None) -> None:
         """End what is not ours, the one that works only once one of ours can take its place."""
@@ -115,7 +123,7 @@ class ProxySupervisor:
 
     def _holder(self, lock: Path) -> int | None:
         """Return who holds a lock, 0 for somebody unknown, None for nobody; hear of its end."""
-        pid = process_control.lock_holder(lock)
+        pid = disk.holder(lock)
         if pid is None:
             return 0 if disk.is_locked(lock) else None
         self._watch(pid)
@@ -140,7 +148,7 @@ class ProxySupervisor:
 
     @property
     def trouble(self) -> Reason | None:
-        """Return what is wrong with it; None when nothing is."""
+        """Return the problem with the client proxy; None without one."""
         if self._failures < 2 or self._children:
             return None
         log_name = str(self._paths.proxy_log)
@@ -148,7 +156,7 @@ class ProxySupervisor:
 
 
 def allow_restart(paths: PoolPaths, environ: Mapping[str, str] = os.environ) -> None:
-    """Say how this process is started, should it die."""
+    """Record how to restart this process should it die."""
     if environ.get("NOTIFY_SOCKET"):
         forbid_restart(paths)
         return
@@ -163,5 +171,5 @@ def allow_restart(paths: PoolPaths, environ: Mapping[str, str] = os.environ) -> 
 
 
 def forbid_restart(paths: PoolPaths) -> None:
-    """Say that this process shall not be started again."""
+    """Record that this process must not be restarted."""
     paths.manager_start.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Observe, plan, apply: one tick at a time, each from the world as it is.
+"""The reconciler: observe, plan and apply, each tick from the current state.
 
 Killed at any point it leaves nothing that its successor does not repair: a launch is in
 the history before the cloud is asked, and everything else is read again from the cloud.
@@ -48,8 +48,7 @@ from fogft.planning.rollout import Update
 from fogft.pool.folder.store import Identity, Store
 from fogft.pool.manager import offers
 from fogft.pool.manager.operations import Operations, Submit
-from fogft.pool.manager.remembering import Remembering
-from fogft.pool.manager.timekeeping import Timekeeping
+from fogft.pool.manager.timekeeping import Remembering, Timekeeping
 from fogft.pool.manager.updating import Updating
 from fogft.reason_words import words
 
@@ -66,7 +65,7 @@ BuildOrder = Callable[[Identity, PoolSpec, PlannedLaunch], Launch]
 
 
 class Tick(NamedTuple):
-    """What one tick saw and decided.
+    """The observations and decisions of one tick.
 
     Attributes:
         over: Its hours are used up: the pool ends by itself.
@@ -85,7 +84,7 @@ class Tick(NamedTuple):
 
 
 def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
-    """Return an order without files: all that a cloud needs, and nothing to serve with."""
+    """Return a launch order without files: enough for a cloud, not for serving."""
     return Launch(
         id=ReplicaId(identity.uid, planned.slot, planned.generation),
         pool=identity.name,
@@ -100,7 +99,7 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
 
 
 class Reconciler:
-    """Brings one pool to what is wanted.
+    """Reconciles one pool with its spec.
 
     Args:
         reading: Tells in place of `clock` what it is, and whether it was set; see

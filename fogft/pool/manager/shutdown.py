@@ -1,4 +1,4 @@
-"""What `down` does: end everything of a pool, whether or not its manager lives.
+"""What `down` does: end everything of a pool, with or without its manager.
 
 Manager first (it would repair what we end), then the client proxy, then every machine
 that carries the pool's uid, then the folder. Stopped half-way, it can be run again.
@@ -39,7 +39,7 @@ def end(
     warned: Callable[[str], None] = lambda _: None,
     limit_s: float = LIMIT_S,
 ) -> list[str]:
-    """End a pool and return what was ended, in words, in order.
+    """Shut a pool down and return what was ended, in words, in order.
 
     Of one that another machine manages, only what is left here.
 
@@ -89,13 +89,13 @@ def end(
 def without_manager(
     paths: PoolPaths, done: Callable[[str], None]
 ) -> contextlib.AbstractContextManager[None]:
-    """End a pool's manager; none can start while this is open."""
+    """End a pool's manager; none can start inside this context."""
     return _taken(done, "manager", paths.manager_lock)
 
 
 @contextlib.contextmanager
 def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Iterator[None]:
-    """End a pool's client proxy and its standby; none can start while this is open."""
+    """End a pool's client proxy and its standby; none can start inside this context."""
     # Its place in line stays free until the proxy has gone: it would wait for us to take over.
     process_control.end_holder(paths.standby_lock)
     with (
@@ -107,7 +107,7 @@ def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Itera
 
 @contextlib.contextmanager
 def without_orders(paths: PoolPaths, spec: PoolSpec, done: Callable[[str], None]) -> Iterator[None]:
-    """As `without_client_proxy` where a service is stateful: only one robot may order requests."""
+    """Like `without_client_proxy`, if a service is stateful: only one robot may order requests."""
     with contextlib.ExitStack() as ended:
         if any(service.state is not None for service in spec.services):
             ended.enter_context(without_client_proxy(paths, done))
@@ -127,7 +127,7 @@ def _taken(done: Callable[[str], None], what: str, path: Path) -> Iterator[None]
     lock = disk.Lock(path)
     for _ in range(_TRIES):
         pid = process_control.end_holder(path)
-        if pid is not None and process_control.lock_holder(path) != pid:
+        if pid is not None and disk.holder(path) != pid:
             done(f"{what} (pid {pid})")
         if lock.acquire(wait=False):
             break

@@ -1,4 +1,4 @@
-"""`status.json`: what the manager last saw of its pool, for people and programs.
+"""`status.json`: the manager's last observation of its pool, for people and programs.
 
 Owns: the schema, and turning one tick of the manager into it.
 Not here: how it is shown (`fogft.cli`).
@@ -49,7 +49,7 @@ WORDS = {
 
 @dataclass(frozen=True)
 class ReplicaStatus:
-    """One replica, with what `LinkReport` says of it. Ages and durations in seconds; None: unknown.
+    """One replica with its `LinkReport`. Ages and durations in seconds; None: unknown.
 
     Attributes:
         verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
@@ -96,7 +96,7 @@ class ReplicaStatus:
     def linked(
         self, link: LinkReport | None, services: set[str], *, links_known: bool, stale: bool
     ) -> ReplicaStatus:
-        """Return it with what its link says now; without one, with what is left unknown.
+        """Return a copy with the current link report; without one, with unknown link fields.
 
         Args:
             services: Names of all services: with these it is ready.
@@ -111,7 +111,7 @@ class ReplicaStatus:
                 in_flight=0,
                 known=not stale and (links_known or self.phase in _COMING),
                 lease_left_s=None,
-                detail="it was not found yet" if self.age_s is None else self.detail,
+                detail="it has not been found yet" if self.age_s is None else self.detail,
             )
         is_up, is_known = link.state is LinkState.UP, not stale
         phase = self.phase
@@ -147,7 +147,7 @@ class ServiceStatus:
 
 @dataclass(frozen=True)
 class TopicStatus:
-    """One topic, of an action or by itself.
+    """One topic, possibly of an action.
 
     Attributes:
         heard_by: The replicas, as ``slot.generation``, that pass it on now: of a topic of the
@@ -163,7 +163,7 @@ class TopicStatus:
 
 @dataclass(frozen=True)
 class UpdateStatus:
-    """An update under way, or the last one where it was given up.
+    """An update in progress, or the last one if it was given up.
 
     Attributes:
         done: Replicas of the version that is wanted now which serve.
@@ -179,7 +179,7 @@ class UpdateStatus:
 
 @dataclass(frozen=True)
 class EventStatus:
-    """Something that happened.
+    """One event.
 
     Attributes:
         event: In a word or three; see `WORDS`.
@@ -223,7 +223,7 @@ def _check_drawn(raw: Mapping[str, Any]) -> None:
 
 @dataclass(frozen=True)
 class PoolStatus:
-    """The whole pool.
+    """The status of a pool.
 
     Attributes:
         cloud_reachable: Whether the cloud could say what exists; if not, `replicas` is
@@ -235,7 +235,7 @@ class PoolStatus:
         usd_to_date: What the pool has cost since its first `up`, as the manager saw it.
         notes: Why the pool is not yet as wanted, in sentences.
         reasons: The same, one for each note, as ``{cause, ...}``.
-        version: Of this schema; see `fogft.pool.commands.status_schema`.
+        version: Of this schema; see `fogft.pool.commands.status`.
         topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
             how this machine's robot finds its gateways; empty where there are none.
         manager_version: Of fogft, by which the manager runs; empty before 0.2.0.
@@ -282,7 +282,7 @@ class PoolStatus:
         links: Sequence[LinkReport] | None,
         stale: bool = False,
     ) -> PoolStatus:
-        """Return it with what the client proxy knows.
+        """Return a copy completed with the client proxy's report.
 
         Args:
             report: Its last report, however old.
@@ -336,9 +336,9 @@ class PoolStatus:
 
 
 def from_json(raw: Any, path: Path) -> PoolStatus:
-    """Read back the status in a file."""
-    hint = "remove it: a manager of this version writes it anew"
-    return stored(PoolStatus, raw, f"`{path}` is not a status", hint)
+    """Read a status from a file."""
+    hint = "remove it: the manager writes a new one"
+    return stored(PoolStatus, raw, f"`{path}` is not a status file", hint)
 
 
 def of_tick(
@@ -352,7 +352,7 @@ def of_tick(
     usd_to_date: float = 0.0,
     credentials_end_at: float | None = None,
 ) -> PoolStatus:
-    """Return the status after a tick, as far as the manager and the cloud know it."""
+    """Return the status after a tick, as known to the manager and the cloud."""
     from fogft.model.groups import FIRST_BY_HAND
 
     health, observed, plan = tick.plan.health, tick.observed, tick.plan
@@ -465,7 +465,7 @@ def _phases(launched_at: float, machine: Machine, record: Record | None) -> dict
 
 
 def event_status(event: Event) -> EventStatus:
-    """Return an event as a status tells it."""
+    """Return an event in its status form."""
     return EventStatus(
         at=event.at,
         event=WORDS[event.kind],

@@ -1,4 +1,4 @@
-"""What the manager and the rendezvous tell Prometheus, and what the manager counts for it.
+"""Prometheus metrics of the manager and the rendezvous, and the manager's counters.
 
 Owns: what counts as a launch, a preemption, a loss, a failure, and how long launches take.
 Not here: the history that outlives the manager (`fogft.pool.folder.history_file`), and what
@@ -12,8 +12,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fogft.metrics.families import counter, gauge, histogram
 from fogft.metrics.proxies import by_event
+from fogft.metrics.scrape import counter, gauge, histogram
 from fogft.model.reason import Cause
 from fogft.model.replica import Phase
 from fogft.planning.observed.history import Event, EventKind
@@ -29,7 +29,7 @@ _PHASES = ("provisioning", "starting", "total")
 
 
 class Tally:
-    """Counts events as they are written, and times each launch. One thread."""
+    """Counts events as they are recorded, and times each launch. One thread."""
 
     def __init__(self) -> None:
         self._launches: Counter[str] = Counter({"spot": 0, "on_demand": 0})
@@ -39,7 +39,8 @@ class Tally:
         self._preempted: set[str] = set()
         self._ordered: dict[str, tuple[float, bool]] = {}
         self._running: dict[str, float] = {}
-        self._took: dict[str, list[float]] = {phase: [] for phase in _PHASES}
+        self._took = {phase: [0] * (len(BUCKETS_S) + 1) for phase in _PHASES}  # launches by bucket
+        self._took_s = dict.fromkeys(_PHASES, 0.0)
 
     def heard(self, event: Event) -> None:
         """Count an event."""
@@ -63,7 +64,7 @@ class Tally:
             self._running.pop(replica, None)
 
     def seen(self, replicas: Iterable[ReplicaStatus], now: float) -> None:
-        """Note which machines run: so long took what comes before `starting`."""
+        """Note the running machines, to time the phases before `starting`."""
         for one in replicas:
             replica = f"{one.slot}.{one.generation}"
             if replica in self._ordered and one.phase != Phase.PROVISIONING.value:
@@ -82,18 +83,23 @@ class Tally:
         running_at = self._running.pop(replica, ready_at)
         if running_at < 0:
             return  # it was ready before
-        self._took["provisioning"].append(max(0.0, running_at - ordered_at))
-        self._took["starting"].append(max(0.0, ready_at - running_at))
-        self._took["total"].append(max(0.0, ready_at - ordered_at))
+        for phase, began, ended in (
+            ("provisioning", ordered_at, running_at),
+            ("starting", running_at, ready_at),
+            ("total", ordered_at, ready_at),
+        ):
+            took_s = max(0.0, ended - began)
+            self._took[phase][bisect_left(BUCKETS_S, took_s)] += 1
+            self._took_s[phase] += took_s
         self._running[replica] = -1.0
 
     def metrics(self) -> Iterator[Metric]:
-        """Yield what was counted."""
+        """Yield the counters."""
         for name, help, label, counts in (
-            ("launches", "Machines that were ordered.", "market", self._launches),
-            ("refused_launches", "Orders that a cloud refused, by cause.", "cause", self._refused),
+            ("launches", "Machines ordered.", "market", self._launches),
+            ("refused_launches", "Orders refused by a cloud, by cause.", "cause", self._refused),
             ("failed_launches", "Launches that failed, by cause.", "cause", self._failed),
-            ("lost_replicas", "Machines that went unasked.", "kind", self._lost),
+            ("lost_replicas", "Machines lost without an order to end them.", "kind", self._lost),
         ):
             yield counter(
                 f"fogft_pool_{name}_total", help, [(n, {label: key}) for key, n in counts.items()]
@@ -102,15 +108,8 @@ class Tally:
             "fogft_pool_launch_duration_seconds",
             "Time from the order to a running machine, from there to ready, and in total.",
             BUCKETS_S,
-            ((_buckets(took), sum(took), {"phase": phase}) for phase, took in self._took.items()),
+            ((took, self._took_s[phase], {"phase": phase}) for phase, took in self._took.items()),
         )
-
-
-def _buckets(took: list[float]) -> list[int]:
-    counts = [0] * (len(BUCKETS_S) + 1)
-    for one in took:
-        counts[bisect_left(BUCKETS_S, one)] += 1
-    return counts
 
 
 def _cause(event: Event) -> str:
@@ -118,7 +117,7 @@ def _cause(event: Event) -> str:
 
 
 def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
-    """Yield the metrics of a pool as its manager last saw it; none before the first time."""
+    """Yield the metrics of a pool's last status; none before the first."""
     yield from tally.metrics()
     if status is None:
         return
@@ -137,20 +136,23 @@ def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
         ),
         "fogft_pool_stopping": ("Whether the pool is being shut down.", status.stopping),
         "fogft_pool_observed_timestamp_seconds": (
-            "When the manager last looked, since the epoch.",
+            "When the manager last observed the pool, in Unix time.",
             status.observed_at,
         ),
-        "fogft_manager_epoch": ("Which manager of the pool this is.", status.epoch),
+        "fogft_manager_epoch": (
+            "Number of the manager; later ones have higher ones.",
+            status.epoch,
+        ),
     }
     for name, (help, value) in gauges.items():
         yield gauge(name, help, [(value, {})])
     ends_at = status.credentials_end_at
     yield gauge(
         "fogft_credentials_left_seconds",
-        "Until the cloud's credentials end, where that is known.",
+        "Time until the cloud's credentials expire, where known.",
         [] if ends_at is None else [(ends_at - status.observed_at, {})],
     )
-    yield counter("fogft_pool_usd_total", "What the pool has cost.", [(status.usd_to_date, {})])
+    yield counter("fogft_pool_usd_total", "Cost of the pool so far.", [(status.usd_to_date, {})])
     phases = Counter(replica.phase for replica in status.replicas)
     yield gauge(
         "fogft_pool_replicas",
@@ -178,7 +180,8 @@ def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
 
 def of_rendezvous(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a rendezvous from its report."""
-    yield gauge("fogft_rendezvous_callers", "Who is connected.", [(report["callers"], {})])
+    help = "Members that are connected."
+    yield gauge("fogft_rendezvous_callers", help, [(report["callers"], {})])
     yield gauge("fogft_rendezvous_records", "Records it holds.", [(report["records"], {})])
     yield by_event("fogft_rendezvous_port_events_total", "Events at its port.", report["port"])
     yield by_event("fogft_rendezvous_messages_total", "Messages by kind.", report["messages"])

@@ -1,4 +1,4 @@
-"""End every machine of a pool, and believe it only when the clouds themselves say so.
+"""End every machine of a pool, verified with the clouds themselves.
 
 Owns: ending them side by side until none is listed, the last look past every memory, and what
 to say when it is not known what still runs.
@@ -22,7 +22,7 @@ ASK_AGAIN_S = 1.0
 
 @dataclass(frozen=True)
 class Known:
-    """What is remembered of a pool's machines, for when its cloud does not answer.
+    """The machines recorded in a pool's folder, in case its cloud does not answer.
 
     Attributes:
         running: Replicas that were launched and have not ended as far as was seen, in words.
@@ -37,7 +37,7 @@ class Known:
 
 
 def known(store: PoolStore) -> Known:
-    """Return what a pool's folder remembers. Never fails: it is for bad times."""
+    """Return the machines recorded in a pool's folder. Never fails."""
     pool = store.paths.folder.name
     try:
         history = store.history()
@@ -99,8 +99,8 @@ def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -
     if not left:
         for name in sorted(known.clouds - audit.asked):
             warned(
-                f"`{name}` could not be asked itself: that nothing is left there is SkyPilot's "
-                f"word; its console shows machines with the label `fogft-pool={uid}`"
+                f"`{name}` could not be asked itself: only SkyPilot says that nothing is left "
+                f"there; its console shows machines with the label `fogft-pool={uid}`"
             )
     return left
 
@@ -137,10 +137,10 @@ def _stubborn(refusals: dict[Machine, CloudError], known: Known) -> FogftError:
 
 
 def _unknown(error: CloudUnreachable, known: Known) -> CloudUnreachable:
-    lines = [f"it cannot be told what of `{known.pool}` still runs: {error.message}"]
+    lines = [f"it is unknown what of `{known.pool}` still runs: {error.message}"]
     lines += [f"  may still run: {replica}" for replica in known.running]
     hints = [f"run `fogft down {known.pool}` again", *([error.hint] if error.hint else [])]
     if known.unmanaged_max_hours is not None:
         hours = f"{known.unmanaged_max_hours:g} hours"
-        hints.append(f"replicas that hear of no manager end by themselves after {hours}")
+        hints.append(f"replicas that hear of no manager shut down after {hours}")
     return CloudUnreachable("\n".join(lines), "; ".join(hints))

@@ -1,11 +1,12 @@
-"""What time it is for a tick, whoever sets the clock meanwhile.
+"""Record in the history what happened to each replica and to the clock.
 
-One tick has one time. Where the clock was set, or the machine slept, that is written into the
-history first, and all that is remembered moves along (`planning.observed.clock_jumps`).
+One tick has one time, whoever sets the clock meanwhile. Where it was set, or the machine slept,
+that is written into the history first, and all that is remembered moves along
+(`planning.observed.clock_jumps`).
 
-Owns: when a jump is looked for, and that none is lost.
-Not here: what a jump is (`planning.observed.clock_jumps`), and what moves
-(`planning.observed.history`, `updating`).
+Owns: which observation is an event, when a jump is looked for, and that none is lost.
+Not here: when to look at replicas (`reconciler`), where events are stored (`store`), what a jump
+is (`planning.observed.clock_jumps`), and what moves (`planning.observed.history`, `updating`).
 """
 
 from __future__ import annotations
@@ -15,10 +16,88 @@ import time
 from collections.abc import Callable
 
 from fogft.model.reason import Cause, Reason
+from fogft.model.replica import Observed, ReplicaId
 from fogft.planning.observed.clock_jumps import Reading, Watch
-from fogft.planning.observed.history import Event, EventKind
+from fogft.planning.observed.health import Health, Verdict
+from fogft.planning.observed.history import Event, EventKind, History
 from fogft.pool.folder.store import Store
 from fogft.pool.manager.updating import Updating
+from fogft.reason_words import words
+
+
+class Remembering:
+    """Adds to a pool's history. Events are on disk before a method returns, or `StateError`."""
+
+    def __init__(self, store: Store, clock: Callable[[], float]) -> None:
+        self._store = store
+        self._clock = clock
+        self._leaving: dict[ReplicaId, Reason] = {}  # when they were judged last
+
+    def add(
+        self,
+        kind: EventKind,
+        id: ReplicaId,
+        *,
+        location: str = "",
+        reason: Reason | None = None,
+        on_demand: bool = False,
+        at: float | None = None,
+        version: str = "",
+    ) -> None:
+        """Add one event, by default with the current time."""
+        when = self._clock() if at is None else at
+        self._store.append(
+            Event(when, kind, id.slot, id.generation, location, reason, on_demand, version=version)
+        )
+
+    def losses(self, observed: Observed) -> None:
+        """Record replicas that are no longer listed. The cloud's list must be known.
+
+        It went when it was observed, not a moment later: the plan of the same observation must
+        not take the loss for something of the future, and go to the same place again.
+        """
+        uid = self._store.identity().uid
+        ids = [m.id for m in observed.machines or ()]
+        listed = {(id.slot, id.generation) for id in ids if id.pool_uid == uid}
+        for record in self._store.history().open():
+            if (record.slot, record.generation) not in listed:
+                id = ReplicaId(uid, record.slot, record.generation)
+                kind = EventKind.ENDED if record.ending else EventKind.GONE
+                log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
+                why = None if record.ending else self._leaving.get(id, Reason(Cause.NOT_LISTED))
+                self.add(kind, id, reason=why, at=observed.now)
+
+    def health(self, health: Health, history: History, now: float) -> None:
+        """Record replicas that became ready, became unready or failed."""
+        leaving = (judged for judged in health.replicas if judged.verdict is Verdict.LEAVING)
+        self._leaving = {judged.id: judged.fault for judged in leaving if judged.fault}
+        for judged in health.replicas:
+            machine, record = judged.machine, judged.record
+            id = machine.id
+            if record is None or record.closed is not None:  # the cloud's list is the record
+                place = machine.placement
+                self.add(
+                    EventKind.LAUNCH,
+                    id,
+                    location=place.location,
+                    on_demand=not place.spot,
+                    at=now,
+                    version=machine.spec_hash,
+                )
+                record = history.record(id.slot, id.generation)
+            if record is None:
+                continue
+            if judged.serving:
+                if record.first_ready_at is None or record.unready_since:
+                    log.info("replica_ready replica=%s zone=%s", id.short, record.location)
+                    self.add(EventKind.READY, id, at=now)
+            elif record.first_ready_at and not record.unready_since and judged.answers:
+                log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
+                self.add(EventKind.UNREADY, id, at=now)
+            if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
+                log.warning("replica_failed replica=%s reason=%r", id.short, words(judged.why))
+                self.add(EventKind.FAILED, id, reason=judged.why, at=now)
+
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +126,7 @@ class Timekeeping:
         self._unwritten: list[tuple[EventKind, float, Reason]] = []
 
     def look(self) -> bool:
-        """Take the time of a tick; return whether it jumped.
+        """Read the clocks for a tick; return whether the time jumped.
 
         Raises:
             StateError: A jump cannot be written down. It is tried again at the next look.
@@ -72,12 +151,12 @@ class Timekeeping:
 
     @property
     def doubt_s(self) -> float:
-        """By how much the clock was set just now; see `Observed.doubt_s`."""
+        """By how much the clock was just set; see `Observed.doubt_s`."""
         return self._watch.doubt_s
 
     @property
     def notes(self) -> list[Reason]:
-        """What there is to say of it."""
+        """Notes about a changed clock."""
         if not self.doubt_s:
             return []
         return [Reason(Cause.CLOCK_DOUBTED, seconds=self.doubt_s)]
@@ -88,7 +167,7 @@ _TRIES = 10
 
 
 def read() -> Reading:
-    """Return all three as of one moment.
+    """Read all three clocks at one moment.
 
     A process that is held up between two of them would see a jump where there is none, so it
     reads again.

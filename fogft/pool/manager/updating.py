@@ -1,4 +1,4 @@
-"""Follow a changed pool file through, and go back to the last good one when it must not stay.
+"""Carry out updates of the pool file, and roll back to the last good one.
 
 Two files, both the manager's: the good file, byte for byte, and what is remembered of the one
 applied last. `up` writes neither: another file's digest makes what is remembered void, so the
@@ -26,13 +26,13 @@ log = logging.getLogger(__name__)
 
 
 class Updating:
-    """The updates of one pool; what cannot be remembered raises `StateError`."""
+    """The updates of one pool. Raises `StateError` if the state cannot be stored."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
 
     def look(self, uid: str, observed: Observed, history: History) -> tuple[PoolSpec, Trial]:
-        """Give up the file that is being applied if it must be; return the file in force."""
+        """Roll back the file being applied if necessary; return the file in force."""
         store = self._store
         spec, good, trial = store.spec(), store.good(), store.trial()
         if trial.file != store.applied():
@@ -51,7 +51,7 @@ class Updating:
         return store.spec(), trial
 
     def move(self, by_s: float) -> None:
-        """Let what is remembered be later: the clock was set."""
+        """Shift stored times, because the clock was set."""
         trial = self._store.trial()
         if trial.began_at:
             self._store.write_trial(replace(trial, began_at=trial.began_at + by_s))
@@ -66,7 +66,7 @@ class Updating:
         wanted: int,
         now: float,
     ) -> Update | None:
-        """Keep the file in force once the pool is whole with it; return the update's state."""
+        """Store the file as good once all replicas run it; return the update's state."""
         good = self._store.good()
         if not trial.fault and spec is not good and spec != good:
             settle_s = rollout.SETTLE_S if good is not None else 0.0

@@ -1,4 +1,4 @@
-"""A gateway: to robots it is like a replica, and its service is a dispatcher over its own links.
+"""A gateway: a replica to its robots, backed by a dispatcher over its own links.
 
 A robot sends a request once; here it is fanned out. Its id goes on unchanged, so a copy that
 came on another way joins the one under way, here or at the replica, and nothing is run
@@ -35,24 +35,23 @@ _COPIES_LIMIT = 8  # of one request that wait for its answer: links that were op
 
 
 class Forwarder:
-    """Passes requests on, and each answer back to all that await it, at most `of_one` a robot."""
+    """Forwards requests, and each answer to all that await it; at most `of_one` per robot.
 
-    def __init__(
-        self,
-        *,
-        held: int = 2048,
-        of_one: int = 512,
-        kept_bytes: int = 16 << 20,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._held = held
-        self._of_one = of_one
+    Attributes:
+        joined: Copies of requests that were known.
+    """
+
+    held_limit = 2048  # requests under way at once; more are refused as overloaded
+    of_one_limit = 512  # the same for one robot: nobody takes all the room
+    kept_bytes = 16 << 20  # answers kept for copies that come later, together
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
         self._dispatchers: dict[str, Dispatcher] = {}
         self._ready: frozenset[str] = frozenset()
         self._unready_since: dict[str, float] = {}
-        self._known = KnownRequests(kept_bytes, 4 * held)
+        self._known = KnownRequests(self.kept_bytes, 4 * self.held_limit)
         self._by_robot: Counter[str] = Counter()
         self._queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
@@ -60,7 +59,7 @@ class Forwarder:
         self.refused: Counter[Refusal] = Counter()
 
     def start(self) -> None:
-        """Begin to pass on: on a thread of its own, since the wire's threads must not send."""
+        """Start forwarding on its own thread, since the link's threads must not send."""
         threading.Thread(target=self._pass_on, name="fogft-forward", daemon=True).start()
 
     def use(self, service: str, dispatcher: Dispatcher) -> None:
@@ -75,7 +74,7 @@ class Forwarder:
     # -- from robots (the wire's threads) -------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
-        """Take a request from the wire. Never blocks."""
+        """Take a request from the link. Never blocks."""
         answer = reason = None
         with self._lock:
             known = self._known.get(incoming.request_id)
@@ -106,7 +105,8 @@ class Forwarder:
             return Refusal.EXPIRED
         if incoming.service not in self._ready:
             return Refusal.NOT_READY
-        full = self._known.held >= self._held or self._by_robot[incoming.robot] >= self._of_one
+        of_robot = self._by_robot[incoming.robot]
+        full = self._known.held >= self.held_limit or of_robot >= self.of_one_limit
         return Refusal.OVERLOADED if full else None
 
     def _refuse(self, incoming: Incoming, reason: Refusal) -> None:
@@ -114,7 +114,7 @@ class Forwarder:
         incoming.refuse(reason)
 
     def cancel(self, ids: Iterable[bytes]) -> None:
-        """Stop what is no longer wanted, here and behind."""
+        """Cancel requests, here and at the replicas behind."""
         for id in ids:
             self._stop(id, Refusal.CANCELLED)
 
@@ -165,7 +165,7 @@ class Forwarder:
             dispatcher.cancel(job.id)  # stopped in between; answered is fine, too
 
     def pass_on_waiting(self) -> None:
-        """Pass on what was taken; for tests without a thread."""
+        """Forward the requests taken; for tests without a thread."""
         while not self._queue.empty():
             job = self._queue.get()
             if job is not None:
@@ -174,7 +174,7 @@ class Forwarder:
     # -- from replicas (their links' threads) ---------------------------------------------
 
     def respond(self, handle: Any, payload: bytes) -> None:
-        """Give an answer to all that await it, and keep it for copies that come later."""
+        """Send an answer to all that await it, and keep it for later copies."""
         job: Job = handle
         with self._lock:
             if job.waiting is None:
@@ -188,7 +188,7 @@ class Forwarder:
     # -- time -----------------------------------------------------------------------------
 
     def tick(self, ready: frozenset[str]) -> None:
-        """Drop what is past its deadline, or has none `ready` to answer it. Call at 50 Hz."""
+        """Drop requests past their deadline or without a `ready` replica. Call at 50 Hz."""
         now = self._clock()
         for name in ready:
             self._unready_since.pop(name, None)
@@ -214,7 +214,7 @@ class Forwarder:
         }
 
     def close(self) -> None:
-        """Refuse what is under way, and stop."""
+        """Refuse requests under way, and stop."""
         with self._lock:
             left = self._known.unanswered(None)
         for job in left:
@@ -223,7 +223,7 @@ class Forwarder:
 
 
 def numbers(report: Mapping[str, Any]) -> dict[str, float]:
-    """Return a forwarder's counters as a probe's answer carries them."""
+    """Return a forwarder's counters in the form of a probe's answer."""
     refused = report["refused"]
     return {
         "held": report["in_flight"],

@@ -64,7 +64,7 @@ def run(config_path: Path, *, listen: str | None = None, metrics: str | None = N
     lock = disk.Lock(config.lock)
     if not lock.acquire(wait=False):
         name, pool = config.robot, config.pool
-        raise PoolBusy(f"gateway `{name}` of pool `{pool}` runs already")
+        raise PoolBusy(f"gateway `{name}` of pool `{pool}` is already running")
     gateway = _Gateway(config)
     try:
         gateway.run(stop)
@@ -102,8 +102,8 @@ class _Gateway:
         holder = holder_of(Signer(ours.certificate, ours.key).common_name)
         if holder.role is not Role.GATEWAY:
             raise CredentialError(
-                f"`{holder.common_name}` is no gateway's certificate",
-                "`fogft credentials issue gateway NAME` makes one",
+                f"`{holder.common_name}` is not a gateway's certificate",
+                "`fogft credentials issue gateway NAME` creates one",
             )
         return holder
 

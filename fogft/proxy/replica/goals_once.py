@@ -1,4 +1,4 @@
-"""At a replica: an action server gets each goal once, however often robots send it.
+"""Ensure that a replica's action server gets each goal once, however often it is sent.
 
 A robot gives a goal again to whom may not have it: a replica that came later, was too slow, whose
 link was lost, or whose command crashed. To be asked twice for one goal harms some action servers
@@ -18,7 +18,7 @@ import logging
 import math
 import threading
 import time
-from collections import OrderedDict, deque
+from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 
@@ -32,7 +32,6 @@ from fogft.topics import goals
 
 log = logging.getLogger(__name__)
 
-_ACCEPTED_KEPT = 16_384  # of each action, 200 bytes each
 _QUEUE_LIMIT = 512
 _COPIES_LIMIT = 64
 _BYTES_LIMIT = 64 << 20  # of all goals that have no answer
@@ -49,25 +48,31 @@ class _Open:
         self.payload = payload
         self.size = len(payload)
         self.begun_at: float | None = None  # when the action server was given it
-        self.holds = False  # it counts among those that the action server has to look at
         self.unheard = False  # we would not hear its answer
         self.ticket: int | None = None
         self.waiting: list[tuple[float, Incoming]] = []  # copies, each with its deadline
+
+    def holds(self, now: float) -> bool:
+        """Whether it counts among those that the action server has to look at."""
+        begun_at = self.begun_at
+        return begun_at is not None and not self.unheard and now - begun_at <= _PATIENCE_S
 
 
 class _ActionServer:
     """What is known of one `send_goal` service, in its present life."""
 
     def __init__(self) -> None:
-        self.life = 0
         self.death = "", -math.inf  # what part was seen to be gone, and when
-        self.queue: deque[bytes] = deque()  # goals that it was not given yet
-        self.open: dict[bytes, _Open] = {}
+        self.open: dict[bytes, _Open] = {}  # oldest first
         self.accepted: OrderedDict[bytes, bytes] = OrderedDict()
 
     @property
-    def at_work(self) -> int:
-        return sum(goal.holds for goal in self.open.values())
+    def queue(self) -> list[bytes]:
+        """Goals that it was not given yet."""
+        return [goal for goal, known in self.open.items() if known.begun_at is None]
+
+    def at_work(self, now: float) -> int:
+        return sum(known.holds(now) for known in self.open.values())
 
     @property
     def held_bytes(self) -> int:
@@ -75,21 +80,19 @@ class _ActionServer:
 
 
 class GoalsOnce:
-    """Passes on the goals that are new; remembers the last `accepted_kept` of each action."""
+    """Forwards new goals; remembers the last `accepted_kept` of each action."""
+
+    outstanding = OUTSTANDING  # goals that an action server is given at once
+    accepted_kept = 16_384  # of each action, 200 bytes each; the oldest go first
 
     def __init__(
         self,
         services: Collection[str],
         is_ready: Callable[[str], bool],
-        *,
-        outstanding: int = OUTSTANDING,
-        accepted_kept: int = _ACCEPTED_KEPT,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._servers = {service: _ActionServer() for service in services}
         self._is_ready = is_ready
-        self._outstanding = outstanding
-        self._accepted_kept = accepted_kept
         self._clock = clock
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
@@ -102,7 +105,7 @@ class GoalsOnce:
 
     @property
     def in_flight(self) -> int:
-        """Goals that wait or were given and have no answer yet."""
+        """The number of goals without an answer yet."""
         with self._lock:
             return sum(len(server.open) for server in self._servers.values())
 
@@ -113,7 +116,7 @@ class GoalsOnce:
     # -- from the wire --------------------------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
-        """Take a goal from the wire. Never blocks."""
+        """Take a goal from the link. Never blocks."""
         service, goal = incoming.service, goals.goal_of(incoming.payload)
         server = self._servers[service]
         with self._lock:
@@ -123,7 +126,6 @@ class GoalsOnce:
                 known = server.open.get(goal)
                 if known is None:
                     known = server.open[goal] = _Open(incoming.payload)
-                    server.queue.append(goal)
                 known.waiting.append((self._clock() + incoming.remaining_s, incoming))
         if answer is not None:
             incoming.reply(answer)
@@ -154,18 +156,19 @@ class GoalsOnce:
         server = self._servers[service]
         while True:
             with self._lock:
-                if not server.queue or server.at_work >= self._outstanding:
+                now, queue = self._clock(), server.queue
+                if not queue or server.at_work(now) >= self.outstanding:
                     return
-                goal, life = server.queue.popleft(), server.life
+                goal = queue[0]
                 known = server.open[goal]
-                known.begun_at, known.holds = self._clock(), True
+                known.begun_at = now
                 payload, known.payload = known.payload, b""
             client = self._clients.get(service)
             if client is None:
                 self._drop(service, goal, known, Refusal.NOT_READY)
                 continue
             try:
-                answered = partial(self._answered, service, goal, life)
+                answered = partial(self._answered, service, goal, known)
                 known.ticket = client.call(payload, answered)
             except RosError as error:
                 log.warning("goal_not_passed_on service=%s reason=%r", service, str(error))
@@ -180,16 +183,16 @@ class GoalsOnce:
                 del self._servers[service].open[goal]
         self._refuse(service, (known,), reason)
 
-    def _answered(self, service: str, goal: bytes, life: int, answer: bytes) -> None:
+    def _answered(self, service: str, goal: bytes, known: _Open, answer: bytes) -> None:
         server = self._servers[service]
         with self._lock:
-            known = server.open.pop(goal, None) if life == server.life else None
-            if known is None:
+            if server.open.get(goal) is not known:  # the action server has died since
                 return
+            del server.open[goal]
             lost = self._overtaken(server, known)
             if goals.is_success(Part.GOAL, answer):
                 server.accepted[goal] = answer
-                if len(server.accepted) > self._accepted_kept:
+                if len(server.accepted) > self.accepted_kept:
                     server.accepted.popitem(last=False)
         try:
             for _, incoming in known.waiting:
@@ -204,21 +207,21 @@ class GoalsOnce:
         One that was silent for long was given more than its queue holds, which then loses the
         oldest. It answers in order: what it was given before that, it has lost.
         """
+        now, by_at = self._clock(), by.begun_at or 0.0
         lost = [
             goal
             for goal, known in server.open.items()
             if known.begun_at is not None
-            and by.begun_at is not None
-            and known.begun_at < by.begun_at
-            and not known.holds
+            and known.begun_at < by_at
             and not known.unheard
+            and not known.holds(now)
         ]
         return [server.open.pop(goal) for goal in lost]
 
     # -- time and ends --------------------------------------------------------------------
 
     def tick(self) -> None:
-        """Refuse the copies whose deadline has come. Call at about 10 Hz."""
+        """Refuse copies past their deadline. Call at about 10 Hz."""
         now = self._clock()
         late: list[Incoming] = []
         with self._lock:
@@ -226,19 +229,15 @@ class GoalsOnce:
                 for goal, known in list(server.open.items()):
                     late += [one for deadline, one in known.waiting if deadline <= now]
                     known.waiting = [entry for entry in known.waiting if entry[0] > now]
-                    if known.begun_at is None:
-                        if not known.waiting:  # never begun: nobody wants it any more
-                            del server.open[goal]
-                            server.queue.remove(goal)
-                    elif now - known.begun_at > _PATIENCE_S:
-                        known.holds = False
+                    if known.begun_at is None and not known.waiting:
+                        del server.open[goal]  # never begun: nobody wants it any more
         for incoming in late:
             incoming.refuse(Refusal.EXPIRED)
         for service in self._servers:
             self._pass_on(service)
 
     def crashed(self, service: str = "") -> None:
-        """A service, or all with the user's command, has died: its action has lost all goals."""
+        """Note that a service, or the whole command, died: its action has lost all goals."""
         action, now = service.rpartition("/")[0], self._clock()
         for name, server in self._servers.items():
             if not service or name.rpartition("/")[0] == action:
@@ -247,20 +246,17 @@ class GoalsOnce:
                     if service and service != part and now - at < _ONE_DEATH_S:
                         continue
                     server.death = service, now
-                    server.life += 1
                     server.accepted.clear()
                     ended, server.open = server.open, {}
-                    server.queue.clear()
                 self._refuse(name, ended.values(), Refusal.CRASHED)
 
     def left_ros(self) -> None:
-        """We have lost our own node: answers under way never come, and are not asked again."""
+        """Note that our own node was lost: pending answers never come, and are not asked again."""
         for name, server in self._servers.items():
             with self._lock:
                 unbegun = [server.open.pop(goal) for goal in server.queue]
-                server.queue.clear()
                 for known in server.open.values():
-                    known.holds, known.unheard = False, True
+                    known.unheard = True
             self._refuse(name, unbegun, Refusal.NOT_READY)
 
     def _refuse(self, service: str, ended: Collection[_Open], reason: Refusal) -> None:
@@ -273,7 +269,7 @@ class GoalsOnce:
 
 
 def for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool] | None:
-    """Return what says whether an answer holds for the moment only; None where none does.
+    """Return a predicate for answers that hold only for the moment; None if none do.
 
     A replica that comes later is asked for a result as soon as it is given the goal: it may answer
     that before it knows the goal.

@@ -1,4 +1,4 @@
-"""Requests that a replica, or a gateway, knows: each id once, with its answer for a while. Pure.
+"""Requests known to a replica or gateway: each id once, its answer kept for a while. Pure.
 
 A robot that lost its link sends what was in flight again, under the same id. So an id is known
 until its deadline, and its answer is kept for copies as long as there is room.
@@ -17,7 +17,12 @@ _DEADLINES_KEPT = 1024  # of jobs that were forgotten
 
 
 class KnownRequests:
-    """The jobs that are held, and at most `kept_ids` that were answered not long ago."""
+    """The open jobs, and at most `kept_ids` recently answered ones.
+
+    Args:
+        kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
+        kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
+    """
 
     def __init__(self, kept_bytes: int, kept_ids: int) -> None:
         self._kept_bytes_limit = kept_bytes
@@ -35,7 +40,7 @@ class KnownRequests:
         return len(self._jobs) + len(self._deadlines)
 
     def unanswered(self, service: str | None) -> list[Job]:
-        """Return the jobs that somebody waits for, of one service or of all."""
+        """Return the jobs that a caller waits for, of one service or of all."""
         return [
             job
             for job in self._jobs.values()
@@ -43,7 +48,7 @@ class KnownRequests:
         ]
 
     def add(self, job: Job) -> None:
-        """Hold a new job."""
+        """Add a new job."""
         self._jobs[job.id] = job
         heapq.heappush(self._deadlines, (job.deadline, job.id))
         if len(self._deadlines) > 2 * len(self._jobs) + _DEADLINES_KEPT:
@@ -55,12 +60,12 @@ class KnownRequests:
         self.held_bytes += job.size
 
     def release(self, job: Job) -> None:
-        """A job is held no more."""
+        """Note that a job is done."""
         self.held -= 1
         self.held_bytes -= job.size
 
     def forget(self, job: Job) -> None:
-        """Forget a job that is held no more: a copy is run anew."""
+        """Forget a finished job, so that a copy is run again."""
         del self._jobs[job.id]
 
     def keep(self, job: Job, answer: bytes) -> None:
@@ -83,7 +88,7 @@ class KnownRequests:
             self._kept_bytes -= len(job.answer or b"")
 
     def expired(self, now: float) -> list[bytes]:
-        """Forget what is past its deadline; return the ids that somebody still waits for."""
+        """Forget jobs past their deadline; return the ids that a caller still waits for."""
         late = []
         while self._deadlines and self._deadlines[0][0] <= now:
             _, id = heapq.heappop(self._deadlines)

@@ -1,4 +1,4 @@
-"""What a replica offers: the services that its configuration lists, or whatever `run` advertises.
+"""The services that a replica offers: those in its configuration, or those of `run`.
 
 Where the configuration lists none, the ROS graph of the replica is looked at, and every service
 that an application offers there is taken up, under the name that ROS gives it: namespaces and
@@ -23,7 +23,11 @@ _TOLD = 8  # names in a sentence
 
 
 class Offering:
-    """The services of one replica."""
+    """The services of one replica.
+
+    Args:
+        services: Those of the configuration; none to find them out.
+    """
 
     def __init__(
         self,
@@ -59,12 +63,12 @@ class Offering:
         return new
 
     def reset(self) -> None:
-        """Forget what was seen: `run` has ended."""
+        """Forget the services seen, because `run` has exited."""
         self._seen, self._seen_since = {}, self._clock()
 
     @property
     def told(self) -> dict[str, str]:
-        """Return name -> type of what was found out, once it has settled; else nothing."""
+        """Return name -> type of the discovered services, once stable; else nothing."""
         if not self._finds_out or self._clock() < self._seen_since + SETTLED_S:
             return {}
         return dict(self._seen)
@@ -80,7 +84,7 @@ class Offering:
         return told if all(definition.known for definition in told.values()) else {}
 
     def missing(self, ready: frozenset[str]) -> str:
-        """Return in words what is missing, and what `run` offers instead; empty if nothing is."""
+        """Return in words the missing services and what `run` offers instead; empty if complete."""
         if self._finds_out and not self.services:
             return "`run` offers no service yet"
         missing = sorted({service.name for service in self.services} - ready)
@@ -89,6 +93,9 @@ class Offering:
             limit = f"may have {NAMES_BYTES_LIMIT} bytes together"
             return f"{what} {limit}" if self._left_out and self._finds_out else ""
         listed = {service.name: service.type for service in self.services}
+        for name in missing:
+            if (offered := self._seen.get(name)) and offered != listed[name]:
+                return f"`run` offers {name} as {offered}, not as {listed[name]}"
         others = [f"{n} ({t})" for n, t in sorted(self._seen.items()) if listed.get(n) != t]
         more = "; it offers " + ", ".join(others[:_TOLD]) if others else ""
         if len(others) > _TOLD:

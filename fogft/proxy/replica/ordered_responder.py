@@ -1,4 +1,4 @@
-"""The replica's side of one stateful service: carry out what `OrderedReplica` decides.
+"""The replica's side of one stateful service: carries out what `OrderedReplica` decides.
 
 Orders come from the wire's threads, responses from the ROS thread. The lock is held while a
 decision is made, never while something is sent.
@@ -33,7 +33,7 @@ _SNAPSHOT_LIMIT_S = 30.0
 
 
 class Clients(NamedTuple):
-    """The three local services: the one itself, its snapshot and its restore."""
+    """Clients of the three local services: the service, its snapshot and its restore."""
 
     service: RosClient
     snapshot: RosClient
@@ -66,22 +66,22 @@ class OrderedResponder:
 
     @property
     def ready(self) -> bool:
-        """Whether it has the present state and applies what comes."""
+        """Whether it has the current state and applies requests."""
         return self._machine.current
 
     @property
     def in_flight(self) -> int:
-        """Requests that are held and not yet answered."""
+        """The number of unanswered requests."""
         return self._machine.in_flight
 
     def use(self, clients: Clients | None) -> None:
-        """Set the clients of the local services; None while ROS is left."""
+        """Set the clients of the local services; None without a ROS node."""
         with self._lock:
             self._clients = clients
             self._machine.serving = False
 
     def request(self, incoming: Incoming) -> None:
-        """Take an order from the wire. Never blocks."""
+        """Take an order from the link. Never blocks."""
         try:
             op, epoch, index = orders.decode(incoming.request_id)
         except OrderError:
@@ -110,7 +110,7 @@ class OrderedResponder:
         clients = self._clients
         try:
             if clients is None:
-                raise RosError("ROS was left")
+                raise RosError("ROS has shut down")
             if begin.op is Op.APPLY:
                 clients.service.call(begin.payload, lambda answer: self._done(begin, answer))
             elif begin.op is Op.SNAPSHOT:
@@ -162,14 +162,14 @@ class OrderedResponder:
         self._perform(effects)
 
     def crashed(self) -> None:
-        """The service has died, with its state."""
+        """Note that the service has died, with its state."""
         with self._lock:
             self._again = None
             effects = self._machine.lost()
         self._perform(effects)
 
     def tick(self, alive: bool) -> None:
-        """Look for the services, and try again what ROS did not take. Call at about 10 Hz."""
+        """Look for the services, and retry calls that ROS rejected. Call at about 10 Hz."""
         with self._lock:
             clients = self._clients
             self._machine.serving = alive and clients is not None and clients.available()

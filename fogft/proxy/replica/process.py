@@ -1,4 +1,4 @@
-"""``fogft serve --config FILE``: the server proxy as a process, one a replica.
+"""``fogft serve --config FILE``: the server proxy process, one per replica.
 
 It ends with status 0 when it was told to or when its lease is over; whoever started it (a VM's
 job, the local cloud's machine) then ends the machine.
@@ -17,18 +17,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fogft.cloud import notice
-from fogft.cloud.local.reservations import Reservation, own_domain, reserve_domain
 from fogft.cloud.notice import Notice, NoticeKind
-from fogft.link.zenoh import runtime
+from fogft.link.zenoh.settings import forget_threads
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.metrics.spans import wanted
 from fogft.model.proxy_config import ServerProxyConfig
 from fogft.model.type_definition import Definition
-from fogft.process import start_log, stop_on_signal
-from fogft.proxy import middleware, start
-from fogft.proxy.announcing import Presence
+from fogft.process import begin_start, end_start, start_log, stop_on_signal
+from fogft.proxy import middleware
 from fogft.proxy.config import read_server
+from fogft.proxy.replica.announcing import Presence
 from fogft.proxy.replica.server import ServerProxy
 from fogft.proxy.replica.service_queue import Job
 from fogft.proxy.replica.supervisor import Supervisor
@@ -36,6 +35,7 @@ from fogft.records import cache
 from fogft.records.record import RecordKind
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
+from fogft.ros.reservations import Reservation, own_domain, reserve_domain
 
 log = logging.getLogger(__name__)
 
@@ -58,13 +58,17 @@ def run(
     """Run until a signal ends it, or until the manager's lease is over.
 
     Args:
+        listen: ``host:port`` instead of the file's.
+        domain_id: ROS domain instead of the file's.
+        workdir: Folder in which `run` starts, instead of the file's.
         notice_file: File that appears when the machine is about to be preempted.
         advertise: ``host:port`` at which this replica is reached, where it cannot know that.
+        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
 
     Raises:
         FogftError: The configuration, the credentials or ROS cannot be used.
     """
-    start.begin()
+    begin_start()
     config = read_server(
         config_path,
         listen=listen,
@@ -105,7 +109,7 @@ def run(
         proxy.start()
         scrape.at(config.metrics)
         presence = Presence(config, proxy.endpoint)
-        start.settle()
+        end_start()
         _loop(proxy, presence, stop, died)
         if proxy.lease_is_over:
             log.error("lease_over replica=%s reason='no manager was heard of'", config.id)
@@ -179,13 +183,13 @@ def _make(
 
 
 def run_environment(config: ServerProxyConfig) -> dict[str, str]:
-    """Return what the user's command finds in its environment.
+    """Return the environment of the user's command.
 
     In a virtual environment its own `python3` comes first, as if it were activated, so that
     ``run: python3 node.py`` finds the same ROS as the proxy.
     """
     environ = environment.child_environment(os.environ)
-    runtime.forget(environ)
+    forget_threads(environ)
     if sys.prefix != sys.base_prefix:
         environ["VIRTUAL_ENV"] = sys.prefix
         environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"

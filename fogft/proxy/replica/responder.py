@@ -8,7 +8,7 @@ waits past its deadline is never begun, nor what its robot no longer wants.
 
 Owns: what becomes of the requests that this replica holds.
 Not here: which ids are known (`known_requests`), in what order they run and how many
-(`service_queue`), readiness and `run` (`supervisor`), links, ROS.
+(`service_queue`), readiness and the command (`supervisor`), links, ROS.
 """
 
 from __future__ import annotations
@@ -22,9 +22,8 @@ from functools import partial
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
-from fogft.proxy.replica.interruption import Interruptions
 from fogft.proxy.replica.known_requests import KnownRequests
-from fogft.proxy.replica.service_queue import Job, ServiceQueue
+from fogft.proxy.replica.service_queue import Interruptions, Job, ServiceQueue
 from fogft.requests.load import Handling, Load
 from fogft.ros.port import RosClient
 
@@ -36,45 +35,46 @@ OUTSTANDING = 10
 
 
 class Responder:
-    """Hands requests to the local services and gives each copy its answer.
+    """Passes requests to the local services, and answers each copy.
 
     Args:
         limits: How many may be at work, by service, where it is not to be learned.
         latest: Services of which the newest request goes first.
         passing: Whether a service's answer holds for the moment only: a copy is run anew; None
             where none does.
-        kept_bytes, kept_ids: As for `KnownRequests`.
         answered: Told of each request that the service has answered, and when.
 
     Attributes:
+        ran, ran_s: Requests passed on, and the time until their responses together.
+        joined: Copies of requests that were known.
         saved, interrupted: Requests dropped unbegun, or told to stop, that nobody wanted any more.
+        wasted, wasted_s: Requests that were run for nobody: too late, or unwanted.
     """
+
+    held_limit = 512  # requests held at once; more are refused, from whom has most waiting
+    held_bytes = 64 << 20  # of them together; more are refused as overloaded
+    outstanding = OUTSTANDING  # passed on to one service at once, where no limit is given
+    kept_bytes, kept_ids = 16 << 20, 32768  # as for `KnownRequests`
 
     def __init__(
         self,
         is_ready: Callable[[str], bool],
         *,
-        max_in_flight: int = 512,
-        held_bytes: int = 64 << 20,
-        outstanding: int = OUTSTANDING,
         limits: Mapping[str, int] | None = None,
         latest: Collection[str] = (),
         passing: Callable[[str, bytes], bool] | None = None,
-        kept_bytes: int = 16 << 20,
-        kept_ids: int = 32768,
         answered: Callable[[Job, float], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._is_ready = is_ready
-        self._max_in_flight, self._held_bytes_limit = max_in_flight, held_bytes
-        self._outstanding, self._limits = outstanding, dict(limits or {})
+        self._limits = dict(limits or {})
         self._latest = frozenset(latest)
         self._passing = passing
         self._clock, self._answered = clock, answered
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
         self._interruptions = Interruptions()
-        self._known = KnownRequests(kept_bytes, kept_ids)
+        self._known = KnownRequests(self.kept_bytes, self.kept_ids)
         self._queues: dict[str, ServiceQueue] = {}
         self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
         self.ran_s = self.wasted_s = 0.0
@@ -82,16 +82,16 @@ class Responder:
 
     @property
     def at_work(self) -> int:
-        """Requests that the services have."""
+        """The number of requests in the services."""
         return sum(queue.at_work for queue in self._queues.values())
 
     @property
     def in_flight(self) -> int:
-        """Requests that are held and not yet answered."""
+        """The number of unanswered requests."""
         return self._known.held
 
     def report(self) -> dict[str, float]:
-        """Return what became of the job, as a probe's answer tells it."""
+        """Return the counters of requests, in the form of a probe's answer."""
         return {
             "held": self._known.held,
             "ran": self.ran,
@@ -105,7 +105,14 @@ class Responder:
         }
 
     def hanging(self, *, stuck: bool = False) -> dict[str, float]:
-        """Return which services have ended nothing for unusually long, and for how long."""
+        """Return the services that have finished nothing for unusually long, and for how long.
+
+        Args:
+            stuck: Only those that are to be started anew for it.
+
+        Returns:
+            For how many seconds, by service.
+        """
         now = self._clock()
         with self._lock:
             return {
@@ -116,7 +123,7 @@ class Responder:
 
     @property
     def limits(self) -> dict[str, int]:
-        """How many requests each service may have at once."""
+        """How many requests each service may have concurrently."""
         return {name: queue.limit.limit for name, queue in self._queues.items()}
 
     def use(
@@ -131,7 +138,7 @@ class Responder:
     # -- from the wire --------------------------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
-        """Take a request from the wire. Never blocks."""
+        """Take a request from the link. Never blocks."""
         now = self._clock()
         displaced = begun = None
         with self._lock:
@@ -176,7 +183,7 @@ class Responder:
         queue = self._queues.get(service)
         if queue is None:
             limit, latest = self._limits.get(service), service in self._latest
-            queue = self._queues[service] = ServiceQueue(self._outstanding, limit, latest=latest)
+            queue = self._queues[service] = ServiceQueue(self.outstanding, limit, latest=latest)
         return queue
 
     def _reason_to_refuse(
@@ -194,15 +201,15 @@ class Responder:
         deadline = now + remaining_s
         hopeless = queue.hopeless(incoming.robot, deadline, remaining_s)
         held_bytes = self._known.held_bytes + len(incoming.payload)
-        if hopeless or (held_bytes > self._held_bytes_limit and self._known.held):
+        if hopeless or (held_bytes > self.held_bytes and self._known.held):
             return Refusal.OVERLOADED, None
-        if self._known.held < self._max_in_flight:
+        if self._known.held < self.held_limit:
             return None, None
         displaced = queue.evict(incoming.robot, deadline)
         return (Refusal.OVERLOADED if displaced is None else None), displaced
 
     def cancel(self, ids: Iterable[bytes]) -> None:
-        """Drop requests that are no longer wanted, or tell them to stop. May block."""
+        """Cancel requests: drop waiting ones, interrupt running ones. May block."""
         dropped, at_work = [], []
         with self._lock:
             for id in ids:
@@ -261,7 +268,7 @@ class Responder:
 
     @property
     def remembered(self) -> int:
-        """How many ids and deadlines of requests are remembered, answered ones included."""
+        """The number of remembered request ids and deadlines, answered ones included."""
         return len(self._known)
 
     def _finished(self, job: Job, payload: bytes) -> None:
@@ -325,7 +332,7 @@ class Responder:
         incoming.refuse(reason, load=load)
 
     def crashed(self, service: str | None = None) -> None:
-        """A service, or all with the user's command, has died: refuse what is held for it."""
+        """Note that a service, or the whole command, died: refuse its requests."""
         with self._lock:
             dead = self._known.unanswered(service)
             blamed = [job for job in dead if job.passed_on]
@@ -344,7 +351,7 @@ class Responder:
             self._end(job.id, Refusal.CRASHED)
 
     def tick(self) -> None:
-        """Drop what is past its deadline. Call at about 10 Hz."""
+        """Drop requests past their deadline. Call at about 10 Hz."""
         now = self._clock()
         with self._lock:
             late = self._known.expired(now)

@@ -1,4 +1,4 @@
-"""The server proxy: the replica's side. Takes requests off the wire to the local services.
+"""The server proxy: passes requests from the link to the replica's local services.
 
 It says "ready" for a service only while the user's command lives and discovery finds the service,
 and answers probes at once whatever the services do.
@@ -31,15 +31,15 @@ from fogft.model.state import StateSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.replica.goals_once import GoalsOnce, for_the_moment
-from fogft.proxy.replica.interruption import CANCEL_TYPE
 from fogft.proxy.replica.offering import Offering
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.replica.responder import Responder
-from fogft.proxy.replica.service_queue import Job, limits_of
+from fogft.proxy.replica.service_queue import CANCEL_TYPE, Job, limits_of
 from fogft.proxy.replica.serving_lease import HeldLease
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
 from fogft.records.record import Record
+from fogft.ros.joining import Pauses
 from fogft.ros.port import RosClient, RosNode
 
 if TYPE_CHECKING:
@@ -54,13 +54,17 @@ _LOOK_EVERY_S = 0.15  # at services, while all are ready
 
 
 class ServerProxy:
-    """Answers for one replica.
+    """The server proxy of one replica.
 
     Args:
+        services: What it answers; none for whatever the command offers.
+        listener: Its end of the wire; `serve` is called here.
         make_node: Joins ROS; called again after each death of the command.
         spare: A second process of the command, to take over when the first dies.
         make_state: Says how the state of a stateful service travels.
         define: Returns the definition of a service type here, for the robot to compare.
+        topics: What passes besides services; then nodes publish and subscribe, too.
+        answered: As for `Responder`.
     """
 
     def __init__(
@@ -84,6 +88,7 @@ class ServerProxy:
         self._listener, self._make_node = listener, make_node
         self.command, self._spare = command, spare  # the process at work, and the one that waits
         self._clock, self._look_at = clock, 0.0
+        self._pauses = Pauses()
         self._lease = HeldLease(clock)
         self._topics = TopicsOnReplica(topics, clock)
         self._incarnation = secrets.token_hex(8)
@@ -109,11 +114,11 @@ class ServerProxy:
         self._goals = GoalsOnce(
             [s.name for s in services if s.part is Part.GOAL],
             lambda name: name in self.ready,
-            clock=clock,
+            clock,
         )
 
     def start(self) -> None:
-        """Begin to listen and start the user's command."""
+        """Start listening, and start the user's command."""
         keys = self._keys(self._offering.services)
         keys |= names.service_keys(self._id.pool_uid, self._id.slot, self._topics.types)
         self._join_ros()
@@ -129,11 +134,11 @@ class ServerProxy:
         return names.service_keys(self._id.pool_uid, self._id.slot, types)
 
     def run_once(self) -> None:
-        """See to the command, to readiness and to deadlines. Call at about 10 Hz."""
+        """Supervise the command, readiness and deadlines. Call at about 10 Hz."""
         lease = self._listener.lease()
         self.renew(() if lease is None else (lease,))
-        died = self._poll()
-        if died or self._node is None or not self._node.alive:
+        died, stopped = self._poll(), self._pauses.was_long()
+        if died or stopped or self._node is None or not self._node.alive:
             self.ready = frozenset()
             if died:
                 self._goals.crashed()
@@ -145,6 +150,8 @@ class ServerProxy:
         if not self.complete or now >= self._look_at:
             self._look_at = now + _LOOK_EVERY_S
             self._look_for_services()
+            if self._node is not None:
+                self._node.look()
         self._end_stuck()
         self.responder.tick()
         self._goals.tick()
@@ -233,7 +240,10 @@ class ServerProxy:
         return {name: seconds for name, seconds in hanging.items() if name in plain}
 
     def _replaced(self) -> set[str]:
-        """Return the services with one more server than before: the dead one is listed for long."""
+        """Return the services that have one more server than before.
+
+        It took the place of one that died: discovery lists the dead one beside it for long.
+        """
         before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
         return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
 
@@ -244,7 +254,7 @@ class ServerProxy:
 
     @property
     def idle(self) -> bool:
-        """Whether all can answer, and nobody waits for it."""
+        """Whether all services can answer, and nothing is pending."""
         return (
             self.complete
             and not self.responder.in_flight
@@ -257,24 +267,24 @@ class ServerProxy:
         return self._listener.endpoint
 
     def renew(self, records: Iterable[Record]) -> None:
-        """Take leases that the manager signed; only a newer one changes anything."""
+        """Take signed manager leases; only a newer one has an effect."""
         for record in records:
             self._lease.renew(record)
 
     def revoke(self, names: frozenset[str]) -> None:
-        """Let these holders of certificates in no more."""
+        """Revoke the access of these certificate holders."""
         if names - self._revoked:
             self._revoked |= names
             self._listener.revoke(self._revoked)
 
     @property
     def lease_is_over(self) -> bool:
-        """Whether the manager was not heard of for as long as it said in advance."""
+        """Whether the lease has expired, because no manager was heard of."""
         left_s = self._lease.left_s
         return left_s is not None and left_s <= 0
 
     def noticed(self, notice: Notice) -> None:
-        """Pass on what the machine was told by its cloud. From any thread; never taken back.
+        """Take a preemption notice of this machine. Any thread; never withdrawn.
 
         A preemption asks the robot to prefer the others, and the manager to replace this
         replica; a rebalance is a hint, and the replica serves on as before.
@@ -285,7 +295,7 @@ class ServerProxy:
             self._at_risk = True
 
     def report(self) -> dict[str, Any]:
-        """Return what became of requests here, for metrics."""
+        """Return the counters of requests, for metrics."""
         answering = self._answering()
         return {
             "work": self.responder.report(),
@@ -398,13 +408,13 @@ class ServerProxy:
     def _detail_of_complete(self) -> str:
         for name, ordered in self._ordered.items():
             if not ordered.ready:
-                return ordered.detail or f"`{name}` does not have the present state yet"
+                return ordered.detail or f"`{name}` does not have the current state yet"
         for name, seconds in () if self._topics.trouble else self._hanging().items():
-            return f"`{name}` has work and has answered nothing for {seconds:.0f} s"
+            return f"`{name}` has requests and has answered none for {seconds:.0f} s"
         return self._topics.trouble
 
     def close(self) -> None:
-        """Stop the command, leave the wire and ROS."""
+        """Stop the command, and close the link and the ROS node."""
         self.ready = frozenset()
         for command in filter(None, (self._spare, self.command)):
             command.stop()

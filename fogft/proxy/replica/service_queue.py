@@ -1,22 +1,32 @@
-"""The jobs of one service at a replica: what waits, what was passed on, and how many may be.
+"""The jobs of one service at a replica: waiting ones, running ones, and the limit of those.
 
 In what order requests run is decided here and nowhere else (`take`). Called under the
 responder's lock.
 
-Owns: a service's queue, its limit, and the room that is taken.
-Not here: request ids and copies (`responder`), the order itself (`requests.admission`).
+A service is told to stop what it works on through the cancel service that it offers, a
+`std_srvs/srv/Trigger`: "stop what you are doing". That names no request, because a ROS service does
+not know our ids. So a service that has one is given one request at a time, and nothing more until
+the cancel service has answered: else what stops might be the next request. (The two travel apart,
+in any order.)
+
+Owns: a service's queue, its limit, the room that is taken, and the cancel calls under way.
+Not here: request ids and copies (`responder`), the order itself (`requests.fair_queue`).
 """
 
 from __future__ import annotations
 
+import logging
 from collections import deque
+from collections.abc import Callable, Mapping
 
+from fogft.errors import RosError
 from fogft.link.port import Incoming
 from fogft.model.keys import LONGEST_S
 from fogft.model.spec import ServiceSpec
-from fogft.requests.admission import AdmissionQueue
 from fogft.requests.concurrency import ConcurrencyLimit
+from fogft.requests.fair_queue import FairQueue
 from fogft.requests.load import NEARLY, Handling, Load
+from fogft.ros.port import RosClient
 
 # Job whose deadline has passed is still in the service's hands and takes its room. After so
 # long its response is taken for lost.
@@ -33,7 +43,7 @@ _LONGEST_FADES = 0.999  # with each answer
 
 
 class Job:
-    """A request that was accepted: who waits for it, and its answer once there is one."""
+    """An accepted request: its callers, and its answer once there is one."""
 
     __slots__ = (
         *("alone", "answer", "arrived", "begun", "deadline", "id", "level", "passed_on"),
@@ -68,7 +78,7 @@ class ServiceQueue:
     """
 
     def __init__(self, most: int, given: int | None = None, *, latest: bool = False) -> None:
-        self._waiting: AdmissionQueue[Job] = AdmissionQueue(latest=latest)
+        self._waiting: FairQueue[Job] = FairQueue(latest=latest)
         self.evict = self._waiting.evict  # what must go so that a newcomer fits in
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
@@ -84,7 +94,7 @@ class ServiceQueue:
         return len(self._waiting)
 
     def put(self, job: Job) -> None:
-        """Let a job wait for its turn."""
+        """Queue a job."""
         # A spare copy that waits for what is nearly over goes after all that is none.
         deadline = job.deadline + (LONGEST_S if job.spare else 0.0)
         self._waiting.put(job.id, job.robot, deadline, job)
@@ -94,32 +104,37 @@ class ServiceQueue:
         return self.at_work < self.limit.limit and not self._alone
 
     def has_free_slot(self, now: float) -> bool:
-        """Whether nothing waits, and the service can begin with one more at once, or nearly."""
+        """Whether nothing waits, and the service can start one more (almost) at once."""
         if len(self._waiting) or self._alone:
             return False
         nearly_over = now - self._begun_last >= NEARLY * self.limit.takes_s > 0.0
         return self.at_work < max(1, self.limit.known) or (self.at_work == 1 and nearly_over)
 
     def takes(self, job: Job) -> bool:
-        """Whether a job that comes now is passed on at once."""
+        """Whether a job that arrives now is passed on at once."""
         return self._has_room and not len(self._waiting) and not (job.alone and self.at_work)
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
-        """Return what there is to do when `ended` have just ended; None until the pace is known."""
+        """Return the load when `ended` have just ended; None until the pace is known.
+
+        Args:
+            spent_s: How long the request was here that is answered with it.
+            ended: How many of those at work have just ended.
+        """
         if not self.limit.service_s:
             return None
         waiting, running = len(self._waiting), self.at_work - ended
         return Load(waiting, running, self.limit.known, self.limit.service_s, spent_s)
 
     def hopeless(self, robot: str, deadline: float, remaining_s: float) -> bool:
-        """Whether a request would wait past its deadline, as far as is known."""
+        """Whether a request is expected to wait past its deadline."""
         waiting = len(self._waiting)
         if not waiting or self.limit.wait_s(waiting, self.at_work) <= remaining_s:
             return False
         return self.limit.wait_s(self._waiting.ahead(robot, deadline), self.at_work) > remaining_s
 
     def take(self, now: float) -> Job | None:
-        """Return what is to be passed on next; None when nothing waits, or nothing more may be.
+        """Return the next job to pass on; None if none waits or the limit is reached.
 
         What it returns may be past its deadline, or about to be while others wait that are not:
         then it was not begun and takes no room.
@@ -135,7 +150,7 @@ class ServiceQueue:
         return job
 
     def begin(self, job: Job, now: float) -> None:
-        """Job is passed on."""
+        """Note that a job is passed on."""
         self.at_work += 1
         self._alone = job.alone
         self._unanswered += 1
@@ -146,11 +161,11 @@ class ServiceQueue:
         job.passed_on, job.begun, job.level = True, now, self.at_work
 
     def remove(self, job: Job) -> bool:
-        """Take a job out that waits; whether it did."""
+        """Remove a waiting job; return whether it was waiting."""
         return self._waiting.remove(job.id) is not None
 
     def finished(self, job: Job, now: float) -> None:
-        """The service has answered."""
+        """Note that the service has answered."""
         if job.passed_on:
             took_s = now - job.begun
             self.limit.finished(job.level, took_s, now)
@@ -160,7 +175,7 @@ class ServiceQueue:
         self._quiet_since = now if self.at_work else None
 
     def free(self, job: Job) -> None:
-        """The service has no more to do with this job."""
+        """Note that the service is done with a job."""
         if job.passed_on:
             job.passed_on = False
             self.at_work -= 1
@@ -170,32 +185,32 @@ class ServiceQueue:
                 self._quiet_since = None
 
     def hangs(self, now: float) -> bool:
-        """Whether the service has work, and has ended none for far longer than it takes."""
+        """Whether the service has work, and has finished none for far longer than usual."""
         return self.quiet_s(now) > max(_HANGS_AFTER_S, _HANGS_AFTER_TIMES * self._longest_s)
 
     def stuck(self, now: float) -> bool:
-        """Whether it hangs, and nobody waits for anything that it has."""
+        """Whether it hangs, and no caller waits for its work."""
         if self._unanswered < _STUCK_ON or now < self._last_deadline:
             return False
         return self.quiet_s(now) > max(_STUCK_AFTER_S, _STUCK_AFTER_TIMES * self._longest_s)
 
     def quiet_s(self, now: float) -> float:
-        """Return how long the service, which has answered before, has ended none of its work."""
+        """Return for how long a service that has answered before has finished none of its work."""
         if self._quiet_since is None or not self._longest_s:
             return 0.0
         return now - self._quiet_since
 
     def died(self) -> None:
-        """The service is another process from now on, of which nothing is known."""
+        """Note that the service is a new process, of which nothing is known."""
         self._quiet_since, self._unanswered = None, 0
         self._longest_s = self._last_deadline = 0.0
 
     def overdue(self, job: Job, now: float) -> None:
-        """Job that was passed on is past its deadline: it keeps its room for a while."""
+        """Note that a running job is past its deadline; it keeps its slot for a while."""
         self._overdue.append((now + _ABANDONED_AFTER_S, job))
 
     def abandoned(self, now: float) -> list[Job]:
-        """Return the overdue jobs whose response is taken for lost; their room is free."""
+        """Return the overdue jobs whose response counts as lost; their slots are free."""
         found = []
         while self._overdue and self._overdue[0][0] <= now:
             job = self._overdue.popleft()[1]
@@ -207,7 +222,60 @@ class ServiceQueue:
 
 
 def limits_of(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
-    """Return how many requests a service may have at once, where that is not to be learned."""
+    """Return how many requests a service may have concurrently, if that is fixed."""
     # A cancel service names no request, so it must be clear which one is meant.
     limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
     return {name: limit for name, limit in limits.items() if limit}
+
+
+log = logging.getLogger(__name__)
+
+CANCEL_TYPE = "std_srvs/srv/Trigger"
+# A serialised message without fields: the header, the byte that stands for no fields, padding.
+# Kept true by tests/ros/test_types.py.
+EMPTY_REQUEST = bytes((0, 1, 0, 0, 0, 0, 0, 0))
+_LIMIT_S = 2.0
+
+
+class Interruptions:
+    """The cancel services of a replica. `send` needs no lock, the rest the responder's."""
+
+    def __init__(self) -> None:
+        self._clients: Mapping[str, RosClient] = {}
+        self._under_way: dict[str, tuple[ServiceQueue, float]] = {}
+
+    def use(self, clients: Mapping[str, RosClient]) -> None:
+        """Set the clients of the cancel services, by the service that they interrupt."""
+        self._clients = clients
+
+    def begin(self, job: Job, queue: ServiceQueue, now: float) -> bool:
+        """Hold back the service's next request; return whether there is a service to call."""
+        service = job.service
+        if service not in self._clients or service in self._under_way or not job.passed_on:
+            return False
+        queue.at_work += 1
+        self._under_way[service] = (queue, now + _LIMIT_S)
+        return True
+
+    def send(self, service: str, ended: Callable[[str], None]) -> bool:
+        """Call the cancel service; `ended` is called once it has answered."""
+        try:
+            self._clients[service].call(EMPTY_REQUEST, lambda _: ended(service))
+        except (RosError, KeyError) as error:
+            log.warning("cancel_not_called service=%s reason=%r", service, str(error))
+            ended(service)
+            return False
+        return True
+
+    def ended(self, service: str) -> None:
+        """Note that the cancel service has answered or died: the next request may go."""
+        found = self._under_way.pop(service, None)
+        if found is not None:
+            found[0].at_work -= 1
+
+    def tick(self, now: float) -> None:
+        """Give up on cancel services that do not answer."""
+        for service, (_, until) in list(self._under_way.items()):
+            if until <= now:
+                log.warning("cancel_unanswered service=%s waited_s=%.1f", service, _LIMIT_S)
+                self.ended(service)

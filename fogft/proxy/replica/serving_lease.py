@@ -1,4 +1,4 @@
-"""For how long a replica goes on without hearing of the pool's manager. Pure.
+"""How long a replica keeps serving without hearing from the manager. Pure.
 
 The manager signs leases, and signs a new one every minute or sooner: each says when it was signed
 and how long it lasts. Robots and rendezvous pass them on, and nothing else that they say or do
@@ -30,7 +30,7 @@ class HeldLease:
         self._heard_at = self._ends_at = 0.0
 
     def renew(self, record: Record) -> None:
-        """Take a lease whose signature was checked; an older one changes nothing."""
+        """Take a verified lease; an older one changes nothing."""
         if record.order <= self._order:
             return
         lease, now = roster.lease(record), self._clock()
@@ -42,10 +42,10 @@ class HeldLease:
 
     @property
     def age_s(self) -> float | None:
-        """Seconds since a newer lease came; None where none ever did."""
+        """Seconds since the lease was renewed; None if it never was."""
         return None if self._ahead is None else self._clock() - self._heard_at
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until it is over; None where there is none."""
+        """Seconds until it expires; None without a lease."""
         return None if self._ahead is None else max(0.0, self._ends_at - self._clock())

@@ -1,4 +1,4 @@
-"""Run the user's command as a child: start it, see it die, start it again, end it.
+"""Run the user's command as a child process, and restart it when it exits.
 
 The command gets a session of its own and dies with this process, whatever ends it
 (`fogft.child`). It is started through ``bash -c``, as SkyPilot does.
@@ -29,10 +29,15 @@ class Supervisor:
 
     Args:
         command: A shell command; ``exec`` in it saves a process.
-        backoff_s: Second and longest wait between a death and the next start; the first start
-            after a death is at once. A run longer than the longest wait resets it, and so does a
-            death while requests were at work.
+        environ: All that it inherits.
+        domain_id: The ROS domain that it gets; None for what `environ` says.
+        stdout: Descriptor for its standard output; None for our own.
     """
+
+    # Second and longest wait between a death and the next start; the first start after a death is
+    # at once. A run longer than the longest wait resets it, and so does a death while requests were
+    # at work.
+    backoff_s = 0.5, 15.0
 
     def __init__(
         self,
@@ -42,7 +47,6 @@ class Supervisor:
         *,
         domain_id: int | None = None,
         clock: Callable[[], float] = time.monotonic,
-        backoff_s: tuple[float, float] = (0.5, 15.0),
         stdout: int | None = None,
     ) -> None:
         self._stdout = stdout
@@ -53,7 +57,6 @@ class Supervisor:
         if domain_id is not None:
             self.environ["ROS_DOMAIN_ID"] = str(domain_id)
         self._clock = clock
-        self._backoff_s = backoff_s
         self._wait_s = 0.0  # the first restart is at once
         self.start_at = 0.0
         self._started_at = 0.0
@@ -63,7 +66,7 @@ class Supervisor:
 
     @property
     def pid(self) -> int | None:
-        """The command's process; None where there is none."""
+        """The pid of the command; None if it does not run."""
         return self._child.pid if self._child is not None else None
 
     @property
@@ -72,7 +75,7 @@ class Supervisor:
         return self._child is not None
 
     def poll(self, *, at_work: bool = False) -> bool:
-        """See whether the command died, and start it when its time has come.
+        """Check whether the command exited, and restart it when due.
 
         Args:
             at_work: Whether it had requests: then one of these has ended it, and it is not its
@@ -96,17 +99,19 @@ class Supervisor:
         assert self._child is not None
         self._kill_group(self._child.pid)  # what it left behind in its group
         ran_s = self._clock() - self._started_at
-        if ran_s > self._backoff_s[1] or at_work:
+        if ran_s > self.backoff_s[1] or at_work:
             self._wait_s = 0.0
         self.last_exit = (
-            f"died of {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
+            f"was killed by {signal.Signals(-status).name}"
+            if status < 0
+            else f"exited with status {status}"
         )
         log.warning("run_ended status=%d ran_s=%.1f again_in_s=%.1f", status, ran_s, self._wait_s)
         self._child = None
         self._delay_next_start()
 
     def _delay_next_start(self) -> None:
-        first_s, longest_s = self._backoff_s
+        first_s, longest_s = self.backoff_s
         self.start_at = self._clock() + self._wait_s
         self._wait_s = min(max(2 * self._wait_s, first_s), longest_s)
 
@@ -130,7 +135,7 @@ class Supervisor:
         log.info("run_started pid=%d command=%r", self._child.pid, self._command)
 
     def restart(self) -> None:
-        """End the command at once; `poll` notes its death and starts it again."""
+        """Kill the command; `poll` notices and restarts it."""
         if self._child is not None:
             self._kill_group(self._child.pid)
 

@@ -1,4 +1,4 @@
-"""Topics at a replica: publish what robots send, and hold what its nodes publish until it is asked.
+"""Topics at a replica: publishes robots' messages, and holds its nodes' messages for them.
 
 Messages travel as requests and answers, so links, credentials and windows are those of services.
 A robot's message is a request that is answered when it was published. What nodes here publish
@@ -127,11 +127,11 @@ class TopicsOnReplica:
 
     @property
     def trouble(self) -> str:
-        """Why one of them cannot pass; empty when all can."""
+        """Why a topic does not get through; empty if all do."""
         return next(iter(self._trouble.values()), "")
 
     def use(self, node: SerialisedNode | None) -> None:
-        """Publish and subscribe with this node from now on; the one before is gone."""
+        """Publish and subscribe with this node from now on."""
         self._publishers, self._subscriptions = {}, {}
         if node is None:
             return
@@ -161,12 +161,12 @@ class TopicsOnReplica:
             self._trouble.pop(name, None)
 
     def ready(self) -> frozenset[str]:
-        """Return the names of those that pass now: somebody here listens, or may speak."""
+        """Return the names of the topics that have an endpoint here."""
         heard = {name for name, one in self._publishers.items() if one.subscribers()}
         return frozenset(self._subscriptions) | heard
 
     def request(self, incoming: Incoming) -> None:
-        """Take a message or a pull from the wire. Never blocks."""
+        """Take a message or a pull from the link. Never blocks."""
         outgoing = self._outgoing.get(incoming.service)
         if outgoing is None:
             self.queue.put(incoming)
@@ -177,7 +177,7 @@ class TopicsOnReplica:
             incoming.refuse(Refusal.MALFORMED)
 
     def tick(self) -> None:
-        """Answer pulls that have waited long enough. Call at about 10 Hz."""
+        """Answer pulls at their time limit. Call at about 10 Hz."""
         now = self._clock()
         for outgoing in self._outgoing.values():
             outgoing.tick(now)
@@ -198,7 +198,7 @@ class TopicsOnReplica:
                 incoming.refuse(Refusal.NOT_READY)
 
     def publish_one(self, incoming: Incoming) -> None:
-        """Publish one message that waited, and tell the robot. On the publishing thread."""
+        """Publish one queued message, and confirm it to the robot. Publishing thread only."""
         session, number, message = frames.decode_message(incoming.payload)
         publisher = self._publishers.get(incoming.service)
         if publisher is None:
@@ -209,5 +209,5 @@ class TopicsOnReplica:
         incoming.reply(b"")
 
     def close(self) -> None:
-        """Publish no more."""
+        """Stop publishing."""
         self.queue.put(None)

@@ -1,4 +1,4 @@
-"""An action on the robot: its three services, of which all replicas get every request.
+"""An action on the robot: three services whose requests go to all replicas.
 
 The goal that a client makes goes to every replica, and to those that come while it is under
 way: a goal outlives the replicas that it was given to. The first that succeeds is the result;
@@ -26,8 +26,7 @@ from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Effect, Refusal
 from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
-from fogft.requests.decide import Decide, Judgement, Means, Reachable, Send
-from fogft.requests.first_response import Pending
+from fogft.requests.decide import Decide, Judgement, Means, Pending, Reachable, Send
 from fogft.topics import goals
 from fogft.topics.goals import Goals, Had
 
@@ -51,7 +50,11 @@ class _ToCancel:
 
 
 class _Action:
-    """What the three services of one action share, under a lock that is taken last."""
+    """What the three services of one action share, under a lock that is taken last.
+
+    Attributes:
+        began: Called, without the lock, with a goal and a replica that has taken it.
+    """
 
     def __init__(self, clock: Callable[[], float], wake: Callable[[], None]) -> None:
         self.lock = threading.Lock()
@@ -70,7 +73,10 @@ class _Action:
 
 
 class _CancelPart(Decide):
-    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile."""
+    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile.
+
+    What a replica cancels is begun on none that comes later.
+    """
 
     replicates = True
 
@@ -283,7 +289,7 @@ class _ResultPart(Decide):
 
 
 class Actions:
-    """Makes the dispatchers of actions, and has those of one action share what they must."""
+    """Creates the dispatchers of actions, which share state within one action."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -296,7 +302,7 @@ class Actions:
         wake: Callable[[], None],
         **how: Any,
     ) -> Dispatcher:
-        """Make the dispatcher of an action's part; `how` is as `Dispatcher` takes it."""
+        """Create the dispatcher of an action's service; `how` as for `Dispatcher`."""
         name = spec.name.rpartition("/")[0]
         action = self._actions.setdefault(name, _Action(self._clock, wake))
         make = partial(Dispatcher, spec, respond, wake=wake, clock=self._clock, **how)

@@ -45,7 +45,15 @@ MakeDispatcher = Callable[
 
 
 class ClientProxy:
-    """Sends each request to the replicas that its policy chooses; returns the first success."""
+    """Sends each request to the replicas that its policy chooses; returns the first success.
+
+    Args:
+        pool_uid: The pool's uid, part of every key.
+        node: The robot's side of ROS; none in a gateway, where requests come from the wire.
+        make_dispatcher: Makes the dispatcher of a service, given how to respond.
+        define: Returns the definition of a service type here; None to compare none.
+        merge: Makes one status of an action of what its replicas say.
+    """
 
     def __init__(
         self,
@@ -79,7 +87,7 @@ class ClientProxy:
     # -- configuration --------------------------------------------------------------------
 
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
-        """Proxy these services and no others. What is under way goes on."""
+        """Proxy exactly these services. Requests under way continue."""
         with self._lock:
             wanted = {spec.name: spec for spec in specs}
             for name in [n for n in self._services if n not in wanted]:
@@ -100,7 +108,7 @@ class ClientProxy:
         self.look_again()
 
     def pass_topics(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> None:
-        """Pass these topics and no others; `node` publishes and subscribes on the robot's side."""
+        """Pass exactly these topics; `node` publishes and subscribes on the robot."""
         with self._lock:
             if self._topics.serve(topics, node):
                 self.links.redial()
@@ -157,7 +165,7 @@ class ClientProxy:
         return True
 
     def renew(self) -> None:
-        """Take new credentials into use, link by link; no request is lost by it."""
+        """Switch to new credentials, link by link; no request is lost."""
         self._dialer.renew()
         if self._membership is not None:
             self.follow(self._membership)  # who was shut out under the old ones may be in again
@@ -172,7 +180,7 @@ class ClientProxy:
         return True
 
     def redial(self) -> None:
-        """Dial everybody anew, by other uplinks; what is in flight is sent again."""
+        """Redial all replicas over other uplinks; requests in flight are sent again."""
         with self._lock:
             self.links.redial()
         self.look_again()
@@ -190,7 +198,7 @@ class ClientProxy:
     # -- events of links (their threads) --------------------------------------------------
 
     def answered(self, link: Link, answer: Answer) -> None:
-        """Pass the end of an attempt to its service: the one that knows the request."""
+        """Pass the end of an attempt to the service of its request."""
         service = self._services.get(answer.service)
         if service is not None:
             service.dispatcher.answered(link, answer)
@@ -198,30 +206,30 @@ class ClientProxy:
             self._topics.answered(key_of(link), answer)
 
     def changed(self, link: Link) -> None:
-        """Wake `run_once`: routes are worked out there, not on a link's thread."""
+        """Wake `run_once`, which computes routes; a link's thread must not."""
         self.look_again()
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Pass on the end of an attempt that nobody awaits."""
+        """Pass on the end of a forgotten attempt."""
         found = self._services.get(answer.service)
         if found is not None:
             found.dispatcher.late(link, answer)
 
     def look_again(self) -> None:
-        """Have routes worked out anew: a type may be known that was not, say. Any thread."""
+        """Have routes recomputed, for instance after a type became known. Any thread."""
         self._changed = True
         self._wake.set()
 
     # -- the proxy's own thread -----------------------------------------------------------
 
     def run_once(self, timeout_s: float = _IDLE_TICK_S) -> bool:
-        """Wait for a change or a moment, then route, advertise and tick; whether something changed.
+        """Wait briefly for a change, then route, advertise and tick; return whether it changed.
 
         Raises:
             RosError: The node's thread has ended: nothing would be taken any more.
         """
         if self._node is not None and not self._node.alive:
-            raise RosError("ROS has stopped; the log says why", "start the proxy again")
+            raise RosError("ROS has stopped; see the log for the reason", "start the proxy again")
         self._wake.wait(max(0.0, min(timeout_s, self._next_look - self._clock())))
         self._wake.clear()
         changed, self._changed = self._changed, False
@@ -261,11 +269,11 @@ class ClientProxy:
 
     @property
     def idle(self) -> bool:
-        """Whether nothing has to be seen to, for all that is known."""
+        """Whether nothing is pending."""
         return self._next_look == NEVER
 
     def report(self) -> dict[str, Any]:
-        """Return links and services as `proxy-status.json` has them."""
+        """Return the report of links and services for `proxy-status.json`."""
         with self._lock:
             links, gateways = self._link_reports()
             services: Mapping[str, Any] = {
@@ -287,50 +295,50 @@ class ClientProxy:
         return self.links.reports(dispatchers, self._differences)
 
     def behind(self) -> tuple[GatewayView, ...]:
-        """Return what is seen of each replica, as a gateway tells its robots."""
+        """Return the state of each replica, as a gateway reports it to its robots."""
         with self._lock:
             links, _ = self._link_reports()
         return tuple(GatewayView.of(report) for report in links)
 
     @property
     def offered(self) -> list[str]:
-        """Services that are offered in ROS now."""
+        """The services currently offered in ROS."""
         return [name for name, service in self._services.items() if service.server is not None]
 
     def begin_leaving(self) -> None:
-        """Leave topics to another proxy, and note which requests are taken beside it."""
+        """Begin a hand-over: leave topics to the other proxy, record requests taken meanwhile."""
         with self._lock:
             for service in self._services.values():
                 service.dispatcher.taken = []
             self._topics.close()
 
     def take_no_more(self) -> None:
-        """Leave callers' requests to another proxy."""
+        """Stop taking requests; another proxy does."""
         with self._lock:
             for service in self._services.values():
                 service.dispatcher.leaving = True
 
     def waiting(self, *, ordered: bool = False) -> int:
-        """Count the requests without an answer; only those of stateful services if asked."""
+        """Count the unanswered requests, of all or only of stateful services."""
         with self._lock:
             services = [s for s in self._services.values() if s.spec.state or not ordered]
             return sum(service.dispatcher.waiting for service in services)
 
     def hold(self) -> dict[str, list[bytes]]:
-        """Order stateful services no more; return what was taken of each since we are leaving."""
+        """Stop ordering stateful services; return the requests taken since the hand-over began."""
         with self._lock:
             services = [s for s in self._services.values() if s.spec.state]
             return {s.spec.name: s.dispatcher.hold() for s in services}
 
     def take_over(self, taken: Mapping[str, Collection[bytes]] | None) -> None:
-        """Order stateful services, but what another proxy has taken; None if that is not known."""
+        """Order stateful services, except requests the other proxy has taken (None: unknown)."""
         with self._lock:
             for name, service in self._services.items():
                 service.dispatcher.take_over(None if taken is None else taken.get(name, ()))
         self.look_again()
 
     def trace(self) -> list[dict[str, Any]]:
-        """Return how requests ended since the last call, of the services that are traced."""
+        """Return the outcomes since the last call, of traced services."""
         past_s = time.time() - time.monotonic()
         with self._lock:
             return [
@@ -340,7 +348,7 @@ class ClientProxy:
             ]
 
     def close(self) -> None:
-        """Close every link. The ROS node is its owner's to close."""
+        """Close every link. The owner closes the ROS node."""
         with self._lock:
             for link in self.links:
                 self._drop(link.peer.id)

@@ -1,4 +1,4 @@
-"""How a request's end reaches its caller: a response, a fallback's, an empty one, or silence.
+"""Delivers a request's outcome to its caller: a response, the fallback's, an empty one or none.
 
 Where a caller is (in ROS, or a robot at a gateway) is the matter of the function that responds.
 When the fallback is asked is `requests.fallback`'s to say; here it is called.
@@ -19,8 +19,8 @@ from fogft.log_limits import worth_logging
 from fogft.metrics.outcomes import Outcome
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.request import Ledger, Request
+from fogft.requests.decide import Pending
 from fogft.requests.fallback import FallbackTimer
-from fogft.requests.first_response import Pending
 from fogft.requests.load import NEVER
 from fogft.ros.port import RosClient
 
@@ -30,7 +30,13 @@ Respond = Callable[[Any, bytes], None]
 
 
 class Delivery:
-    """How one service's requests end."""
+    """The delivery of one service's outcomes.
+
+    Args:
+        respond: Sends a response to the caller of a handle. Any thread.
+        empty_response: The serialised default response, for ``on_timeout: empty``.
+        forget: Tells these replicas that a request is no longer wanted.
+    """
 
     def __init__(
         self,
@@ -47,7 +53,10 @@ class Delivery:
         self.adopt(ledger.spec, None)
 
     def adopt(self, spec: ServiceSpec, client: RosClient | None) -> None:
-        """Follow what a spec says of the fallback, with its client. Under the lock."""
+        """Apply a spec's fallback, with its client. Under the lock.
+
+        Without a fallback nothing more is asked before the deadline.
+        """
         self._client, requests = client, self._ledger.requests
         if requests.fallback is None and spec.fallback is not None:
             requests.fallback = FallbackTimer(spec.fallback)
@@ -59,21 +68,21 @@ class Delivery:
     # -- without the lock -----------------------------------------------------------------
 
     def give(self, pending: Pending[Request], payload: bytes) -> None:
-        """Send a response to its caller. One that ROS does not take harms no other request."""
+        """Send a response to its caller. A failure affects no other request."""
         try:
             self._respond(pending.item.handle, payload)
         except RosError as error:
             self._warn("undelivered", "response_undelivered", error.message)
 
     def poisoned(self, request: bytes, pending: Pending[Request]) -> None:
-        """Services died over a request: it ends now, as its policy says for a deadline."""
+        """End a request that crashed several services, in the way set for its deadline."""
         self._ledger.outcomes.poisoned_at = time.time()
         empty = self._ledger.spec.on_timeout is OnTimeout.EMPTY
         outcome = Outcome.FALLBACK if self._falls_back else Outcome.POISON
         self._end(request, pending, outcome, self._empty_response if empty else None)
 
     def expired(self, request: bytes, pending: Pending[Request]) -> None:
-        """A request's deadline has come."""
+        """Handle a request's deadline."""
         spec, response = self._ledger.spec, pending.rejection
         if self._falls_back:
             outcome = Outcome.FALLBACK
@@ -112,7 +121,7 @@ class Delivery:
     # -- the fallback ---------------------------------------------------------------------
 
     def tick(self, now: float, *, able: bool) -> float:
-        """Ask the fallback for what is due, give up the rest; return when to look again."""
+        """Call the fallback for due requests, and give up the rest; return when to call again."""
         timer, requests = self._ledger.requests.fallback, self._ledger.requests
         if timer is None:
             return NEVER
@@ -148,7 +157,7 @@ class Delivery:
                 payload = pending.item.payload
                 client.call(payload, lambda response: self._fallback_answered(request, response))
                 return True
-            reason = "nobody offers it"
+            reason = "no node offers it"
         except RosError as error:
             reason = error.message
         self._warn("fallback_failed", "fallback_not_asked", reason)

@@ -1,4 +1,4 @@
-"""What people see of a client proxy in ROS, and what they change there.
+"""A client proxy's `/diagnostics` and parameters in ROS.
 
 What ``/diagnostics`` says of the pool, of each service, topic and replica is made of the proxy's
 report. Requests that got no answer are worth a warning for a while, so the counters of half a
@@ -31,8 +31,8 @@ UNMANAGED_AFTER_S = 90.0  # a manager signs a lease for its replicas every minut
 _TROUBLES = {
     "silent": "got no answer",
     "empty": "got an empty answer",
-    "turned_away": "were turned away",
-    "poison": "ended the service and were not sent again",
+    "turned_away": "were rejected",
+    "poison": "crashed the service and were not retried",
     "fallback": "were answered by the fallback",
 }
 _COUNTS = (
@@ -42,7 +42,11 @@ _COUNTS = (
 
 
 class Diagnosis:
-    """Turns reports into statuses."""
+    """Turns reports into diagnostic statuses.
+
+    Args:
+        robot: The robot's; it is the hardware that the pool's and the services' statuses name.
+    """
 
     def __init__(self, pool: str, robot: str) -> None:
         self._pool = pool
@@ -84,17 +88,17 @@ class Diagnosis:
         elif not links:
             message, worst = "there is no replica", Level.ERROR
         else:
-            message = f"{up} of {len(links)} replicas are reached"
+            message = f"{up} of {len(links)} replicas can be reached"
             worst = max(worst, Level.OK if up == len(links) else Level.WARN)
         if left_s is not None:
-            message += f"; no manager runs, replicas end in {left_s / 3600:.1f} h"
+            message += f"; no manager is running, and replicas shut down in {left_s / 3600:.1f} h"
             worst = max(worst, Level.WARN)
         credentials_s = report.get("credentials_left_s")
         if credentials_s is not None and credentials_s < CREDENTIALS_SOON_S:
             if credentials_s > 0:
-                message += f"; the cloud's credentials end in {credentials_s / 60:.0f} min"
+                message += f"; the cloud's credentials expire in {credentials_s / 60:.0f} min"
             else:
-                message += "; the cloud's credentials have ended: nothing is launched or ended"
+                message += "; the cloud's credentials have expired: nothing is launched or ended"
             worst = max(worst, Level.WARN)
         values = {
             "replicas": len(links),
@@ -150,7 +154,7 @@ class Diagnosis:
         elif state != "up" or ready < services:
             level, message = Level.WARN, detail or "not all services can answer"
         elif link.get("draining"):
-            level, message = Level.WARN, "its machine will be taken"
+            level, message = Level.WARN, "its machine is about to be preempted"
         elif link.get("hanging"):
             level, message = Level.WARN, detail
         elif link.get("disagrees"):
@@ -204,7 +208,13 @@ _DIAGNOSE_EVERY_S = 1.0
 
 
 class SeenFromRos:
-    """The proxied services and the pool, as ROS's tools see them."""
+    """The diagnostics and parameters of a pool and its services in ROS.
+
+    Args:
+        make_visible: Makes the visible node, given who judges parameters; returns None where
+            there is none, and then nothing is shown or set.
+        check_field: Says why a type's response has no boolean field of that name.
+    """
 
     def __init__(
         self,
@@ -221,13 +231,13 @@ class SeenFromRos:
         self._visible = make_visible(self._set)
 
     def follow(self, specs: Iterable[ServiceSpec]) -> tuple[ServiceSpec, ...]:
-        """Take the pool file's services; return them as they are to be proxied."""
+        """Set the pool file's services; return them with parameters applied."""
         with self._lock:
             self._policies.follow(specs)
             return self._take()
 
     def changed(self) -> tuple[ServiceSpec, ...] | None:
-        """Return the services as they are to be proxied if a parameter was set since; else None."""
+        """Return the services with parameters applied if one was set since; else None."""
         if not self._was_set.is_set():
             return None
         with self._lock:

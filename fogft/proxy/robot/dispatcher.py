@@ -10,8 +10,8 @@ caller takes it back. What differs between services is put in:
 `submit` is called by the thread that takes ROS requests and never blocks. Answers come from the
 links' threads, which may not send: that is left to the next `tick`, which `wake` brings about.
 
-Owns: that life. Not here: sending (`sending`), links (`fogft.link`), ROS.
-Design: docs/design/dispatcher.md.
+Owns: that life, and which policy a service has.
+Not here: sending (`sending`), links (`fogft.link`), ROS. Design: docs/design/dispatcher.md.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from fogft.metrics.outcomes import Outcome
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.model.spec import Part, ServiceSpec
+from fogft.model.spec import HedgingMode, Part, ServiceSpec
 from fogft.proxy.robot.delivery import Delivery, Respond
 from fogft.proxy.robot.request import Ledger, Request
 from fogft.proxy.robot.sending import Sender, key_of
-from fogft.requests.auto import policy
+from fogft.requests.auto import Auto
+from fogft.requests.choose import All, Choose, Failover
 from fogft.requests.decide import Accepts, Decide, Means
-from fogft.requests.first_response import Verdict
 from fogft.requests.load import NEVER
-from fogft.requests.pending import PendingRequests
+from fogft.requests.pending import PendingRequests, Verdict
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -54,11 +54,15 @@ class Dispatcher:
     """The requests of one service, from the caller's request to the caller's response.
 
     Args:
+        respond: Sends a response to a caller. Any thread.
+        decide: What answers mean; the first success unless given.
         fault_of: Returns what is wrong with the bytes of a response; empty for nothing. One that
             is malformed is a failure of its replica, and another answer is awaited.
         ok_of: Returns, for a name of a boolean response field, whether a response is a success;
             asked where the spec names an `ok_field`.
+        empty_response: The serialised default response, for ``on_timeout: empty``.
         max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
+        id_of: Gives a caller's request its id, by service and handle.
 
     Attributes:
         leaving: Whether callers' requests are left to another proxy, which gets them too.
@@ -115,16 +119,16 @@ class Dispatcher:
 
     @property
     def waiting(self) -> int:
-        """How many requests have no answer yet."""
-        return len(self._requests.table)
+        """The number of unanswered requests."""
+        return len(self._requests)
 
     @property
     def able(self) -> bool:
-        """Whether a request that comes now can be answered."""
+        """Whether a request that arrives now can be answered."""
         return self._decide.ready if self._decide.sends_requests else bool(self._sender.able)
 
     def submit(self, payload: bytes, handle: Any) -> None:
-        """Take a caller's request and offer it to whom the policy chooses."""
+        """Take a caller's request and offer it to the replicas that the policy chooses."""
         spec = self._ledger.spec
         request = self._id_of(spec.name, handle)
         with self._lock:
@@ -135,12 +139,16 @@ class Dispatcher:
         self.forward(request, payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
-        """Do so for one with an id; whether it was taken. Raises ValueError: it is known."""
+        """Do the same for a request with an id; return whether taken.
+
+        Raises:
+            ValueError: A request with this id is under way.
+        """
         now, requests, outcomes = self._clock(), self._requests, self.outcomes
         with self._lock:
             outcomes.received(len(payload))
             over = requests.held_bytes + len(payload) > self.max_pending_bytes
-            if over or len(requests.table) >= self.max_pending:
+            if over or len(requests) >= self.max_pending:
                 self._turn_away(request, len(payload))
                 return False
             links, able = self._sender.links, self._sender.able
@@ -168,19 +176,19 @@ class Dispatcher:
         count["turned_away"] += 1
         self.outcomes.note(request, Outcome.TURNED_AWAY, took_s=0.0, at=self._clock())
         if worth_logging(count["turned_away"]):
-            held = f"{size} B, beside {self._requests.held_bytes} B of {len(self._requests.table)}"
+            held = f"{size} B, beside {self._requests.held_bytes} B of {len(self._requests)}"
             limit = f"at most {self.max_pending_bytes} B and {self.max_pending} requests may wait"
             log.warning("request_turned_away service=%s reason=%r count=%d",
                         self.spec.name, f"{held}: {limit}", count["turned_away"])  # fmt: skip
 
     def hold(self) -> list[bytes]:
-        """Order no more; return the callers' requests that were taken beside another proxy."""
+        """Stop ordering; return the requests taken during the hand-over."""
         with self._lock:
             self._decide.hold()
             return list(self.taken or ())
 
     def take_over(self, taken: Collection[bytes] | None) -> None:
-        """Order what was held, but for what another proxy has taken; None for perhaps all of it."""
+        """Order the held requests, except those the other proxy has taken (None: unknown)."""
         for request in self._decide.held:
             if taken is None or request in taken:
                 self.cancel(request)
@@ -189,7 +197,7 @@ class Dispatcher:
         self._wake()
 
     def cancel(self, request: bytes) -> None:
-        """End a request that its caller no longer wants; unknown ids are fine."""
+        """Cancel a request; unknown ids are ignored."""
         with self._lock:
             pending = self._requests.stop(request, self._clock())
             self.outcomes.count["cancelled"] += pending is not None
@@ -240,6 +248,8 @@ class Dispatcher:
                 outcomes.rejected(replica)
             self._after(request, verdict)
         elif isinstance(means, Refusal):
+            if means is Refusal.MALFORMED:
+                self._misread(replica, id, "no answer to an order")
             self._failed(replica, request, means)
 
     def _misread(self, replica: int, id: ReplicaId, fault: str) -> None:
@@ -252,7 +262,7 @@ class Dispatcher:
                       self.spec.name, id.short, count, fault)  # fmt: skip
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Learn from the end of an attempt that was forgotten; its bytes stay unread."""
+        """Learn from the end of a forgotten attempt; its bytes are not read."""
         worked = answer.payload is not None or answer.refusal is Refusal.LATE
         now, replica, choose = self._clock(), key_of(link), self._requests.choose
         with self._lock:
@@ -320,7 +330,14 @@ class Dispatcher:
     # -- policy, links and time -----------------------------------------------------------
 
     def adopt(self, spec: ServiceSpec, fallback: RosClient | None = None) -> None:
-        """Follow another policy from now on. Raises RosError: there is no such `ok_field`."""
+        """Switch to another policy.
+
+        Args:
+            fallback: The client of its fallback service, if it has one.
+
+        Raises:
+            RosError: The response has no such `ok_field`; nothing was changed.
+        """
         accepts = self._decide.accepts
         if spec.ok_field != self.spec.ok_field and self._ok_of is not None:
             accepts = self._ok_of(spec.ok_field) if spec.ok_field else None
@@ -335,13 +352,13 @@ class Dispatcher:
         self._wake()
 
     def began_anew(self, replica: int, about: Callable[[bytes], bool]) -> None:
-        """Have a replica asked again: it has begun anew what some requests are `about`."""
+        """Ask a replica again, because it restarted what some requests are `about`."""
         with self._lock:
-            self._requests.table.welcome(replica, lambda item: about(item.payload))
+            self._requests.welcome(replica, lambda item: about(item.payload))
         self._wake()
 
     def tick(self) -> float:
-        """Let requests expire, offer the others; return when to call again at the latest."""
+        """Expire requests, offer others to more replicas; return when to call again, at latest."""
         now = self._clock()
         with self._lock:
             expired = self._requests.expire(now)
@@ -358,9 +375,9 @@ class Dispatcher:
         look_at = max(look_at, now + _SHORTEST_S)
         self._sender.next_look = look_at
         # After that was set: who comes later sees it, and wakes.
-        if self._asked or len(self._requests.table):
+        if self._asked or len(self._requests):
             self._asked = False
-            deadline = max(self._requests.table.soonest_deadline, now + _SHORTEST_S)
+            deadline = max(self._requests.soonest_deadline, now + _SHORTEST_S)
             look_at = min(look_at, deadline, now + _SELDOM_S)
         if now < self._busy_until:
             look_at = min(look_at, now + _TICK_S)
@@ -368,7 +385,7 @@ class Dispatcher:
         return look_at
 
     def close(self) -> None:
-        """Let go of what is held outside."""
+        """Release external resources."""
         with self._lock:
             self._decide.close()
 
@@ -381,7 +398,7 @@ class Dispatcher:
         return self._malformed[replica] >= MALFORMED_LIMIT
 
     def trace(self) -> list[dict[str, Any]]:
-        """Return how requests ended since the last call, where that is traced."""
+        """Return the outcomes since the last call, if traced."""
         with self._lock:
             trace = self.outcomes.trace
             found = list(trace or ())
@@ -395,9 +412,18 @@ class Dispatcher:
         with self._lock:
             return {
                 **self.outcomes.report(),
-                "pending": len(requests.table) + len(requests.fallback or ()),
+                "pending": len(requests) + len(requests.fallback or ()),
                 "pending_bytes": requests.held_bytes,
                 "hedging": requests.choose.report(),
                 "needed_replicas": requests.choose.needed(len(self._sender.able), self._clock()),
                 **self._decide.report(),
             }
+
+
+def policy(spec: ServiceSpec) -> Choose:
+    """Return the policy for a service's `hedging`."""
+    if spec.hedging is HedgingMode.FAILOVER:
+        return Failover()
+    # Where every answer counts, or every replica applies every request, all are asked.
+    counts_all = spec.quorum > 1 or spec.state is not None or spec.part is not Part.NONE
+    return All() if counts_all or spec.hedging is HedgingMode.ALL else Auto()

@@ -1,4 +1,4 @@
-"""Whom a client proxy shall talk to: from the manager's file, from records, or from both.
+"""The membership a client proxy follows: from the manager's file, from records, or both.
 
 The manager of this machine writes a file; further robots learn the same from records. The
 later one counts. Where replicas are is corrected by what they say of themselves, and those
@@ -33,7 +33,7 @@ log = logging.getLogger(__name__)
 
 
 class Following:
-    """A pool's membership as a client proxy sees it. Raises WireError, CredentialError."""
+    """A client proxy's view of the pool's membership. Raises WireError, CredentialError."""
 
     def __init__(self, config: ClientProxyConfig) -> None:
         self._config = config
@@ -47,7 +47,11 @@ class Following:
         self._call()
 
     def apply(self, config: ClientProxyConfig) -> None:
-        """Take a changed configuration into use. Raises WireError: a port cannot be had."""
+        """Apply a changed configuration.
+
+        Raises:
+            WireError: The new door's port cannot be had; there is none then.
+        """
         old, self._config = self._config, config
         if (old.dial_in, old.dial_in_listen) != (config.dial_in, config.dial_in_listen):
             if self.door is not None:
@@ -92,7 +96,7 @@ class Following:
         client.publish(kind, holder.name, holder.generation, content)
 
     def renew(self) -> None:
-        """Speak under the certificate that now stands in its file."""
+        """Switch to the certificate now in its file."""
         if self._client is not None:
             self._announce(self._client)
 
@@ -144,7 +148,7 @@ class Following:
         return named | self._known().revoked
 
     def report(self, newer: Iterable[SignedRecord] = ()) -> Mapping[str, Any]:
-        """Return the newest manager's epoch, of what replicas said too, each rendezvous, the door.
+        """Return the newest known manager epoch, each rendezvous' state, and the dial-in port's.
 
         Nobody counts here but who signed: a replica that lies is refused.
         """
@@ -161,7 +165,7 @@ class Following:
         return found
 
     def close(self) -> None:
-        """Leave each rendezvous and shut the door."""
+        """Disconnect from each rendezvous, and close the dial-in port."""
         if self._client is not None:
             self._client.close()
         if self.door is not None:

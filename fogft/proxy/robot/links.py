@@ -1,4 +1,4 @@
-"""The links of a client proxy, one to each member, and what its report says of each replica.
+"""The links of a client proxy, one per member, and its report of each replica.
 
 Seen through a gateway a replica is put as if it were linked directly, so that the manager judges
 it as it judges all others: a gateway that is silent is a link that is silent. Seen through
@@ -36,7 +36,7 @@ _ORDER = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 def link_report(
     link: Link, dispatchers: Collection[Dispatcher], differ: Mapping[str, str], *, draining: bool
 ) -> dict[str, Any]:
-    """Return what is reported of a link; `differ`: what it cannot answer for us, and why."""
+    """Return the report of a link; `differ`: services it cannot answer, with reasons."""
     status, id = link.status(), link.peer.id
     answer = status.probe_answer
     ours = next(iter(differ.values()), "") if link.usable else ""
@@ -77,7 +77,7 @@ def link_report(
 
 
 def seen_through(status: LinkStatus, gateway: str) -> list[dict[str, Any]]:
-    """Return the replicas that a gateway told of, as reports of links."""
+    """Return link reports of the replicas behind a gateway."""
     answer = status.probe_answer
     return [_report(status, gateway, one) for one in (answer.behind if answer else ())]
 
@@ -128,7 +128,11 @@ Define = Callable[[str], Definition]
 
 
 class TypeCheck:
-    """Compares what replicas tell of their types with what they are here."""
+    """Compares replicas' type definitions with those on this machine.
+
+    Args:
+        define: Returns a type's definition here; None where types are not known here.
+    """
 
     def __init__(self, define: Define | None) -> None:
         self._define = define
@@ -136,7 +140,7 @@ class TypeCheck:
         self._found: dict[tuple[ReplicaId, str], tuple[Definition, str]] = {}
 
     def differences(self, link: Link, services: Iterable[ServiceSpec]) -> Mapping[str, str]:
-        """Return which services a replica cannot answer for us, and why, as far as it tells."""
+        """Return the services that a replica cannot answer because of their types, with reasons."""
         answer = link.status().probe_answer
         if self._define is None or answer is None or not answer.types:
             return {}
@@ -165,13 +169,17 @@ class TypeCheck:
         return why
 
     def forget(self, id: ReplicaId) -> None:
-        """Drop what is kept of a replica that is gone."""
+        """Drop the state of a replica that is gone."""
         for key in [key for key in self._found if key[0] == id]:
             del self._found[key]
 
 
 class Links:
-    """Who is talked to."""
+    """The links of a client proxy.
+
+    Args:
+        keys: Returns the keys of all services and topics at a slot.
+    """
 
     def __init__(self, dialer: Dialer, events: LinkEvents, keys: Keys) -> None:
         self._dialer = dialer
@@ -185,18 +193,18 @@ class Links:
         return iter(list(self._links.values()))
 
     def missing(self, members: Collection[ReplicaId]) -> list[ReplicaId]:
-        """Return whom there is a link to, and who is no member any more."""
+        """Return the linked replicas that are no longer members."""
         return [id for id in self._links if id not in members]
 
     def reach(self, member: Member) -> None:
-        """Have a link to a member; dial it anew where it has moved."""
+        """Ensure a link to a member; redial it if it has moved."""
         old = self._members.get(member.id)
         self._members[member.id] = member
         if old is None or old.endpoint != member.endpoint:
             self._dial(member)
 
     def redial(self) -> None:
-        """Dial everybody anew; what is in flight is sent again."""
+        """Redial all replicas; requests in flight are sent again."""
         for id in list(self._links):
             self._dial(self._members[id])
 
@@ -210,7 +218,7 @@ class Links:
             old.close()
 
     def remove(self, id: ReplicaId) -> Link:
-        """Take a link out; to be closed once it is out of every route."""
+        """Remove a link; close it once no route uses it."""
         self._members.pop(id, None)
         log.info("link_dropped replica=%s", id.short)
         return self._links.pop(id)
@@ -218,33 +226,33 @@ class Links:
     # -- what they tell -------------------------------------------------------------------
 
     def draining(self, link: Link) -> bool:
-        """Whether a replica is to be left alone: it says so, or the manager does."""
+        """Whether a replica is draining, by its own report or the manager's."""
         member = self._members.get(link.peer.id)
         return link.draining or (member is not None and member.draining)
 
     def versions(self) -> dict[ReplicaId, str]:
-        """Return what each member runs."""
+        """Return the version of each member."""
         return {id: member.version for id, member in self._members.items()}
 
     @property
     def silent_together(self) -> bool:
-        """Whether all that ever answered (two at least) have fallen silent together."""
+        """Whether all links that ever answered (at least two) fell silent together."""
         states = [link.status() for link in self]
         heard = [status for status in states if status.heard_age_s is not None]
         return len(heard) > 1 and all(status.state is not LinkState.UP for status in heard)
 
     @property
     def ready(self) -> frozenset[str]:
-        """Services that at least one link calls ready."""
+        """The services that at least one link reports ready."""
         return frozenset(name for link in self for name in link.ready)
 
     def hanging(self) -> dict[ReplicaId, frozenset[str]]:
-        """Return the services that a replica says answer nothing of what they have."""
+        """Return the services that a replica reports as hanging."""
         answers = {link.peer.id: link.status().probe_answer for link in self}
         return {id: answer.hanging for id, answer in answers.items() if answer is not None}
 
     def types(self) -> dict[str, Definition]:
-        """Return the definitions of types as most replicas told them."""
+        """Return the type definitions reported by most replicas."""
         told: dict[str, list[Definition]] = {}
         for link in self:
             answer = link.status().probe_answer

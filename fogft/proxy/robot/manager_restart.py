@@ -1,4 +1,4 @@
-"""Start the pool's manager again when it was killed, as it starts a client proxy that was.
+"""Restart the pool's manager after it was killed, or hangs.
 
 Owns: when. Not here: which manager wants it, and how it is started (its own file says so).
 """
@@ -14,6 +14,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.child import detached
 from fogft.errors import StateError
+from fogft.process import Hanging
 
 log = logging.getLogger(__name__)
 
@@ -21,10 +22,16 @@ NAME = "manager.json"
 LOOK_S = 1.0
 BACKOFF_LIMIT_S = 60.0
 STEADY_S = 60.0
+HANGS_AFTER_S = 120.0  # it may wait for its cloud
 
 
 class ManagerRestart:
-    """Looks whether the manager was killed. `environ`: ours before ROS was prepared."""
+    """Watches the manager, ends one that hangs and restarts it.
+
+    Args:
+        folder: The pool's. Without a manager's file in it nothing is ever started.
+        environ: The environment for it: what our own was before ROS was prepared in it.
+    """
 
     def __init__(
         self,
@@ -40,10 +47,15 @@ class ManagerRestart:
         self._wait_s = LOOK_S
         self._missing = False
         self._lock = folder
+        self._hanging = Hanging(HANGS_AFTER_S, clock)
         self.child: subprocess.Popen[bytes] | None = None
 
     def look(self) -> None:
-        """Start it where it has been missing for a while, less and less often."""
+        """Restart the manager if it has been missing for a while, with growing pauses.
+
+        Raises:
+            StateError: It cannot be started, or its file is damaged.
+        """
         now = self._clock()
         if now < self._look_at:
             return
@@ -59,6 +71,9 @@ class ManagerRestart:
         except (TypeError, KeyError) as error:
             raise StateError(f"`{self._folder / NAME}` is damaged: {error!r}") from error
         self._lock = locks[0]
+        holder = disk.holder(self._lock, said=False)
+        if self._hanging.end(holder):
+            log.error("manager_hangs pid=%d", holder)
         missing = not any(map(disk.is_locked, locks))
         if missing and self._missing:  # not for an instant only, as between two commands
             self._start(command, folder, log_path)
@@ -72,11 +87,11 @@ class ManagerRestart:
         try:
             self.child = detached(command, log_path, folder=folder, environ=self._environ)
         except OSError as error:
-            raise StateError(f"the manager cannot be started again: {error}") from error
+            raise StateError(f"the manager cannot be restarted: {error}") from error
         log.warning("manager_started_again pid=%d", self.child.pid)
 
     def close(self) -> None:
-        """End one that has not begun to work: whoever ends us may be ending the pool."""
+        """End a restarted manager that is not working yet: the pool may be shutting down."""
         child = self.child
         if child is not None and child.poll() is None and not disk.is_locked(self._lock):
             child.kill()

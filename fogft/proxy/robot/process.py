@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from fogft import __version__, disk
 from fogft.disk import Watched
-from fogft.errors import FogftError, PoolBusy, StateError
+from fogft.errors import FogftError, PoolBusy, RosError, StateError
 from fogft.link.uplinks import UplinkDialer
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
@@ -29,10 +29,9 @@ from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.spec import Part, ServiceSpec
 from fogft.model.type_definition import RESPONSE
-from fogft.process import Watchdog, notify, start_log, stop_on_signal
-from fogft.proxy import middleware, start
+from fogft.process import Watchdog, begin_start, end_start, notify, start_log, stop_on_signal
+from fogft.proxy import middleware
 from fogft.proxy.config import read_client
-from fogft.proxy.order_mark import OrderMark
 from fogft.proxy.robot import standby as in_line
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy
@@ -40,13 +39,14 @@ from fogft.proxy.robot.diagnostics import SeenFromRos
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.manager_restart import ManagerRestart
+from fogft.proxy.robot.order_mark import OrderMark
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning
 
 if TYPE_CHECKING:
+    from fogft.ros.joining import EarlyJoin
     from fogft.ros.node import SerialisedNode
-    from fogft.ros.participant.joining import EarlyJoin
     from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
@@ -64,13 +64,14 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     """Run until a signal ends it.
 
     Args:
+        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
         standby: Where one runs already, wait until it ends, and take its place at once.
 
     Raises:
         PoolBusy: This pool's client proxy runs already, with `standby` another standby too.
         FogftError: The configuration, the credentials or ROS cannot be used.
     """
-    start.begin()
+    begin_start()
     start_log()
     stop = stop_on_signal()
     config = read_client(config_path, metrics)
@@ -80,7 +81,7 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     early = None
     if not lock.acquire(wait=False):
         if not standby:
-            raise PoolBusy(f"the client proxy of pool `{config.pool}` runs already")
+            raise PoolBusy(f"the client proxy of pool `{config.pool}` is already running")
         early = in_line.wait(config, lock, stop, _node_name("fogft_proxy", config.pool))
         if stop.is_set():
             return
@@ -90,18 +91,20 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
         config_path, config, metrics=metrics, lock=lock, managing=managing, early=early
     )
     try:
-        start.settle()
+        end_start()
         notify("READY=1")
-        running.loop(stop)
-        if stop.is_set():
+        renewed = running.loop(stop)
+        if renewed or stop.is_set():
             in_line.hand_over(config, running.proxy, running.callers, running.release)
     finally:
         running.close()
         log.info("proxy_stopped pool=%s", config.pool)
+    if renewed:
+        raise RosError("this process was stopped for long, and has handed over to its standby")
 
 
 def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
-    """Make the dialer of a proxy, or of a gateway.
+    """Create the dialer of a proxy or gateway.
 
     With several uplinks one is suspected in half the time: a false alarm costs a copy, no more.
     """
@@ -133,7 +136,16 @@ def make_dispatcher(
     id_of: Callable[[str, Any], bytes] | None = None,
     held: Callable[[], bool] = lambda: False,
 ) -> Dispatcher:
-    """Make a service's dispatcher, with what it needs of its ROS type. Raises RosError."""
+    """Create a service's dispatcher, with what it needs of its ROS type.
+
+    Args:
+        respond: Sends a response to the caller of a handle.
+        speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
+        id_of: Gives a request its id, by service and handle; a random one unless given.
+
+    Raises:
+        RosError: The type is needed and cannot be loaded.
+    """
     fault_of = middleware.fault_of(spec.type, RESPONSE)
     shared: dict[str, Any] = {"fault_of": fault_of, **({"id_of": id_of} if id_of else {})}
     if spec.part is not Part.NONE:
@@ -174,8 +186,7 @@ class _Running:
         managing: ManagerRestart,
         early: EarlyJoin | None,
     ) -> None:
-        from fogft.ros import goal_status
-        from fogft.ros.messages import check_ok_field
+        from fogft.ros.messages import check_ok_field, merged_status
 
         began = time.monotonic()
         self.config_path, self.metrics, self.config = config_path, metrics, config
@@ -199,7 +210,7 @@ class _Running:
             id_of=in_line.request_ids(config.credentials.key),
             held=lambda: self.held,
         )
-        self.dialer, merge = make_dialer(config), goal_status.merged
+        self.dialer, merge = make_dialer(config), merged_status
         proxy = self.proxy = ClientProxy(
             config.pool_uid, joined.node, self.dialer, make, define=joined.define, merge=merge
         )
@@ -245,11 +256,16 @@ class _Running:
 
     def _forget_participant(self) -> None:
         status = self.config.status
-        told = {**(disk.read_json(status) or {}), "participant": ""}
-        disk.write_json(status, told, durable=False)
+        told = disk.read_json(status)
+        if isinstance(told, dict):
+            disk.write_json(status, {**told, "participant": ""}, durable=False)
 
-    def loop(self, stop: threading.Event) -> None:
-        """Serve until told to stop, or until the pool's folder is gone."""
+    def loop(self, stop: threading.Event) -> bool:
+        """Serve until told to stop, until the pool's folder is gone, or the standby is to go on.
+
+        Returns:
+            Whether the standby is to go on: see `standby.Renewal`.
+        """
         proxy, config, folder = self.proxy, self.config, self.config_path.parent
         memory, watchdog = memory_tuning.Trimmer(), Watchdog()
         watched_config = Watched(self.config_path)
@@ -260,7 +276,7 @@ class _Running:
         started = reported = busy = time.monotonic()
         looked = 0.0
         changed = False  # since the last report
-        participant = b""
+        participant, renewal = b"", in_line.Renewal(config.lock)
         while not stop.is_set():
             changed = proxy.run_once() or changed
             now = time.monotonic()
@@ -271,6 +287,9 @@ class _Running:
             looked = now
             memory.look()
             watchdog.work()
+            self.joined.node.look()
+            if renewal.due():
+                return True
             try_step(self.managing.look, config.lock)
             if self.held:
                 try_step(self._take_over, config.lock)
@@ -290,7 +309,7 @@ class _Running:
                 reported, changed = now, False
                 if not folder.exists():  # the pool's: its end is the pool's
                     log.warning("folder_gone path=%s", folder)
-                    return
+                    return False
                 # The id of this process in DDS, once it offers a service.
                 ids = map(self.joined.participant, proxy.offered)
                 participant = participant or next(filter(None, ids), b"")
@@ -298,6 +317,7 @@ class _Running:
                 try_step(functools.partial(self._report, told, now), config.status)
                 trace = config.status.with_name(TRACE_NAME)
                 try_step(functools.partial(_trace, trace, proxy, self.spans), trace)
+        return False
 
     def _take_over(self) -> None:
         if not in_line.is_held(self.config.lock):
@@ -348,7 +368,7 @@ _troubles: dict[Path, str] = {}
 
 
 def try_step(step: Callable[[], None], path: Path) -> None:
-    """Do one step; a bad file, a full disk or the like is logged once and changes nothing."""
+    """Run one step; errors such as a bad file or a full disk are logged once and skipped."""
     try:
         step()
     except (FogftError, OSError) as error:  # of the system: no descriptor, no folder

@@ -29,14 +29,14 @@ HOLD_S = 3.0
 
 
 class Advertising:
-    """Whether one service is to be offered, as its replicas come and go."""
+    """Whether one service should be offered, as replicas come and go."""
 
     def __init__(self) -> None:
         self._offered = False
         self._unable_since: float | None = None
 
     def wanted(self, spec: ServiceSpec, *, able: bool, waiting: int, now: float) -> bool:
-        """Return whether a service with this policy is to be offered now."""
+        """Return whether a service with this policy should be offered now."""
         at_once = spec.fallback is not None and spec.fallback.while_none_ready
         if able or at_once or spec.advertised is Advertise.ALWAYS:
             self._offered, self._unable_since = True, None
@@ -49,7 +49,7 @@ class Advertising:
 
 
 class ProxiedService:
-    """A service of the robot's. `trouble`: why it is not offered, or clients get no answers."""
+    """A proxied service. `trouble`: why it is not offered, or clients get no answers."""
 
     def __init__(self, spec: ServiceSpec, dispatcher: Dispatcher) -> None:
         self.spec = spec
@@ -62,7 +62,7 @@ class ProxiedService:
         self._looked_at = 0.0
 
     def adopt(self, spec: ServiceSpec, node: RosNode | None) -> None:
-        """Have the dispatcher follow a policy, with a client of its fallback service."""
+        """Apply a policy to the dispatcher, with a client of its fallback service."""
         name = spec.fallback.service if spec.fallback is not None else ""
         if name != self._fallback_name:
             old, self._fallback, self._fallback_name = self._fallback, None, name
@@ -76,7 +76,7 @@ class ProxiedService:
         self.dispatcher.adopt(spec, self._fallback)
 
     def may_ask(self, links: Sequence[Link], leaving: Collection[ReplicaId]) -> list[Link]:
-        """Return those of the links with our type by which its requests may go."""
+        """Return the links with our type over which its requests may be sent."""
         if self.spec.state is not None:  # replicas are brought to readiness by what is sent
             return [link for link in links if link.usable]
         ready = [link for link in links if self.spec.name in link.ready]
@@ -85,7 +85,7 @@ class ProxiedService:
         return [link for link in ready if link.peer.id not in leaving] or ready
 
     def advertise(self, node: RosNode, now: float) -> None:
-        """Offer or withdraw it, as it should be now (monotonic seconds)."""
+        """Offer or withdraw the service, as required now (monotonic seconds)."""
         able, waiting = self.dispatcher.able, self.dispatcher.waiting
         wanted = self._advertising.wanted(self.spec, able=able, waiting=waiting, now=now)
         if wanted and self.server is None:
@@ -120,7 +120,7 @@ class ProxiedService:
                         self.spec.name)  # fmt: skip
 
     def close(self) -> None:
-        """Withdraw it from ROS, and let go of what its dispatcher holds."""
+        """Withdraw it from ROS, and close its dispatcher."""
         for end in (self.server, self._fallback):
             if end is not None:
                 end.close()

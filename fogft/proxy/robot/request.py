@@ -1,4 +1,4 @@
-"""What the client proxy keeps of one service's requests: each with its caller, all with counters.
+"""The client proxy's requests of one service, with their callers and counters.
 
 Owns: the lock under which they are. Not here: what happens to them (`dispatcher`).
 """
@@ -13,14 +13,19 @@ from typing import Any
 from fogft.metrics.outcomes import Outcome, Outcomes
 from fogft.model.refusal import Refusal
 from fogft.model.spec import ServiceSpec
-from fogft.requests.first_response import Pending
+from fogft.requests.decide import Pending
 from fogft.requests.pending import PendingRequests
 
 _TRACE_KEPT = 20_000  # lines until they are written, twice a second
 
 
 class RequestTrace:
-    """Who was asked for a traced request. Moments are on the dispatcher's clock, seconds."""
+    """The replicas asked for a traced request. Times on the dispatcher's clock, in seconds.
+
+    Attributes:
+        asked: Each replica that took it, with the moment when it was asked first.
+        refused: Each replica that refused it, with its last reason.
+    """
 
     __slots__ = ("asked", "refused")
 
@@ -29,13 +34,17 @@ class RequestTrace:
         self.refused: dict[int, Refusal] = {}
 
     def declined(self, replica: int, asked: float | None) -> None:
-        """Take back that a replica was asked at this moment; it may have been before."""
+        """Undo that a replica was asked at this time; earlier attempts stay."""
         if self.asked.get(replica) == asked:
             self.asked.pop(replica, None)
 
 
 class Request:
-    """A caller's request. `arrived` is on the dispatcher's clock, seconds."""
+    """A caller's request. `arrived` is on the dispatcher's clock, seconds.
+
+    Attributes:
+        trace: Who was asked; None where it is not traced.
+    """
 
     __slots__ = ("arrived", "handle", "payload", "trace")
 
@@ -47,7 +56,11 @@ class Request:
 
 
 class Ledger:
-    """One service's requests and counters. All is used under the lock."""
+    """One service's requests and counters. Used under the lock.
+
+    Attributes:
+        lock: Held for moments, never while something is sent or delivered.
+    """
 
     def __init__(
         self, spec: ServiceSpec, requests: PendingRequests[Request], clock: Callable[[], float]
@@ -59,13 +72,13 @@ class Ledger:
         self.adopt(spec)
 
     def adopt(self, spec: ServiceSpec) -> None:
-        """Follow another policy."""
+        """Switch to another policy."""
         self.spec = spec
         if spec.trace != (self.outcomes.trace is not None):
             self.outcomes.trace = deque(maxlen=_TRACE_KEPT) if spec.trace else None
 
     def end(self, request: bytes, pending: Pending[Request], outcome: Outcome) -> None:
-        """Count how a request ended that no replica's answer has ended."""
+        """Count the outcome of a request without a replica's answer."""
         self.outcomes.count[outcome] += 1
         self.trace(request, pending, outcome, self.clock())
 
@@ -78,7 +91,7 @@ class Ledger:
         *,
         replica: str = "",
     ) -> None:
-        """Note how a request ended, where that is wanted."""
+        """Trace a request's outcome, if enabled."""
         if self.outcomes.trace is None:
             return
         arrived, trace = pending.item.arrived, pending.item.trace or RequestTrace()

@@ -1,4 +1,4 @@
-"""Offer one service's requests to the links of replicas, and tell links what is not wanted.
+"""Offer one service's requests to links, and cancel requests at links.
 
 Whom to ask, and when, is the policy's to say (`requests.choose`); here it is carried out. This is
 the one place where a request leaves for a replica.
@@ -21,7 +21,13 @@ from fogft.requests.load import NEVER, Handling
 
 
 class Sender:
-    """Sends one service's requests. `next_look`: when the policy wants to be asked."""
+    """Sends one service's requests.
+
+    Attributes:
+        links: Those that may be asked, by replica.
+        able: The replicas that the policy may choose.
+        next_look: When the policy wants to be asked, as `offer_more` found it.
+    """
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
@@ -35,7 +41,7 @@ class Sender:
         self.next_look = NEVER
 
     def burst(self, begins: bool) -> None:
-        """Have what is sent until the burst ends leave together, in few messages."""
+        """Batch what is sent until the burst ends into few messages."""
         self._in_burst = begins
         if not begins:
             for link in tuple(self.links.values()):
@@ -45,7 +51,7 @@ class Sender:
         self, request: bytes, payload: bytes, links: Mapping[int, Link], chosen: Sequence[int],
         timeout_s: float,
     ) -> None:  # fmt: skip
-        """Offer a new request to those that were chosen for it."""
+        """Offer a new request to its chosen replicas."""
         name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
         taken = 0
         for replica in chosen:
@@ -58,7 +64,7 @@ class Sender:
             else:
                 self._declined(request, replica, is_copy=True)
         self._count(taken)
-        if len(chosen) > 1 and request not in self._ledger.requests.table:
+        if len(chosen) > 1 and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)
 
@@ -69,7 +75,12 @@ class Sender:
         leaving: Collection[ReplicaId] = (),
         hanging: Collection[ReplicaId] = (),
     ) -> None:
-        """Set the links that may be asked now, `hanging` ones too; offer what they lack."""
+        """Set the links that may be asked now, `hanging` ones included; offer open requests.
+
+        Args:
+            links: Those whose replica is ready; where replicas are brought to readiness, all.
+            hanging: Those that say that the service answers nothing of what it has.
+        """
         routed = {key_of(link): link for link in links}
         replication, now = self._replication, self._ledger.clock()
         hang = {key for key, link in routed.items() if link.peer.id in hanging}
@@ -123,12 +134,12 @@ class Sender:
             self._declined(request, replica, is_copy=True)
             return False
         self._count(1)
-        if request not in requests.table:  # it was answered meanwhile
+        if request not in requests:  # it was answered meanwhile
             self.forget(request, (replica,))
         return True
 
     def replicate(self) -> None:
-        """Send what else replicas must have."""
+        """Send all that must be replicated."""
         replication, ledger = self._replication, self._ledger
         if replication is None:
             return

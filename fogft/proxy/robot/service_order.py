@@ -1,4 +1,4 @@
-"""The order of one stateful service on a robot: its terms, one after the other.
+"""The order of one stateful service on a robot, term after term.
 
 It decides which answers count, and brings replicas to the same numbers in the same order. All
 that it decides is `ordering.sequencer`'s; here are the requests that have a number, those that
@@ -18,9 +18,8 @@ from typing import Any
 from fogft.model.refusal import Refusal
 from fogft.ordering.orders import Op, OrderError, OrderId, decode, encode
 from fogft.ordering.sequencer import Handover, Sequencer
-from fogft.proxy.order_mark import OrderMark
-from fogft.requests.decide import Decide, Judgement, Means, Reachable, Send
-from fogft.requests.first_response import Pending
+from fogft.proxy.robot.order_mark import OrderMark
+from fogft.requests.decide import Decide, Judgement, Means, Pending, Reachable, Send
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +28,7 @@ _ATTEMPT_S = 60.0
 
 
 class ServiceOrder(Decide):
-    """Numbers requests, and says what to send to whom and when an answer counts.
+    """Numbers requests, and decides what to send to which replica and which answers count.
 
     Args:
         held: Whether another proxy orders still: requests wait until `take_over`.
@@ -68,11 +67,11 @@ class ServiceOrder(Decide):
         return Sequencer(epoch, mark=mark, holder=self._mark.holder, begin=begin)
 
     def hold(self) -> None:
-        """Order no more: another proxy does, whose term ends this one."""
+        """Stop ordering: another proxy does, and its term ends this one."""
         self._held = True
 
     def take_over(self, now: float) -> None:
-        """Begin a term from what was answered last, if another proxy has ordered until now."""
+        """Begin a term from the last answer, if another proxy has ordered until now."""
         if self._held:
             self._held, self._term = False, self._begin_term()
             self._reach(now)
@@ -89,20 +88,20 @@ class ServiceOrder(Decide):
 
     @property
     def trouble(self) -> str:
-        """Why the service cannot be had; empty if nothing is wrong."""
+        """Why the service is unavailable; empty if it is available."""
         if self._term.held_by:
             return (
                 f"robot `{self._term.held_by}` orders this service, and a service with `state` "
                 "is for one robot; for several see docs/how-to/state.md"
             )
         if self._term.stranded:
-            return "no replica that can be reached holds the state; see docs/design/state.md"
+            return "no replica that can be reached has the state; see docs/design/state.md"
         return ""
 
     # -- what a caller wants --------------------------------------------------------------
 
     def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
-        """Give a request its number; it waits where no replica can take it."""
+        """Number a request; it waits if no replica can take it."""
         payload = pending.item.payload
         if self._waiting or not self._number(request, payload):
             self._waiting[request] = payload
@@ -115,7 +114,7 @@ class ServiceOrder(Decide):
         return True
 
     def closed(self, request: bytes, pending: Pending[Any]) -> None:
-        """Nobody waits for this answer any more; what has a number is applied all the same."""
+        """Note that nobody waits for this answer any more. Numbered requests are still applied."""
         self._waiting.pop(request, None)
         number = self._numbers.pop(request, None)
         if number is not None:
@@ -123,7 +122,7 @@ class ServiceOrder(Decide):
             self._term.abandon(number)
 
     def hears_out(self, request: bytes) -> bool:
-        """All replicas apply all requests."""
+        """Return True: all replicas apply all requests."""
         return True
 
     # -- what replicas say ----------------------------------------------------------------
@@ -141,7 +140,7 @@ class ServiceOrder(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
-        """Take a reply; where it answers a number, write down that this is returned."""
+        """Take a reply; if it answers a number, store that it is being returned."""
         current = self._current(id)
         if current is None:
             return Means.NOTHING
@@ -171,7 +170,7 @@ class ServiceOrder(Decide):
         self._wake_if_due()
 
     def declined(self, id: bytes, replica: int, now: float) -> None:
-        """An order was not taken by its link."""
+        """Note that a link did not accept an order."""
         current = self._current(id)
         if current is not None:
             self._term.declined(replica, current[0], current[2], now)
@@ -190,7 +189,7 @@ class ServiceOrder(Decide):
     # -- what is sent ---------------------------------------------------------------------
 
     def reach(self, replicas: Reachable, now: float) -> None:
-        """Note which replicas can be sent to."""
+        """Set the reachable replicas."""
         self._replicas = replicas
         self._reach(now)
 
@@ -199,7 +198,7 @@ class ServiceOrder(Decide):
         self._term.reach(versions, now, versions=versions, leaving=leaving)
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
-        """Number what waits, and return the orders to send, in their order."""
+        """Number waiting requests, and return the orders to send, in order."""
         if self._held:
             return []
         self._tick(now)
@@ -259,5 +258,5 @@ class ServiceOrder(Decide):
         return {"order": order}
 
     def close(self) -> None:
-        """Let go of the mark's file. Nothing may be answered afterwards."""
+        """Close the mark's file. Nothing may be answered afterwards."""
         self._mark.close()

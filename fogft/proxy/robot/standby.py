@@ -1,10 +1,10 @@
-"""The next client proxy, in line behind the one that works, and how that one hands over to it.
+"""The standby client proxy, and hand-over to it.
 
 The standby has loaded everything and its DDS participant is known, but it offers nothing and no
 node of it is seen. It waits for the lock: the kernel gives it in the instant in which the holder
 ends, whatever ends it.
 
-A holder that is told to end lets the standby take over while it still serves. For half a second
+A holder that is told to end lets the standby take over while it still serves. For a second
 both serve: each request goes to both, under one id, so that a replica runs it once and the caller
 gets one answer. Then the first takes no more, and finishes what it has taken. A stateful service is
 ordered by one only: the other holds what it hears until the first, which keeps a lock meanwhile,
@@ -19,6 +19,7 @@ import contextlib
 import hashlib
 import importlib
 import logging
+import math
 import os
 import threading
 import time
@@ -34,26 +35,28 @@ from fogft.process import Watchdog, notify
 from fogft.proxy import middleware
 from fogft.proxy.robot.client import ClientProxy
 from fogft.records.signing import Signer
+from fogft.ros.joining import Pauses
 
 if TYPE_CHECKING:
-    from fogft.ros.participant.joining import EarlyJoin
+    from fogft.ros.joining import EarlyJoin
 
 log = logging.getLogger(__name__)
 
 LOOK_S = 0.2
 BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
-KNOWN_AFTER_S = 0.5  # once it offers them and knows the callers: until they know its services
+RENEWED_AFTER_S = 3.0  # a pause, a standby has joined anew and is known
+KNOWN_AFTER_S = 1.0  # once it offers them and knows the callers: until they know its services
 ORDER_LIMIT_S = 20.0  # what was ordered is answered by then, or not at all
 FINISH_LIMIT_S = 130.0  # in all less than systemd and `fogft service install` wait
 _PACED_S = 0.5  # until responses that are spread for their client are out
 # What a client proxy imports only when it needs it.
-_NEEDED = ("fogft.link.zenoh.robot.dialer", "fogft.proxy.robot.process", "fogft.ros.goal_status")
+_NEEDED = ("fogft.link.zenoh.robot.dialer", "fogft.proxy.robot.process", "fogft.ros.messages")
 
 
 def wait(
     config: ClientProxyConfig, lock: disk.Lock, stop: threading.Event, node: str
 ) -> EarlyJoin | None:
-    """Prepare all that can be, then wait for the lock; return what was prepared of ROS.
+    """Prepare as much as possible, then wait for the lock; return the prepared ROS node.
 
     Returns early, without the lock, when `stop` is set or the pool's folder is gone.
 
@@ -66,14 +69,19 @@ def wait(
     if not place.acquire(wait=False):  # whoever holds it is ready to take over
         if early is not None:
             early.close()
-        raise PoolBusy(f"the client proxy of pool `{config.pool}` has a standby already")
+        raise PoolBusy(f"the client proxy of pool `{config.pool}` already has a standby")
     log.info("standby_ready pool=%s", config.pool)
-    ours, watchdog = _taken(lock), Watchdog()
+    ours, watchdog, pauses = _taken(lock), Watchdog(), Pauses()
     notify("READY=1")
     taken = False
     while not taken:
         taken = ours.wait(LOOK_S)
         watchdog.work()
+        if early is not None and pauses.was_long():
+            early.close()
+            early = middleware.join_early(config.rmw, node, config.domain_id)
+        if early is not None:
+            early.look()
         if stop.is_set() or not config.lock.parent.exists():
             stop.set()
             if early is not None:
@@ -128,13 +136,34 @@ def request_ids(key: Path) -> Callable[[str, Any], bytes]:
     return id_of
 
 
+class Renewal:
+    """Says when to hand over to the standby because this process was stopped for long."""
+
+    def __init__(self, lock: Path) -> None:
+        self._lock = disk.standby_lock(lock)
+        self._pauses = Pauses()
+        self._at = math.inf
+
+    def due(self) -> bool:
+        """Whether it is time, and there is a standby. Call it every second or more often."""
+        if self._pauses.was_long():
+            self._at = time.monotonic() + RENEWED_AFTER_S
+        return time.monotonic() >= self._at and disk.is_locked(self._lock)
+
+
 def hand_over(
     config: ClientProxyConfig,
     proxy: ClientProxy,
     callers: Callable[[], Mapping[str, int]],
     release: Callable[[], None],
 ) -> None:
-    """Let the standby take over, if there is one; return when nothing is left to do."""
+    """Hand over to the standby, if there is one; return when done.
+
+    Args:
+        config: This proxy's. Replicas that dial in have one door, so with it nothing is shared.
+        callers: Counts who may call each service that we offer.
+        release: Gives up the lock, and all else that the standby needs for itself.
+    """
     taken, order = _files(config.lock)
     lock = disk.Lock(order)
     try:
@@ -143,7 +172,7 @@ def hand_over(
         taken.unlink(missing_ok=True)
         if not lock.acquire(wait=False):
             raise BlockingIOError("another one is handing over to this one")
-    except OSError as error:
+    except (OSError, StateError) as error:
         log.error("handover_failed reason=%r", str(error))
         return
     log.info("handover_began pool=%s", config.pool)
@@ -165,12 +194,12 @@ def hand_over(
 
 
 def is_held(lock: Path) -> bool:
-    """Whether the one that hands over to us orders stateful services still."""
+    """Whether the proxy that hands over to us still orders stateful services."""
     return disk.is_locked(_files(lock)[1])
 
 
 def taken_before(lock: Path) -> Mapping[str, Collection[bytes]] | None:
-    """Return which requests it has taken, by service; None where it was killed, or had no room."""
+    """Return the requests it has taken, by service; None if it was killed or ran out of space."""
     with contextlib.suppress(StateError, ValueError, TypeError, AttributeError):
         told = disk.read_json(_files(lock)[0])
         return {str(name): set(map(bytes.fromhex, ids)) for name, ids in told.items()}

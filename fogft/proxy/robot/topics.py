@@ -1,4 +1,4 @@
-"""Topics on the robot: what it publishes goes to every replica, what they publish comes here.
+"""Topics on the robot: sends its messages to every replica, publishes the replicas' here.
 
 Owns: subscriptions and publishers of the robot's side, what each replica still has to get, and
 the pulls that are out. Not here: links (`client`), which message passes (`topics.select`).
@@ -51,7 +51,7 @@ class _Way:
 
 
 class RobotTopic:
-    """One topic of the robot's."""
+    """One topic on the robot."""
 
     def __init__(
         self, topic: TopicSpec, clock: Callable[[], float], wake: Callable[[], None], merge: Merge
@@ -78,7 +78,7 @@ class RobotTopic:
         self.count = dict.fromkeys(("messages", "passed", "dropped", "refused"), 0)
 
     def open(self, node: SerialisedNode) -> None:
-        """Publish or subscribe here. Raises RosError."""
+        """Create the publisher or subscription. Raises RosError."""
         topic = self.topic
         if topic.origin is Origin.ROBOT:
             self._subscription = node.subscribe(topic.name, topic.type, topic.quality, self.heard)
@@ -86,13 +86,13 @@ class RobotTopic:
             self._publisher = node.publisher(topic.name, topic.type, topic.quality)
 
     def close(self) -> None:
-        """Leave ROS."""
+        """Close the publisher or subscription."""
         for end in (self._publisher, self._subscription):
             if end is not None:
                 end.close()
 
     def report(self) -> dict[str, Any]:
-        """Return its counters and rate, and why it does not pass."""
+        """Return its counters and rate, and why it does not get through."""
         rate_hz = round(self._rate_hz, 2)
         return {
             **self.count,
@@ -103,7 +103,7 @@ class RobotTopic:
     # -- the robot's own messages ---------------------------------------------------------
 
     def heard(self, message: bytes) -> None:
-        """Take a message from ROS, for every replica."""
+        """Take a message from ROS for every replica."""
         with self._lock:
             self._number += 1
             self.count["messages"] += 1
@@ -117,7 +117,7 @@ class RobotTopic:
             self._send()
 
     def route(self, links: Mapping[int, Link], members: Iterable[int]) -> None:
-        """Set the links over which it passes now, and which replicas there are."""
+        """Set the links to use now, and the replicas."""
         with self._lock:
             known = set(members)
             for key in self._ways.keys() - known:
@@ -133,7 +133,7 @@ class RobotTopic:
             self._links = dict(links)
 
     def tick(self) -> None:
-        """Send what is due: messages, and pulls. Not from a link's thread."""
+        """Send due messages and pulls. Not from a link's thread."""
         with self._lock:
             self._send()
         now = self._clock()
@@ -179,7 +179,7 @@ class RobotTopic:
     # -- answers (the links' threads) -----------------------------------------------------
 
     def answered(self, key: int, answer: Answer) -> None:
-        """Take the end of an attempt: a message was confirmed, or a pull answered, or neither."""
+        """Take the end of an attempt: a confirmed message, an answered pull, or a failure."""
         with self._lock:
             way = self._ways.get(key)
             number = None if way is None else way.out.pop(answer.request_id, None)
@@ -243,7 +243,11 @@ class RobotTopic:
 
 
 class TopicsOnRobot:
-    """The topics of one client proxy."""
+    """The topics of one client proxy.
+
+    Args:
+        merge: Makes one status of an action of what its replicas say.
+    """
 
     def __init__(
         self,
@@ -261,7 +265,7 @@ class TopicsOnRobot:
         return name in self._topics
 
     def serve(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> bool:
-        """Pass these topics and no others; return whether they have changed."""
+        """Pass exactly these topics; return whether they have changed."""
         wanted = {topic.key_name: topic for topic in topics}
         changed = False
         for name, old in list(self._topics.items()):
@@ -286,7 +290,7 @@ class TopicsOnRobot:
         return changed
 
     def types(self) -> dict[str, str]:
-        """Return the type of each, by its name on the wire."""
+        """Return the type of each topic, by its name on the link."""
         return {name: one.topic.type for name, one in self._topics.items()}
 
     def route(self, links: Mapping[int, Link]) -> None:
@@ -308,11 +312,11 @@ class TopicsOnRobot:
             one.tick()
 
     def report(self) -> dict[str, Any]:
-        """Return counters by topic, and why some cannot pass."""
+        """Return counters by topic, and why some do not get through."""
         counts = {one.topic.name: one.report() for one in self._topics.values()}
         return {**counts, **{name: {"trouble": why} for name, why in self._trouble.items()}}
 
     def close(self) -> None:
-        """Leave ROS."""
+        """Close the publisher or subscription."""
         for one in self._topics.values():
             one.close()

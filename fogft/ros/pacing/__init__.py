@@ -1,4 +1,4 @@
-"""Responses that leave no faster than their clients take them.
+"""Pacing of responses, so that clients' queues do not overflow.
 
 Not here: sending them (`fogft.ros.entities`, `fogft.rmw_zenoh`).
 """

@@ -1,4 +1,4 @@
-"""Whether a client takes: its node's executor is asked for a turn.
+"""Probes of clients' nodes, to learn whether their executors take responses.
 
 Nothing in DDS tells what a reader has taken. But a ROS node answers services of its own, those of
 its parameters, and by the same executor that takes its clients' responses, one in each turn: an
@@ -23,10 +23,10 @@ KEPT = 64
 
 
 class Graph(Protocol):
-    """What is asked of a ROS node."""
+    """The interface of a ROS node that probes use."""
 
     def client(self, name: str, type_name: str) -> RosClient:
-        """Make a client of a service."""
+        """Create a client of a service."""
 
     def node_of(self, service: str, client: bytes) -> ClientNode | None:
         """Return the node that a client of a service belongs to."""
@@ -45,7 +45,7 @@ class NodeProbes:
         self._lock = threading.Lock()
 
     def answers(self, service: str, client: bytes) -> bool:
-        """Whether discovery has found that the node of a service's client answers.
+        """Whether the node of a service's client answers probes, as far as discovered.
 
         It finds a node, and each of its services, one after another.
         """
@@ -73,7 +73,7 @@ class NodeProbes:
         return True
 
     def unique(self, service: str, client: bytes) -> bool:
-        """Whether only the client's own node can have answered.
+        """Whether no other process has a node of the same name.
 
         A node that was killed and started again answers what its predecessor was asked, which
         discovery lists until its lease ends.
@@ -82,6 +82,6 @@ class NodeProbes:
         return found is not None and found.unique
 
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
-        """Send a probe; `on_answer` comes from the take loop, or never. It may not be sent."""
+        """Try to send a probe; `on_answer` is called from the take loop, or never."""
         with contextlib.suppress(KeyError, RosError):
             self._by_client[client].call(_OF_NO_PARAMETER, lambda _: on_answer())

@@ -1,4 +1,4 @@
-"""When a response may be sent, so that no client's queue overflows. Pure; seconds come in.
+"""When a response may be sent, so that no client's queue overflows. Pure: time is an argument.
 
 All clients of a service share one topic for its responses, and each has a queue of its own:
 of ten, by default, from which the eleventh pushes the first, whoever it is for. So what counts
@@ -83,11 +83,11 @@ class ClientPace:
 
     @property
     def strict(self) -> bool:
-        """Whether only probes show what it takes."""
+        """Whether only probes count as progress."""
         return self.probing in (Probing.ASKED, Probing.YES)
 
     def requested(self, now: float, *, together: bool = False) -> None:
-        """Note a request; `together` with another, when it cannot follow from a response."""
+        """Note a request; `together` with another if it cannot be a reaction to a response."""
         self.refill(now)
         if now - self.asked_at > _QUIET_S:
             self._window, self._proofs, self._usual = WINDOW, 0, WINDOW
@@ -108,7 +108,7 @@ class ClientPace:
                 self._window, self._proofs = min(2 * self._window, WINDOW_LIMIT), 0
 
     def hold(self, handle: Any, payload: bytes, now: float) -> bool:
-        """Have a response wait; False where too much waits already."""
+        """Queue a response; False if the queue is full."""
         whole = self._waiting_bytes + len(payload)
         if self.waiting and (len(self.waiting) >= WAITING_LIMIT or whole > WAITING_BYTES_LIMIT):
             return False
@@ -117,14 +117,14 @@ class ClientPace:
         return True
 
     def next(self, now: float) -> tuple[Any, bytes]:
-        """Return the response that waited for longest; of a client that is behind, the newest."""
+        """Return the oldest queued response; the newest if the client is far behind."""
         behind = self.finding_until is None and now - self.waiting[0][2] > BEHIND_S
         handle, payload, _ = self.waiting.pop() if behind else self.waiting.popleft()
         self._waiting_bytes -= len(payload)
         return handle, payload
 
     def not_found(self, handle: Any, payload: bytes, now: float) -> None:
-        """Have a response wait that was sent before discovery had found the client."""
+        """Queue a response again that was sent before the client was discovered."""
         self.waiting.appendleft((handle, payload, now))
         self._waiting_bytes += len(payload)
         self.finding_until = self.finding_until or now + FIND_LIMIT_S
@@ -140,7 +140,7 @@ class ClientPace:
         self._open = max(self._open - 1, 0)
 
     def has_room(self, sent: int) -> bool:
-        """Whether one more response leaves the oldest that it has not taken in its queue."""
+        """Whether one more response fits in the client's queue."""
         return not self.untaken or sent + 1 < self.untaken[0] + self._size()
 
     def _size(self) -> int:
@@ -149,13 +149,13 @@ class ClientPace:
         return PROBED_WINDOW if self.probing is Probing.YES else WINDOW
 
     def answered_probe(self, now: float) -> None:
-        """Note that its executor had a turn."""
+        """Note an answered probe: the executor had a turn."""
         if self._probes:
             self._took(min(self._taken + 1, self._probes.popleft()))
         self.probed_at = now if self._probes else None
 
     def probes_due(self, now: float, sent: int) -> int:
-        """Return how many probes to send now; they count as sent."""
+        """Return how many probes to send now; those count as sent."""
         if self.probing is not Probing.YES or (self._probes and now < self._probe_again_at):
             return 0
         self._probes = deque([sent] * min(PROBES, len(self.untaken)))
@@ -165,11 +165,11 @@ class ClientPace:
         return len(self._probes)
 
     def silent(self, now: float, limit_s: float = _SILENT_S) -> bool:
-        """Whether it has answered no probe for long."""
+        """Whether it has not answered probes for long."""
         return self.probed_at is not None and now - self.probed_at > limit_s
 
     def refill(self, now: float) -> None:
-        """Take what time alone shows."""
+        """Update the estimate from elapsed time."""
         steps = int((now - self._refilled_at) / EVERY_S)
         if steps > 0:
             self._refilled_at += steps * EVERY_S
@@ -198,7 +198,7 @@ class Pace:
         self.sent = 0
 
     def client(self, id: bytes, now: float) -> ClientPace:
-        """Return a client, which may be new; of many those are forgotten that asked long ago."""
+        """Return a client, adding it if new; the least recent ones are forgotten."""
         pace = self.clients.get(id)
         if pace is None:
             if len(self.clients) >= _CLIENTS_KEPT:
@@ -223,7 +223,7 @@ class Pace:
         client.sent(self.sent)
 
     def in_the_way(self, client: ClientPace, now: float) -> Iterator[tuple[bytes, ClientPace]]:
-        """Return the clients whose queues have no room for a response to this one."""
+        """Return the clients whose queues block a response to this one."""
         for id, other in self.clients.items():
             if other.untaken:
                 other.refill(now)

@@ -84,7 +84,7 @@ class Pacer:
                 self._wake.notify()
 
     def respond(self, handle: Any, payload: bytes) -> None:
-        """Send a response now, or as soon as its client can bear it.
+        """Send a response now, or as soon as its client has room.
 
         Raises:
             RosError: It was sent now, and ROS refused it.
@@ -194,7 +194,7 @@ class Pacer:
             self._wake.notify()
 
     def close(self) -> None:
-        """Send no more; what waits is dropped. Repeatable."""
+        """Stop sending; queued responses are dropped. Repeatable."""
         with self._wake:
             self._closed = True
             self._wake.notify()

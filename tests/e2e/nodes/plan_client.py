@@ -16,6 +16,7 @@ import time
 
 import rclpy
 from nav_msgs.srv import GetPlan
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -79,7 +80,8 @@ class PlanClient(Node):
         executor.add_node(self)
         end = time.monotonic() + seconds
         self.ask()
-        timer = self.create_timer(self._period_s, self.ask)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # a node's own is the system's
+        timer = self.create_timer(self._period_s, self.ask, clock=steady)
         while time.monotonic() < end and not self.enough:
             executor.spin_once(timeout_sec=0.05)
             self.give_up()

@@ -75,6 +75,8 @@ class Service(threading.Thread):
             incoming.refuse(Refusal(incoming.payload[7:].decode()))
         elif incoming.payload == b"ignore":
             pass
+        elif incoming.payload == b"who":
+            incoming.reply(incoming.robot.encode())
         elif incoming.payload.startswith((b"noise:", b"text:")):
             incoming.reply(content(incoming.payload))
         elif self._reply_bytes >= 0:

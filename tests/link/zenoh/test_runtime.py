@@ -6,25 +6,25 @@ import json
 import subprocess
 import sys
 
-from fogft.link.zenoh import runtime
+from fogft.link.zenoh import settings
 
 
 def test_our_wish_is_set_and_the_users_is_kept():
     ours: dict[str, str] = {}
-    runtime.prepare(ours)
-    assert ours == {runtime.VARIABLE: runtime.THREADS}
-    theirs = {runtime.VARIABLE: "(rx: (worker_threads: 4))"}
-    runtime.prepare(theirs)
-    assert theirs == {runtime.VARIABLE: "(rx: (worker_threads: 4))"}
+    settings.ask_for_threads(ours)
+    assert ours == {settings.VARIABLE: settings.THREADS}
+    theirs = {settings.VARIABLE: "(rx: (worker_threads: 4))"}
+    settings.ask_for_threads(theirs)
+    assert theirs == {settings.VARIABLE: "(rx: (worker_threads: 4))"}
 
 
 def test_only_our_own_wish_is_forgotten():
-    ours = {runtime.VARIABLE: runtime.THREADS, "OTHER": "1"}
-    runtime.forget(ours)
+    ours = {settings.VARIABLE: settings.THREADS, "OTHER": "1"}
+    settings.forget_threads(ours)
     assert ours == {"OTHER": "1"}
-    theirs = {runtime.VARIABLE: "(rx: (worker_threads: 4))"}
-    runtime.forget(theirs)
-    assert runtime.VARIABLE in theirs
+    theirs = {settings.VARIABLE: "(rx: (worker_threads: 4))"}
+    settings.forget_threads(theirs)
+    assert settings.VARIABLE in theirs
 
 
 def test_zenoh_takes_the_wish():

@@ -63,7 +63,7 @@ def test_a_robot_of_another_ca_is_refused(
         replica.endpoint,
         files=CredentialPaths(authority.robot().ca, theirs.certificate, theirs.key),
     )
-    _refused(link, "of another CA")
+    _refused(link, "from another CA")
     assert _heard_nothing(replica)
 
 

@@ -26,7 +26,7 @@ def times_asked(world: World, seconds: int) -> list[int]:
 
 @given(worlds())
 def test_only_who_should_answer_and_does_not_is_asked_about(world: World) -> None:
-    """Never one that answers, is still being launched, has failed or is being ended."""
+    """Never one that answers, is still being launched, has failed or is being shut down."""
     links = {link.id: link for link in world.links or ()}
     machines = {m.id: m for m in world.machines or ()}
     for id in Silent().due(world.observed, world.history):

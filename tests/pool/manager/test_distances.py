@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cloud import geography
 from fogft.model.choices import PlacementSpec
 from fogft.model.replica import (
     LinkReport,
@@ -22,6 +21,7 @@ from fogft.model.replica import (
     ReplicaId,
 )
 from fogft.model.spec import PoolSpec
+from fogft.pool.manager import distances
 from fogft.pool.manager.distances import Distances, Latencies, connect_time
 
 NEAR, FAR, DEAD = "aws/us-west-1", "aws/eu-central-1", "aws/us-east-1"
@@ -109,21 +109,21 @@ def test_a_damaged_file_holds_nothing(tmp_path: Path, content: str):
 def test_estimates_grow_with_the_distance():
     here = (37.87, -122.26)
     regions = ["aws/us-west-1", "aws/us-west-2", "aws/us-east-1", "aws/eu-central-1"]
-    guesses = [geography.estimated_rtt_s(here, geography.position(r)) for r in regions]
+    guesses = [distances.estimated_rtt_s(here, distances.position(r)) for r in regions]
     assert guesses == sorted(guesses)
     assert guesses[0] < 0.02
     assert 0.1 < guesses[-1] < 0.25
 
 
 def test_every_place_and_cloud_has_an_endpoint():
-    assert {region.split("/")[0] for region in geography.positions()} == {"aws", "azure", "gcp"}
-    for region, (latitude, longitude) in geography.positions().items():
-        host, port = geography.endpoint(region)
+    assert {region.split("/")[0] for region in distances.positions()} == {"aws", "azure", "gcp"}
+    for region, (latitude, longitude) in distances.positions().items():
+        host, port = distances.endpoint(region)
         assert region.split("/")[1] in host
         assert port == 443
         assert -90 <= latitude <= 90
         assert -180 <= longitude <= 180
-    assert geography.endpoint("local/us-west-1") is None
+    assert distances.endpoint("local/us-west-1") is None
 
 
 def test_one_slow_probe_moves_nothing(tmp_path: Path):

@@ -154,7 +154,7 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
     ]  # fmt: skip
     assert len({line.index(word) for line, word in zip(table, ["PHASE"] + 5 * ["ready"])}) == 1  # noqa: B905
     assert table[5].split()[1:] == ["ready", "by", "hand", "0.000", "up", "4.00", "ms", "7", "-"]
-    assert "it was not found yet" in "\n".join(lines)
+    assert "it has not been found yet" in "\n".join(lines)
 
 
 def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> None:
@@ -174,7 +174,7 @@ def test_slots_are_listed_by_number(tmp_path: Path) -> None:
     with pytest.raises(FogftError) as caught:
         change.generation_in(PoolPaths(tmp_path), 5, NOW)
     assert caught.value.hint == "slots with a replica: 9, 10, 99, 100"
-    with pytest.raises(FogftError, match="started by hand") as caught:
+    with pytest.raises(FogftError, match="started manually") as caught:
         change.generation_in(PoolPaths(tmp_path), 2000, NOW)
     assert "`fogft credentials revoke replica 2000`" in caught.value.hint
     assert slots(PoolPaths(tmp_path)) == [9, 10, 99, 100]

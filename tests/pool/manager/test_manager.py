@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from fogft import disk, logfile
+from fogft import __version__, disk, logfile
 from fogft.errors import PoolBusy
 from fogft.model import intent as intents
 from fogft.pool.commands import startup
 from fogft.pool.folder.lease import TERM, Lease
+from fogft.pool.manager import process_control
 from tests.pool.scene import Scene
 
 
@@ -68,7 +71,7 @@ def test_second_manager_is_refused(scene: Scene) -> None:
     scene.wait(lambda: scene.whole(2))
     second = scene.start_manager()
     assert second.wait(20) == 1
-    assert "has a manager already (pid" in scene.output()
+    assert "already has a manager (pid" in scene.output()
     assert scene.cloud.launched() == ["0.1", "1.1"]
 
 
@@ -79,7 +82,7 @@ def test_manager_of_an_older_epoch_steps_down(scene: Scene) -> None:
     scene.wait(lambda: scene.whole(1))
     disk.write_json(scene.paths.lease, {"epoch": 99, "pid": 1, "beat": 0})
     assert process.wait(20) == 1
-    assert "has a later manager" in scene.output()
+    assert "a later manager has taken over" in scene.output()
 
 
 def test_scale_and_file_change_reach_a_running_manager(scene: Scene) -> None:
@@ -219,6 +222,46 @@ def test_start_manager_starts_one_only_where_there_is_none(scene: Scene) -> None
     scene.wait(lambda: scene.whole(1))
     assert not startup.start_manager(scene.store, scene.command)
     assert [what.split(" ")[0] for what in scene.end()] == ["manager", "client", "replica"]
+
+
+SLOW_TO_TELL = """\
+import json, os, pathlib, sys, time
+from fogft import disk
+lock, status = map(pathlib.Path, sys.argv[1:3])
+held = disk.Lock(lock)
+if not held.acquire(wait=False):
+    sys.exit()
+time.sleep(float(sys.argv[4]))
+status.write_text(json.dumps({"manager_version": sys.argv[3], "manager_pid": os.getpid()}))
+time.sleep(100)
+"""
+
+
+def test_of_two_that_upgrade_a_manager_one_ends_it_and_none_its_successor(scene: Scene) -> None:
+    """Two `up`s of a new version at once; the new manager has not written its status yet."""
+    scene.write()
+    paths = scene.paths
+
+    def command(version: str, delay_s: float = 0.0) -> list[str]:
+        words = [str(paths.manager_lock), str(paths.status), version, str(delay_s)]
+        return [sys.executable, "-c", SLOW_TO_TELL, *words]
+
+    assert startup.start_manager(scene.store, lambda _: command("0.0.9"))
+    old = scene.wait(lambda: disk.holder(paths.manager_lock) if paths.status.exists() else None)
+    with ThreadPoolExecutor() as both:
+        asked = [
+            both.submit(startup.start_manager, scene.store, lambda _: command(__version__, 1.0))
+            for _ in range(2)
+        ]
+        started = [one.result() for one in asked]
+    new = disk.holder(paths.manager_lock)
+    try:
+        assert sorted(started) == [False, True]
+        assert new is not None
+        assert new != old
+        assert json.loads(paths.status.read_text())["manager_pid"] == new
+    finally:
+        process_control.end_holder(paths.manager_lock)
 
 
 def test_logs_of_the_pool_stay_bounded(scene: Scene) -> None:

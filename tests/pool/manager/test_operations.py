@@ -122,6 +122,22 @@ def test_launch_of_unknown_outcome_is_looked_up() -> None:
     assert bench.kinds() == [EventKind.LAUNCH, EventKind.GONE, EventKind.LAUNCH]
 
 
+@pytest.mark.parametrize(("notice_s", "cause"), [(1.5, Cause.NOTICE), (0.0, Cause.NOT_LISTED)])
+def test_why_a_machine_went_is_remembered(notice_s: float, cause: Cause) -> None:
+    """A preemption notice, if there was one; else that its cloud lists it no more."""
+    bench = Bench()
+    for _ in range(5):
+        bench.reconciler.tick()
+        bench.run()
+        bench.now += 30.0
+    bench.cloud.preempt(bench.cloud.machines(UID)[0].id, notice_s=notice_s)
+    for _ in range(3):
+        bench.reconciler.tick()
+        bench.now += 1.0
+    went = [event for event in bench.store.events if event.kind is EventKind.GONE]
+    assert [event.reason for event in went] == [Reason(cause)]
+
+
 def test_readiness_is_remembered_once_for_each_change() -> None:
     """READY, UNREADY and READY again, however many ticks pass in between."""
     bench = Bench()

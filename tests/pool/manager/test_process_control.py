@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from fogft import disk
 from fogft.model.reason import Cause
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
-from fogft.pool.manager.proxy_supervisor import BACKOFF_LIMIT_S, ProxySupervisor
+from fogft.pool.manager.proxy_supervisor import BACKOFF_LIMIT_S, STEADY_S, ProxySupervisor
 from tests.needs import needs
 
 HOLD = """
@@ -59,12 +60,12 @@ def hold(lock: Path, holders: list[subprocess.Popen[bytes]], *words: str) -> int
 
 def test_the_holder_of_a_lock_is_known(lock: Path, holders: list[subprocess.Popen[bytes]]) -> None:
     """By the kernel's list, whatever any file says; nobody holds what is free or missing."""
-    assert process_control.lock_holder(lock) is None
+    assert disk.holder(lock) is None
     pid = hold(lock, holders)
-    assert process_control.lock_holder(lock) == pid
+    assert disk.holder(lock) == pid
     holders[0].kill()
     holders[0].wait()
-    assert process_control.lock_holder(lock) is None
+    assert disk.holder(lock) is None
 
 
 OVERLAY = """
@@ -77,8 +78,8 @@ until grep -q held "$1/said"; do sleep 0.02; done
 "$2" -c "
 import sys
 from pathlib import Path
-from fogft.pool.manager.process_control import lock_holder
-print(lock_holder(Path(sys.argv[1])))
+from fogft.disk import holder
+print(holder(Path(sys.argv[1])))
 " "$1/root/a.lock"
 echo $!
 kill $!
@@ -160,11 +161,11 @@ def test_a_proxy_that_keeps_dying_is_started_less_and_less_often(tmp_path: Path)
 
 
 def test_a_proxy_that_ran_well_is_started_again_at_once(tmp_path: Path) -> None:
-    """After half a minute of life there is no waiting."""
+    """After some seconds of life there is no waiting: kills in a row are no bad start."""
     proxy = Proxy(tmp_path, "raise SystemExit(3)")
     for _ in range(3):
         proxy.look_until_ended()
-        proxy.now += 31
+        proxy.now += STEADY_S + 1
     assert proxy.supervisor.trouble is None
 
 
@@ -176,3 +177,29 @@ def test_a_running_proxy_is_adopted(tmp_path: Path) -> None:
     assert proxy.supervisor.look()
     assert not proxy.paths.proxy_log.exists()
     held.release()
+
+
+WORKS = "import sys, time\nfrom pathlib import Path\nfrom fogft import disk\n"
+WORKS += "disk.Lock(Path(sys.argv[1])).acquire(wait=True)\nprint('held', flush=True)\n"
+WORKS += "while True: time.sleep(0.01)"
+
+
+@pytest.mark.parametrize("which", ["proxy_lock", "standby_lock"])
+def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
+    """Stopped, it holds its place for ever, and nobody can take over; one that works is let be."""
+    proxy = Proxy(tmp_path, "pass")
+    words = [sys.executable, "-c", WORKS, str(getattr(proxy.paths, which))]
+    works = subprocess.Popen(words, stdout=-1)
+    try:
+        assert works.stdout is not None
+        works.stdout.readline()
+        for number in (signal.SIGCONT, signal.SIGSTOP):
+            os.kill(works.pid, number)
+            for _ in range(15):
+                proxy.supervisor.look()
+                proxy.now += 1.0
+                time.sleep(0.05)
+            assert works.poll() == (-signal.SIGKILL if number == signal.SIGSTOP else None)
+    finally:
+        works.kill()
+        works.communicate()

@@ -24,7 +24,7 @@ import pyzeros.service_server
 import zenoh
 from pyzeros.qos import QosProfile
 
-from fogft.rmw_zenoh import session as rmw_session
+from fogft.rmw_zenoh.node import settings_from
 
 _HEADER = b"\x00\x01\x00\x00"
 
@@ -89,7 +89,7 @@ if not os.environ.get("FOGFT_PYZEROS_CODECS"):
 
 def session() -> zenoh.Session:
     """Open a session that is configured as those of `rmw_zenoh`."""
-    return zenoh.open(rmw_session.settings_from(os.environ))
+    return zenoh.open(settings_from(os.environ))
 
 
 async def _serve(name: str, delay_s: float) -> None:

@@ -19,7 +19,8 @@ class Scene:
         self.clock = Clock()
         self.ready = True
         self.clients = {SERVICE: FakeClient(), OTHER: FakeClient()}
-        self.goals = GoalsOnce(self.clients, lambda name: self.ready, clock=self.clock, **options)
+        bounded = type("Bounded", (GoalsOnce,), options)
+        self.goals = bounded(self.clients, lambda name: self.ready, clock=self.clock)
         self.goals.use(self.clients)
         self.asked = 0
 

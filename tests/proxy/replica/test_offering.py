@@ -91,12 +91,19 @@ def test_listed_services_are_all_there_is():
 
 
 def test_a_replica_that_offers_other_names_lists_them():
-    scene = Scene(ServiceSpec("/s", SET_BOOL), graph={"/arm/s": SET_BOOL, "/s": "a_b/srv/C"})
+    scene = Scene(ServiceSpec("/s", SET_BOOL), graph={"/arm/s": SET_BOOL})
     scene.node.clients["/s"].there = False
     scene.look()
     assert scene.probe().detail == (
-        "`run` does not offer /s yet; it offers /arm/s (std_srvs/srv/SetBool), /s (a_b/srv/C)"
+        "`run` does not offer /s yet; it offers /arm/s (std_srvs/srv/SetBool)"
     )
+
+
+def test_a_replica_whose_type_is_another_names_both():
+    scene = Scene(ServiceSpec("/s", SET_BOOL), graph={"/arm/s": SET_BOOL, "/s": "a_b/srv/C"})
+    scene.node.clients["/s"].there = False
+    scene.look()
+    assert scene.probe().detail == "`run` offers /s as a_b/srv/C, not as std_srvs/srv/SetBool"
 
 
 def test_a_replica_without_the_type_stays_and_says_so():

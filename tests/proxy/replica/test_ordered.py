@@ -9,9 +9,9 @@ from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.state import StateService, StateSpec
-from fogft.proxy.order_mark import OrderMark
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.order_mark import OrderMark
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.load import Handling
 from tests.proxy.fakes import UID, Clock, FakeClient, FakeLink

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.errors import RosError, Unreadable
-from fogft.proxy.replica.interruption import EMPTY_REQUEST
 from fogft.proxy.replica.responder import Responder
+from fogft.proxy.replica.service_queue import EMPTY_REQUEST
 from fogft.requests.load import Handling, Load
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
 
@@ -16,12 +16,17 @@ A = b"a" * 16
 B, C, D = b"b" * 16, b"c" * 16, b"d" * 16
 
 
+BOUNDS = {"held_limit", "held_bytes", "outstanding", "kept_bytes", "kept_ids"}
+
+
 class Scene:
     def __init__(self, **options) -> None:
         self.clock = Clock()
         self.ready = True
         self.client = FakeClient()
-        self.responder = Responder(lambda name: self.ready, clock=self.clock, **options)
+        bounds = {name: options.pop(name) for name in BOUNDS & options.keys()}
+        bounded = type("Bounded", (Responder,), bounds)
+        self.responder = bounded(lambda name: self.ready, clock=self.clock, **options)
         self.responder.use({"/s": self.client})
 
     def ask(self, id: bytes, **options) -> FakeIncoming:
@@ -251,7 +256,7 @@ def test_an_unknown_service_is_refused():
 
 
 def test_more_than_the_window_is_refused():
-    scene = Scene(max_in_flight=1)
+    scene = Scene(held_limit=1)
     scene.ask(A)
     assert scene.ask(B).outcome == ["refused overloaded"]
     scene.answer(0)
@@ -539,7 +544,7 @@ def test_a_chatty_robot_does_not_starve_another():
 
 
 def test_when_full_the_chatty_robot_gives_way_to_another():
-    scene = Scene(max_in_flight=4, outstanding=1)
+    scene = Scene(held_limit=4, outstanding=1)
     chatty = [scene.ask(bytes([n]) * 16, robot="chatty", remaining_s=5.0 + n) for n in range(4)]
     quiet = scene.ask(A, robot="quiet")
     assert chatty[3].outcome == ["refused overloaded"]

@@ -173,7 +173,7 @@ def test_a_service_that_answers_nothing_of_what_it_has_is_told_and_then_started_
     scene.clock.now += 1.0
     answer = scene.probe()
     assert (answer.ready, answer.hanging) == ({"/s"}, {"/s"})
-    assert answer.detail == "`/s` has work and has answered nothing for 2 s"
+    assert answer.detail == "`/s` has requests and has answered none for 2 s"
     for _ in range(600):
         scene.clock.now += 0.1
         scene.proxy.run_once()

@@ -57,7 +57,7 @@ def test_a_dead_command_is_told_once_and_started_again_after_its_backoff(supervi
     supervisor = supervise("exit 3", clock=clock)
     supervisor.poll()
     wait_until(lambda: supervisor.poll())
-    assert supervisor.last_exit == "exit status 3"
+    assert supervisor.last_exit == "exited with status 3"
     assert supervisor.restarts == 1  # at once
     wait_until(lambda: supervisor.poll())
     assert not supervisor.alive
@@ -80,7 +80,8 @@ def test_a_command_that_dies_over_requests_is_started_again_at_once_each_time(su
 
 def test_the_wait_doubles_and_is_bounded(supervise):
     clock = Clock()
-    supervisor = supervise("exit 0", clock=clock, backoff_s=(1.0, 4.0))
+    supervisor = supervise("exit 0", clock=clock)
+    supervisor.backoff_s = (1.0, 4.0)
     waits = []
     for _ in range(5):
         supervisor.poll()
@@ -94,7 +95,7 @@ def test_a_signal_is_named(supervise):
     supervisor = supervise("kill -SEGV $$")
     supervisor.poll()
     wait_until(lambda: supervisor.poll())
-    assert supervisor.last_exit == "died of SIGSEGV"
+    assert supervisor.last_exit == "was killed by SIGSEGV"
 
 
 def test_stop_ends_what_ignores_signals_and_what_it_started(supervise, tmp_path):

@@ -172,7 +172,7 @@ class SimulatedLink:
         pass
 
     def status(self) -> LinkStatus:
-        return LinkStatus(LinkState.UP, None, 0.0, 0.0, 0.001, 0, 0, 0, "")
+        return LinkStatus(LinkState.UP, None, 0.0, 0.0, 0.001, 0, 0, "")
 
     def close(self) -> None:
         self.usable = False

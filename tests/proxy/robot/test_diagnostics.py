@@ -108,8 +108,8 @@ def test_counters_that_begin_anew_are_no_trouble():
     [
         (None, Level.OK, ""),
         (7200.0, Level.OK, ""),
-        (600.0, Level.WARN, "the cloud's credentials end in 10 min"),
-        (-5.0, Level.WARN, "the cloud's credentials have ended"),
+        (600.0, Level.WARN, "the cloud's credentials expire in 10 min"),
+        (-5.0, Level.WARN, "the cloud's credentials have expired"),
     ],
 )
 def test_credentials_of_the_cloud_are_counted_down(left_s: float | None, level: Level, said: str):

@@ -151,7 +151,7 @@ def test_a_fallback_that_is_not_there_leaves_silence_and_is_counted(caplog):
     scene.pass_time(5.0)
     assert scene.responses == []
     assert scene.count("silent", "fallback_failed", "pending") == [1, 1, 0]
-    assert "fallback_not_asked service=/s reason='nobody offers it'" in caplog.text
+    assert "fallback_not_asked service=/s reason='no node offers it'" in caplog.text
 
 
 def test_a_fallback_that_hangs_leaves_silence_after_its_own_time():

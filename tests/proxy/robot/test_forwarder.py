@@ -25,7 +25,7 @@ class Scene:
 
     def __init__(self, **given) -> None:
         self.clock = Clock()
-        self.forwarder = Forwarder(clock=self.clock, **given)
+        self.forwarder = type("Bounded", (Forwarder,), given)(clock=self.clock)
         self.dispatcher = Dispatcher(
             ServiceSpec("/s", "std_srvs/srv/SetBool"), self.forwarder.respond, clock=self.clock
         )
@@ -122,7 +122,7 @@ def test_with_nobody_behind_it_refuses_and_hands_back_what_it_holds(scene):
 
 
 def test_one_robot_does_not_take_all_the_room():
-    scene = Scene(held=4, of_one=2)
+    scene = Scene(held_limit=4, of_one_limit=2)
     outcomes = [scene.request(n, robot="greedy").outcome for n in range(3)]
     assert outcomes == [[], [], [refused(Refusal.OVERLOADED)]]
     outcomes = [scene.request(10 + n, robot=f"r{n}").outcome for n in range(3)]
@@ -148,7 +148,7 @@ def test_closing_refuses_what_is_under_way(scene):
 
 def status(state: LinkState, *behind: GatewayView, detail: str = "") -> LinkStatus:
     answer = ProbeAnswer(slot=1, generation=1, incarnation="x", behind=behind)
-    return LinkStatus(state, answer, 0.5, 3.0, 0.01, 0, 0, 0, detail)
+    return LinkStatus(state, answer, 0.5, 3.0, 0.01, 0, 0, detail)
 
 
 def test_replicas_are_seen_through_a_gateway_as_if_linked():

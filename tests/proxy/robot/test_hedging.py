@@ -84,7 +84,7 @@ def test_auto_is_as_good_as_the_shortest_queue_and_as_all_from_idle_to_full(serv
 
     From 70 % on 1.1: what few copies are sent to learn from is work, and there is none to spare.
     """
-    seconds = 45.0 / load  # as many requests at each load
+    seconds = by_day(20, at_night=45) / load  # as many requests at each load
     better = shortest_queue(service, load, seconds)
     if load <= 0.2:  # of more load `all` makes an endless queue
         better = min(better, p99(served(HedgingMode.ALL, service, load, seconds=seconds)) - 0.002)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -13,7 +15,7 @@ from fogft import disk
 from fogft.errors import StateError
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import proxy_supervisor
-from fogft.proxy.robot.manager_restart import LOOK_S, NAME, ManagerRestart
+from fogft.proxy.robot.manager_restart import HANGS_AFTER_S, LOOK_S, NAME, ManagerRestart
 
 
 class Scene:
@@ -82,3 +84,27 @@ def test_one_that_ended_well_or_has_systemd_is_let_be(scene):
     scene.paths.manager_start.write_text("[]")
     with pytest.raises(StateError, match="damaged"):
         scene.looks(1)
+
+
+HOLDS = "import sys, time\nfrom pathlib import Path\nfrom fogft import disk\n"
+HOLDS += "disk.Lock(Path(sys.argv[1])).acquire(wait=True)\nprint('held', flush=True)\n"
+HOLDS += "while True: time.sleep(0.01)"
+
+
+def test_one_that_hangs_is_killed_and_started_again(scene):
+    """It holds its lock, so that no other manager can begin, and does nothing."""
+    words = [sys.executable, "-c", HOLDS, str(scene.paths.manager_lock)]
+    hangs = subprocess.Popen(words, stdout=subprocess.PIPE)
+    try:
+        hangs.stdout.readline()
+        os.kill(hangs.pid, signal.SIGSTOP)
+        os.waitpid(hangs.pid, os.WUNTRACED)  # until then it may come round once more
+        assert not scene.looks(round(HANGS_AFTER_S / LOOK_S))
+        assert hangs.poll() is None
+        started = scene.looks(3)
+        assert hangs.wait(20) == -signal.SIGKILL
+    finally:
+        hangs.kill()
+        hangs.communicate()
+    assert started or scene.looks(5)  # the kernel may have freed the lock between two looks
+    assert scene.restart.child.wait(20) == 0

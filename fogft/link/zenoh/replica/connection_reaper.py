@@ -1,11 +1,12 @@
-"""Close connections at a replica's port that belong to no admitted robot, or deliver nothing.
+"""Close connections at a replica's port that belong to no admitted robot or are stuck.
 
 Zenoh owns the port. It lets a connection that never says who it is stand for as long as it
 likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look ourselves at this
 process's own sockets, twice a second and whenever somebody comes: what is connected to the
 port and is no authenticated link is ended or kept out as `door` says, a link of a revoked
-holder is ended at once, and one that delivers nothing of what it holds after a while. All are
-counted. Where strangers hold all descriptors that the process may have, all of them are ended.
+holder is ended at once, as are those of one holder beyond `LINKS_LIMIT`, and one that delivers
+nothing of what it holds after a while. All are counted. Where strangers hold all descriptors that
+the process may have, all of them are ended.
 Who looks sees, too, which links are thin.
 
 Owns: ending connections, and how they drain. Not here: who has to go (`door`), whose requests are
@@ -20,6 +21,7 @@ import os
 import socket
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 
 from fogft.link.counters import Counters
@@ -35,6 +37,9 @@ log = logging.getLogger(__name__)
 LOOK_EVERY_S = 0.5
 _LOOK_AGAIN_S = 0.01  # while somebody comes, or is kept out
 RUSH_LIMIT = 2  # so many new ones since the last look
+# Of one holder, the newest: a robot has one an uplink, and another while it takes a new certificate
+# into use. Zenoh has room for 128 of all holders together.
+LINKS_LIMIT = 16
 # A robot that is out of reach has long opened another link by then.
 STUCK_AFTER_S = 15.0
 
@@ -43,7 +48,7 @@ _RESERVE = 32  # descriptors
 
 
 class DescriptorReserve:
-    """Descriptors that are kept for when strangers hold all others. For one thread.
+    """File descriptors held in reserve against floods of connections. For one thread.
 
     Without one, nothing tells whose the connections at the port are, no preemption notice is read
     and no state is written. Zenoh takes of what is given back no more than wait at the port.
@@ -54,7 +59,7 @@ class DescriptorReserve:
         self.fill()
 
     def fill(self) -> bool:
-        """Keep as many as there should be; False where no more can be had beside them."""
+        """Fill the reserve; return False if no further descriptor is left besides."""
         try:
             while len(self._kept) < _RESERVE:
                 self._kept.append(_open())
@@ -64,7 +69,7 @@ class DescriptorReserve:
         return True
 
     def release(self) -> None:
-        """Let the process use them."""
+        """Release the reserve for the process to use."""
         while self._kept:
             os.close(self._kept.pop())
 
@@ -73,13 +78,26 @@ def _open() -> int:
     return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
 
 
+def surplus(links: Mapping[Address, str]) -> list[Address]:
+    """Return those of links (to whom, oldest first) of which their holder has newer ones enough."""
+    newer = Counter(links.values())
+    found = []
+    for peer, name in links.items():
+        if newer[name] > LINKS_LIMIT:
+            found.append(peer)
+        newer[name] -= 1
+    return found
+
+
 class ConnectionReaper:
-    """Looks after one port until closed.
+    """Watches one port until closed.
 
     Args:
+        port: The port that this process listens at.
         links: Returns the peers' addresses of authenticated links, with their common names.
-        counters: Counts ``unauthenticated``, ``revoked_links`` and ``stuck_links`` ended, and when
-            the door was shut or no descriptors were left.
+        revoked: Returns the names whose links are to be ended.
+        counters: Counts ``unauthenticated``, ``revoked_links``, ``surplus_links`` and
+            ``stuck_links`` ended, and when the door was shut or no descriptors were left.
         stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.
 
     Attributes:
@@ -104,6 +122,7 @@ class ConnectionReaper:
         self._stuck_after_s = stuck_after_s
         self.thin: frozenset[str] = frozenset()
         self._progress: dict[Address, SocketProgress] = {}
+        self._linked: dict[Address, str] = {}  # oldest first
         self._filter = ListenFilter(port)
         self._door = Door()
         self._reserve = DescriptorReserve()
@@ -114,7 +133,7 @@ class ConnectionReaper:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop looking."""
+        """Stop watching."""
         self._stop.set()
         self._thread.join(1.0)
 
@@ -142,7 +161,7 @@ class ConnectionReaper:
             time.sleep(_LOOK_AGAIN_S / 50)
 
     def look(self, now: float) -> None:
-        """Look once, and end what has to go."""
+        """Check once, and close the connections that must go."""
         short = not self._reserve.fill()
         if short:
             self._filter.drop(None)  # first: what is given back is not for strangers
@@ -158,6 +177,11 @@ class ConnectionReaper:
             for peer, name in links.items():
                 if name in revoked and peer in found:
                     self._end(found[peer], peer, "revoked_links", name)
+            kept = {peer: name for peer, name in self._linked.items() if links.get(peer) == name}
+            self._linked = {**kept, **links}
+            for peer in surplus(self._linked):
+                if peer in found:
+                    self._end(found[peer], peer, "surplus_links", links[peer])
             self._watch(links, found, now)
             strangers = found.keys() - links.keys()
             gone = self._door.look(strangers, links.keys(), now)
@@ -180,7 +204,10 @@ class ConnectionReaper:
     def _watch(
         self, links: Mapping[Address, str], found: Mapping[Address, socket.socket], now: float
     ) -> None:
-        """See how links drain: find the thin ones, and end those that stand still."""
+        """See how links drain: find the thin ones, and end those that stand still.
+
+        A peer that has acknowledged nothing for long is frozen, or out of reach.
+        """
         thin = set()
         progress = {
             peer: self._progress.get(peer) or SocketProgress() for peer in links if peer in found

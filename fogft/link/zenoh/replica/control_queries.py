@@ -36,7 +36,11 @@ _STRANGERS = b""  # in place of a token: replies to whose connection is not know
 
 
 class ControlQueries:
-    """Answers the queries of robots."""
+    """Answers the queries of robots.
+
+    Args:
+        records: What the pool has signed, as far as it is known here.
+    """
 
     def __init__(
         self,
@@ -58,7 +62,7 @@ class ControlQueries:
     # -- Zenoh's threads ------------------------------------------------------------------
 
     def open_answers(self, asked: QueryEnd) -> None:
-        """A connection that was let in asks for its answers to come."""
+        """Handle an admitted connection's query for its stream of answers."""
         try:
             token = _greeting(asked.query).token
         except FrameError as error:
@@ -72,7 +76,7 @@ class ControlQueries:
             self._queues.end(gone, "gone", QueryEnd(query, asked.turn))
 
     def probe(self, on_probe: Callable[[Probe], ProbeAnswer], asked: QueryEnd) -> None:
-        """Somebody greets and asks how we are."""
+        """Handle a probe, which may carry a greeting."""
         self._counters.add("probes")
         try:
             probe = probe_frames.decode_probe(_content(asked.query))
@@ -85,10 +89,10 @@ class ControlQueries:
             said = replace(on_probe(probe), accepts=ACCEPTED)
             return probe_frames.encode_probe_answer(said)
 
-        self.later(partial(self._answer, greeting, asked, answer), asked)
+        self.later(greeting, partial(self._answer, greeting, asked, answer), asked)
 
     def records(self, asked: QueryEnd) -> None:
-        """Somebody brings what the pool has signed."""
+        """Handle signed records that a robot passes on."""
         self._counters.add("records")
         try:
             greeting = _greeting(asked.query)
@@ -101,11 +105,12 @@ class ControlQueries:
             newer = self.take(offered)
             return frames.pack(newer) if newer else b""
 
-        self.later(partial(self._answer, greeting, asked, answer), asked)
+        self.later(greeting, partial(self._answer, greeting, asked, answer), asked)
 
-    def later(self, job: Callable[[], None], asked: QueryEnd) -> None:
-        """Have the other thread do something; where too much waits for it, the query just ends."""
-        if not self._work_queue.offer(job):
+    def later(self, greeting: frame.Greeting, job: Callable[[], None], asked: QueryEnd) -> None:
+        """Run a job on the other thread; if its sender's queue is full, just end the query."""
+        who = greeting.certificate or self._sessions.holder(greeting.token).encode()
+        if not self._work_queue.offer(job, who):
             self._end_of_stranger(asked, "")
 
     def _turn_away(self, asked: QueryEnd, refusal: str, why: str) -> None:
@@ -138,7 +143,11 @@ class ControlQueries:
             self._queues.end(greeting.token, "probe", asked)
 
     def take(self, offered: Sequence[SignedRecord]) -> list[SignedRecord]:
-        """Do what good records say; return what stands in place of those that are out of date."""
+        """Apply valid records; return newer ones for those that are out of date.
+
+        Returns:
+            What stands in place of those that are out of date.
+        """
         newer: list[SignedRecord] = []
         for one in offered:
             verdict = self._records.offer(one)

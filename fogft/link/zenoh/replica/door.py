@@ -1,4 +1,4 @@
-"""Whom a replica's port accepts, and which strangers have to go. Pure: `now` is an argument.
+"""Which hosts a replica's port accepts, and which unauthenticated connections it closes. Pure.
 
 A stranger is who has connected and not said who he is: a robot in the midst of its handshake, or
 nobody that is wanted. Zenoh rests for 0.1 s after each handshake that fails, and all that come
@@ -30,7 +30,7 @@ END_EVERY_S = 0.12
 
 
 class Door:
-    """One port's. Its memory is bounded by the connections that there may be at once."""
+    """The admission state of one port. Bounded by the number of concurrent connections."""
 
     def __init__(self) -> None:
         self._first_seen: dict[Address, float] = {}
@@ -40,7 +40,7 @@ class Door:
     def look(
         self, strangers: Collection[Address], linked: Collection[Address], now: float
     ) -> Address | None:
-        """Take who is connected, linked or not; return the stranger to be ended now."""
+        """Take the current connections; return the unauthenticated ones to close now."""
         self._first_seen = {peer: self._first_seen.get(peer, now) for peer in strangers}
         known = {host for host, _ in linked}
         self._until = {
@@ -55,19 +55,19 @@ class Door:
 
     @property
     def kept_out(self) -> frozenset[str] | None:
-        """Hosts of which nothing more is to be accepted; None for everybody."""
+        """Hosts from which nothing more is accepted; None for all hosts."""
         others = [host for host, _ in self._first_seen if host not in self._until]
         return None if len(others) >= SHUT_LIMIT else frozenset(self._until)
 
 
 def full(strangers: Collection[Address]) -> set[str]:
-    """Return the hosts of which there are too many strangers."""
+    """Return the hosts with too many unauthenticated connections."""
     of_host = Counter(host for host, _ in strangers)
     return {host for host, count in of_host.items() if count >= HOST_LIMIT}
 
 
 def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
-    """Return which strangers (when each was first seen) have to go, oldest first."""
+    """Return the unauthenticated connections (with first sight) to close, oldest first."""
     by_age = sorted(strangers, key=lambda peer: strangers[peer])
     surplus = set(by_age[: max(0, len(by_age) - STRANGERS_LIMIT)])
     for host in full(strangers):  # who shares its address is to have a turn

@@ -1,4 +1,4 @@
-"""Drop new connections to a port in the kernel: those of some hosts, or all.
+"""Drop new connections to a port in the kernel, from some hosts or from all.
 
 Zenoh accepts whatever comes to its port, and rests for 0.1 s after each handshake that fails. So
 from whom too many are under way nothing more is to be accepted. A filter on the listening socket
@@ -38,7 +38,11 @@ Instruction = tuple[int, int, int, int]
 
 
 class ListenFilter:
-    """What is dropped at one port of this process. For one thread."""
+    """The packet filter on one port of this process. For one thread.
+
+    Args:
+        port: Where it listens; where no socket does, nothing is done.
+    """
 
     def __init__(self, port: int) -> None:
         self._listening = sockets.listening(port)
@@ -48,7 +52,7 @@ class ListenFilter:
                 self._listening.listen(WAITING_LIMIT)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until a connection comes, but no longer than that; return whether one came."""
+        """Wait for a connection, with a time limit; return whether one came."""
         if self._listening is None:
             time.sleep(timeout_s)
             return False
@@ -57,7 +61,7 @@ class ListenFilter:
         return bool(waiting.poll(timeout_s * 1e3))
 
     def turn_away(self) -> None:
-        """End the connections that wait for Zenoh to take them."""
+        """Close the connections that Zenoh has not accepted yet."""
         if self._listening is None:
             return
         self._listening.setblocking(False)  # as it is for Zenoh
@@ -68,7 +72,7 @@ class ListenFilter:
                 connection.close()
 
     def drop(self, hosts: frozenset[str] | None) -> None:
-        """Drop the new connections of these hosts from now on, and of no others; None for all."""
+        """Drop new connections from exactly these hosts from now on; None for all hosts."""
         if hosts == self._dropped or self._listening is None:
             return
         hosts = None if hosts is not None and len(hosts) > HOSTS_LIMIT else hosts
@@ -83,13 +87,13 @@ class ListenFilter:
             self._dropped = hosts
 
     def close(self) -> None:
-        """Let go of the port: nothing of ours keeps it open."""
+        """Release the port: close our descriptors of it."""
         if self._listening is not None:
             self._listening.close()
 
 
 def instructions(hosts: Iterable[str] | None) -> list[Instruction]:
-    """Return the filter that drops what comes from these hosts; None for all. Pure.
+    """Return the BPF filter that drops packets from these hosts; None for all. Pure.
 
     Of an IPv6 address the network counts, its first 64 bits: who has one address has them all.
     """

@@ -1,4 +1,4 @@
-"""A replica's end over Zenoh: hear requests and probes, queue the answers of each robot apart.
+"""A replica's end over Zenoh: receives requests and probes, and queues answers by robot.
 
 Requests are published to us; a connection's answers are the replies to one query of its own,
 which it asks once we have let it in, and which stays open.
@@ -54,11 +54,17 @@ _CLOSE_WAIT_S = 1.0
 
 
 class ZenohListener:
-    """A replica's end: it hears requests and probes of robots that its CA admits.
+    """A replica's end: receives requests and probes of robots that its CA admits.
 
     Args:
+        listen: ``host:port``; port 0 for any that is free.
+        credentials: The replica's certificate and key, and the pool's CA.
+        id: Which replica this is: it hears the keys of its slot only.
         handshakes: Tells which handshakes were refused; None where they need not be counted.
         certificate_name: The common name of its certificate, where that is not the replica's.
+
+    Raises:
+        WireError: `listen` is not ``host:port``.
     """
 
     def __init__(
@@ -115,7 +121,7 @@ class ZenohListener:
         on_probe: Callable[[Probe], ProbeAnswer],
         on_cancel: Callable[[Sequence[bytes]], None] = lambda ids: None,
     ) -> None:
-        """Begin to listen. Callbacks come from the wire's threads and must not block.
+        """Start listening. Callbacks come from Zenoh's threads and must not block.
 
         Args:
             on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
@@ -150,7 +156,7 @@ class ZenohListener:
         self._declare(session, names.probe_key(*place), partial(self._control.probe, on_probe))
 
     def add(self, services: Mapping[str, str]) -> None:
-        """Hear requests for further services too (name -> key); only after `serve`."""
+        """Serve further services too (name -> key); only after `serve`."""
         self._services.update((key, name) for name, key in services.items())
 
     def _peers(self) -> dict[Address, str]:
@@ -230,6 +236,9 @@ class ZenohListener:
         if service is None:
             self._refuse_all(requests, stream, Refusal.NOT_READY)
             return
+        robot = self._sessions.robot(token)
+        if robot not in ("", requests[0][0].robot):  # it asks in its own name, whatever it says
+            requests = [(header._replace(robot=robot), content) for header, content in requests]
         for header, payload in requests:
             hand_over = partial(self._hand_over, on_request, service, header, stream)
             if not header.packed:
@@ -284,14 +293,14 @@ class ZenohListener:
     # -- the owner ------------------------------------------------------------------------
 
     def lease(self) -> Record | None:
-        """Return the newest lease that the manager signed, of those that robots brought."""
+        """Return the newest manager lease that robots have passed on."""
         return self._records.get(RecordKind.LEASE)
 
     def counters(self) -> Mapping[str, int]:
         """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
         ``malformed``, ``records``, ``records_refused``, ``records_older``, ``not_admitted``,
         ``handshakes_refused``, ``unauthenticated``, ``kept_out``, ``revoked_links``,
-        ``stuck_links``, ``reply_dropped``, ``failed``, ``cancellations``,
+        ``surplus_links``, ``stuck_links``, ``reply_dropped``, ``failed``, ``cancellations``,
         ``control_queries_dropped``.
         """
         return self._counters.snapshot()
@@ -313,7 +322,7 @@ class ZenohListener:
 
 def _with_port(listen: str) -> str:
     host, separator, port = listen.rpartition(":")
-    if not separator or not host or not port.isdigit() or int(port) > 65535:
+    if not separator or not host or not port.isdecimal() or int(port) > 65535:
         raise WireError(f"`{listen}` is not `host:port`", "for instance `0.0.0.0:7448`")
     if int(port) != 0:
         return listen

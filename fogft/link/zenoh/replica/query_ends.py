@@ -23,23 +23,30 @@ _ANYWAY_S = 1.0  # Zenoh's thread has long let go, though nothing came after
 
 
 class QueryTurns:
-    """Which query Zenoh's one thread has in its hands: the last that came."""
+    """The query that Zenoh's thread is working on: the last one received."""
 
     def __init__(self) -> None:
         self.last = 0
 
     def came(self) -> int:
-        """Count a query. Called by Zenoh's thread, first of all."""
+        """Count a query. Called first by Zenoh's thread."""
         self.last += 1
         return self.last
 
     def over(self, turn: int) -> bool:
-        """Whether Zenoh's thread has let go of a query."""
+        """Whether Zenoh's thread has finished with a query."""
         return turn < self.last
 
 
 class QueryEnd:
-    """A query that is to be ended, after a refusal if there is one."""
+    """A query to end, after sending a refusal if there is one.
+
+    Args:
+        turn: When it came, by `QueryTurns`.
+
+    Attributes:
+        refusal: What is said before; empty for nothing.
+    """
 
     def __init__(self, query: zenoh.Query, turn: int) -> None:
         self.query = query
@@ -48,19 +55,19 @@ class QueryEnd:
         self._ended = False
 
     def say(self) -> None:
-        """Send the refusal. May block while its robot takes nothing. Raises zenoh.ZError."""
+        """Send the refusal. May block while the robot does not read. Raises zenoh.ZError."""
         if self.refusal:
             self.query.reply_err(frame.encode_refusal(frame.NO_STAMP, _NO_REQUEST, self.refusal))
 
     def end(self) -> None:
-        """End the query. May block as `say` does."""
+        """End the query. May block like `say`."""
         if not self._ended:
             self._ended = True
             self.query.drop()  # type: ignore[no-untyped-call]
 
 
 class Unended:
-    """What one thread has yet to end."""
+    """The queries that one thread has yet to end."""
 
     def __init__(self, turns: QueryTurns) -> None:
         self._turns = turns
@@ -77,7 +84,7 @@ class Unended:
             self._ends.append((time.monotonic(), one))
 
     def look(self) -> None:
-        """End what may be ended by now."""
+        """End all queries that may be ended by now."""
         waiting, self._ends = self._ends, []
         for since, one in waiting:
             if self._turns.over(one.turn) or time.monotonic() - since > _ANYWAY_S:

@@ -1,4 +1,4 @@
-"""Requests that came over Zenoh until they are answered, and their replies on the way out.
+"""Requests received over Zenoh until they are answered, and the queues of their replies.
 
 A request is answered once, or refused where it is forgotten. Each connection of a robot has a queue
 and a thread.
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True, eq=False)
 class Reply:
-    """One answer: a payload, or a refusal where that is not empty.
+    """One answer: a refusal if that is not empty, else a payload.
 
     Attributes:
         load: What the replica has to do, as `frame.encode_load` writes it.
@@ -55,16 +55,16 @@ class Reply:
 
     @property
     def joins(self) -> bool:
-        """Whether it may leave in one message with others."""
+        """Whether it may be batched with others."""
         return len(self.payload) <= batch_frames.ENTRY_BYTES_LIMIT and not self.may_pack
 
     @property
     def small(self) -> bool:
-        """Whether it may leave at once, where the stream lets it."""
+        """Whether it is small enough to be sent at once."""
         return len(self.payload) <= SMALL_BYTES and not self.may_pack
 
     def send(self, stamp: bytes) -> None:
-        """Send it. Blocks for as long as its robot takes nothing and the way there is full."""
+        """Send it. Blocks while the robot does not read and the connection is full."""
         query = self.stream.query
         if self.refusal:
             query.reply_err(frame.encode_refusal(stamp, self.request_id, self.refusal, self.load))
@@ -79,7 +79,7 @@ class Reply:
 
 
 def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
-    """Send replies of one stream. May block as `Reply.send` does."""
+    """Send replies of one stream. May block like `Reply.send`."""
     if len(replies) == 1:
         replies[0].send(stamp)
         return
@@ -92,7 +92,6 @@ def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
 
 REPLIES_LIMIT = 1024
 BYTES_LIMIT = 64 << 20
-_IDLE_S = 5.0
 _END_LOOK_S = 0.2  # nobody waits for an end
 
 
@@ -107,7 +106,11 @@ class ReplyQueue:
         self._taken: list[Reply | QueryEnd | None] = []  # it did not fit to what was taken before
 
     def next(self, timeout_s: float) -> list[Reply] | QueryEnd:
-        """Wait for what is to be sent next, together, or to be ended; nothing where all ends."""
+        """Wait for the next replies to send together, or query to end; nothing once closed.
+
+        Raises:
+            Empty: Nothing came.
+        """
         first = self._taken.pop() if self._taken else self.replies.get(timeout=timeout_s)
         if first is None:
             return []
@@ -132,7 +135,14 @@ class ReplyQueue:
 
 
 class ReplyQueues:
-    """All reply queues of a listener."""
+    """All reply queues of a listener.
+
+    Args:
+        counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
+        later: Has something done by a thread that may block; the collector of garbage calls it.
+    """
+
+    idle_s = 5.0  # a thread that had nothing to send for so long ends
 
     def __init__(
         self,
@@ -140,12 +150,10 @@ class ReplyQueues:
         turns: QueryTurns | None = None,
         *,
         later: Callable[[Callable[[], None]], None] = lambda job: job(),
-        idle_s: float = _IDLE_S,
     ) -> None:
         self.later = later
         self._counters = counters
         self._turns = turns or QueryTurns()
-        self._idle_s = idle_s
         self._lock = threading.Lock()
         self._queues: dict[bytes, ReplyQueue] = {}
         self._closed = False
@@ -154,7 +162,12 @@ class ReplyQueues:
         return len(self._queues)
 
     def put(self, token: bytes, robot: str, reply: Reply, *, more: bool) -> None:
-        """Send a reply, or queue it. Never blocks; where too much waits, the robot gets none."""
+        """Send or queue a reply. Never blocks; if the queue is full, the reply is dropped.
+
+        Args:
+            token: The robot's connection: replies of one never wait for another's.
+            more: Others will soon follow, to leave in one message with it.
+        """
         may_send = not more and reply.small and not threads.is_this()
         if may_send and not self._closed and self._sent_at_once(reply):
             self._count(reply)
@@ -177,7 +190,7 @@ class ReplyQueues:
             self._count(reply)
 
     def end(self, token: bytes, robot: str, query: QueryEnd) -> None:
-        """Queue a query that is to be ended. Never blocks."""
+        """Queue a query to be ended. Never blocks."""
         with self._lock:
             if self._closed:
                 return
@@ -213,7 +226,7 @@ class ReplyQueues:
         unended = Unended(self._turns)
         while True:
             try:
-                taken = queue.next(_END_LOOK_S if unended else self._idle_s)
+                taken = queue.next(_END_LOOK_S if unended else self.idle_s)
             except Empty:
                 if unended:
                     self._guarded(unended.look)
@@ -249,7 +262,7 @@ class ReplyQueues:
         self._counters.warn(log, "failed", "reply_failed reason=%r", str(error))
 
     def close(self, timeout_s: float) -> None:
-        """Take nothing more; wait a moment for what is queued."""
+        """Stop accepting replies; wait briefly for queued ones."""
         with self._lock:
             self._closed = True
             queues = list(self._queues.values())
@@ -262,7 +275,7 @@ class ReplyQueues:
 
 
 class ZenohIncoming:
-    """A request that came over Zenoh; see `port.Incoming`."""
+    """A request received over Zenoh; see `port.Incoming`."""
 
     __slots__ = (
         *("_header", "_queues", "_streams"),

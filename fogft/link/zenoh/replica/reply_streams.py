@@ -1,4 +1,4 @@
-"""The query of each connection that carries its replies, and what is unacknowledged on it.
+"""The query that carries each connection's replies, and its unacknowledged bytes.
 
 Replying blocks only where the robot takes nothing and all buffers on the way are full. So who must
 not block may reply himself while no more is on the way than those surely hold. What has arrived is
@@ -67,7 +67,7 @@ class ReplyCredit:
         return len(self._outstanding)
 
     def seen(self, connection: object, stamp: bytes) -> None:
-        """Note the last stamp that was seen on a connection; one that is not known is fine."""
+        """Note the last acknowledged stamp on a connection; unknown ones are ignored."""
         if stamp not in self._outstanding:  # nothing new, as mostly
             return
         with self._lock:
@@ -84,7 +84,7 @@ class ReplyCredit:
                 return
 
     def send_at_once(self, connection: object, send: Send) -> bool:
-        """Call `send` for something of at most 16 KiB where it cannot block; return whether."""
+        """Call `send` for at most 16 KiB if it cannot block; return whether it was called."""
         if self.slow() or not self._gate.acquire(blocking=False):
             return False
         try:
@@ -114,7 +114,7 @@ class ReplyCredit:
                 del self._outstanding[stamp]
 
     def send(self, connection: object, send: Send) -> None:
-        """Call `send`, which may block, for anything. At once nothing leaves until it was seen."""
+        """Call `send`, which may block. Until it is acknowledged, nothing is sent at once."""
         stamp = os.urandom(STAMP_BYTES)
         with self._gate, self._lock:
             self._blockable += 1
@@ -130,14 +130,17 @@ class ReplyCredit:
                     self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=True)
 
 
-LIMIT = 1024  # a replica has 128 sessions; the others are those of connections that are gone
+OF_ONE_LIMIT = 32  # of one holder: nobody's connections push out another's
 
 
 class Stream:
     """One connection's open query, with `ReplyCredit`'s methods for that connection. Any thread."""
 
-    def __init__(self, query: zenoh.Query, credit: ReplyCredit | None = None) -> None:
+    def __init__(
+        self, query: zenoh.Query, credit: ReplyCredit | None = None, holder: str = ""
+    ) -> None:
         self.query = query
+        self.holder = holder
         credit = credit or ReplyCredit()
         self.slow = credit.slow
         name = object()  # of this connection: it must not keep the query, which ends with us
@@ -147,10 +150,15 @@ class Stream:
 
 
 class Streams:
-    """The open queries for answers, by the token of their connection."""
+    """The open queries for answers, by the token of their connection.
 
-    def __init__(self, limit: int = LIMIT, slow: Callable[[str], bool] = lambda _: False) -> None:
-        self._limit = limit
+    Args:
+        slow: Whether the holder of a certificate is known to read slowly.
+    """
+
+    limit = 1024  # a replica has 128 sessions; the others are those of connections that are gone
+
+    def __init__(self, slow: Callable[[str], bool] = lambda _: False) -> None:
         self._slow = slow
         self._lock = threading.Lock()
         self._streams: OrderedDict[bytes, Stream] = OrderedDict()
@@ -160,7 +168,7 @@ class Streams:
     def opened(
         self, token: bytes, query: zenoh.Query, holder: str
     ) -> list[tuple[bytes, zenoh.Query]]:
-        """Take a connection's query; return those, with their tokens, that are to be ended."""
+        """Add a connection's query; return the ones to end, with their tokens."""
         ended = []
         with self._lock:
             if token in self._streams:
@@ -168,13 +176,14 @@ class Streams:
             credit = self._credit.get(holder)
             if credit is None:
                 credit = self._credit[holder] = ReplyCredit(partial(self._slow, holder))
-            self._streams[token] = Stream(query, credit)
-            if len(self._streams) > self._limit:
-                oldest, stream = self._streams.popitem(last=False)
-                ended.append((oldest, stream.query))
+            self._streams[token] = Stream(query, credit, holder)
+            own = [other for other, one in self._streams.items() if one.holder == holder]
+            if len(own) > OF_ONE_LIMIT or len(self._streams) > self.limit:
+                oldest = own[0] if len(own) > OF_ONE_LIMIT else next(iter(self._streams))
+                ended.append((oldest, self._streams.pop(oldest).query))
         return ended
 
     def clear(self) -> None:
-        """Let go of all."""
+        """Remove all queries."""
         with self._lock:
             self._streams.clear()

@@ -11,8 +11,9 @@ Owns: which tokens are good, and whose. Not here: signatures (`signing`), TLS (`
 from __future__ import annotations
 
 import threading
+import time
 from collections import OrderedDict
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 
 from fogft.link import frame
 from fogft.link.frame import Greeting
@@ -22,6 +23,8 @@ from fogft.records.record import RecordError, Verify
 
 HOLDERS_LIMIT = 256
 TOKENS_LIMIT = 64  # of one holder: nobody's connections push out another's
+# Each costs a thread for a while: who makes so many within this greets too often.
+TOKENS_WITHIN_S = 10.0
 _MAY_ASK = frozenset({Role.ROBOT, Role.GATEWAY})
 
 
@@ -34,20 +37,37 @@ class NotAdmittedError(Exception):
 
 
 class AuthenticatedSessions:
-    """The connections that were authenticated. Any thread."""
+    """The connections that were authenticated. Any thread.
 
-    def __init__(self, pool_uid: str, replica: str, verify: Verify) -> None:
+    Args:
+        pool_uid: Holders of other pools are not let in.
+        replica: This replica's common name, which a greeting is made out to.
+    """
+
+    def __init__(
+        self,
+        pool_uid: str,
+        replica: str,
+        verify: Verify,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._clock = clock
         self._pool_uid = pool_uid
         self._replica = replica
         self._verify = verify
         self._lock = threading.Lock()
-        self._tokens: dict[bytes, str] = {}
+        self._tokens: dict[bytes, Holder] = {}
         self.admits = self._tokens.__contains__  # whether a token is let in; asked for each request
-        self._holders: OrderedDict[str, OrderedDict[bytes, None]] = OrderedDict()
+        # When each token was let in, oldest first, by holder.
+        self._holders: OrderedDict[str, OrderedDict[bytes, float]] = OrderedDict()
         self.revoked: frozenset[str] = frozenset()  # common names that are let in no more
 
     def greet(self, greeting: Greeting) -> None:
-        """Let a connection in. Raises NotAdmittedError: its holder may not ask here."""
+        """Admit a connection.
+
+        Raises:
+            NotAdmittedError: Its holder may not ask here.
+        """
         if not greeting.certificate:
             if greeting.token not in self._tokens:
                 raise NotAdmittedError(Refusal.NOT_ADMITTED, "a connection that did not greet")
@@ -64,10 +84,11 @@ class AuthenticatedSessions:
         except ValueError as error:
             raise NotAdmittedError(Refusal.NOT_ADMITTED, str(error)) from error
         if holder.role.value != writer.role or holder.role not in _MAY_ASK:
-            raise NotAdmittedError(Refusal.NOT_ADMITTED, f"`{writer.common_name}` may not ask")
+            words = f"`{writer.common_name}` may not send requests"
+            raise NotAdmittedError(Refusal.NOT_ADMITTED, words)
         if holder.pool_uid != self._pool_uid:
             raise NotAdmittedError(
-                Refusal.NOT_ADMITTED, f"`{writer.common_name}` is no holder here"
+                Refusal.NOT_ADMITTED, f"`{writer.common_name}` is not a member of this pool"
             )
         self._admit(greeting.token, holder)
 
@@ -76,28 +97,37 @@ class AuthenticatedSessions:
         with self._lock:
             if name in self.revoked:
                 raise NotAdmittedError(Refusal.REVOKED, f"`{name}` is revoked")
-            if self._tokens.get(token, name) != name:
+            if self._tokens.get(token, holder) != holder:
                 raise NotAdmittedError(Refusal.NOT_ADMITTED, "a token that is another's")
             if name not in self._holders and len(self._holders) >= HOLDERS_LIMIT:
                 self._forget(next(iter(self._holders)))
-            tokens = self._holders.setdefault(name, OrderedDict())
+            tokens, now = self._holders.setdefault(name, OrderedDict()), self._clock()
             self._holders.move_to_end(name)
-            tokens[token] = None
-            self._tokens[token] = name
-            if len(tokens) > TOKENS_LIMIT:
-                oldest, _ = tokens.popitem(last=False)
-                del self._tokens[oldest]
+            if token in tokens:
+                return
+            if len(tokens) >= TOKENS_LIMIT:
+                oldest, since = next(iter(tokens.items()))
+                if now - since < TOKENS_WITHIN_S:
+                    raise NotAdmittedError(Refusal.OVERLOADED, f"`{name}` greets too often")
+                del tokens[oldest], self._tokens[oldest]
+            tokens[token], self._tokens[token] = now, holder
 
     def _forget(self, name: str) -> None:
         for token in self._holders.pop(name, ()):
             del self._tokens[token]
 
     def holder(self, token: bytes) -> str:
-        """Return whose connection a token names; empty for nobody's."""
-        return self._tokens.get(token, "")
+        """Return the holder of the connection with a token; empty if unknown."""
+        found = self._tokens.get(token)
+        return "" if found is None else found.common_name
+
+    def robot(self, token: bytes) -> str:
+        """Return in which robot's name a connection asks; empty for any, as a gateway's does."""
+        found = self._tokens.get(token)
+        return found.name if found is not None and found.role is Role.ROBOT else ""
 
     def revoke(self, names: Collection[str]) -> None:
-        """Let these holders in no more. Names that were revoked before stay so."""
+        """Admit these holders no more. Earlier revocations stay in force."""
         with self._lock:
             self.revoked |= frozenset(names)
             for name in self.revoked & self._holders.keys():

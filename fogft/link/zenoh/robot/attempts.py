@@ -1,4 +1,4 @@
-"""The requests open on one connection: taken, sent, and ended, each once.
+"""The attempts open on one connection: accepted, sent and ended exactly once.
 
 A request is sent by whoever offers it where that cannot block (`credit`), else by a thread of its
 connection's own, so a peer that takes nothing costs nobody else.
@@ -17,21 +17,20 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from fogft.link import batch_frames, frame
-from fogft.link.cancellations import Cancellations
 from fogft.link.compression import Compression, Unpacker
-from fogft.link.credit import Credit
-from fogft.link.deadline_filter import DeadlineFilter
-from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
+from fogft.link.credit import LARGE_BYTES, Credit, LargeSendGate
 from fogft.link.port import Answer, SendOptions
+from fogft.link.socket_progress import DeadlineFilter
 from fogft.link.window import (
     ATTEMPTS_LIMIT,
     BatchBuffer,
+    Cancellations,
     LinkWindow,
     OpenAttempt,
+    SendQueue,
     Unanswered,
 )
 from fogft.link.zenoh.flow_watch import FlowWatch
-from fogft.link.zenoh.robot.send_queue import SendQueue
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model.refusal import Refusal
 from fogft.requests.load import Handling
@@ -51,28 +50,34 @@ _TELL = OpenAttempt("", b"", None, 0, 0.0, 0.0)
 
 
 class Outlet(Protocol):
-    """What attempts need of their connection."""
+    """The interface of a connection that attempts use."""
 
     @property
     def flow(self) -> FlowWatch:
-        """What flows through its socket."""
+        """The kernel's counters of its socket."""
 
     def publish(self, service: str, content: bytes, header: bytes) -> None:
-        """Send a message to a service. May block for as long as the peer takes nothing."""
+        """Send a message to a service. May block while the peer does not read."""
 
     def cancel(self, ids: Sequence[bytes]) -> None:
-        """Tell the replica that these are no longer wanted. May block likewise."""
+        """Send cancellations of these requests. May block likewise."""
 
     def alive(self) -> bool:
-        """Whether there is still a link beneath."""
+        """Whether the Zenoh session still has a link."""
 
     def lose(self, because: str) -> None:
-        """It is of no more use. Any thread, perhaps more than once."""
+        """Note that the connection is lost. Any thread, perhaps more than once."""
 
 
 @dataclass(frozen=True)
 class Callbacks:
-    """What a connection tells its link. Called from any thread; none may block."""
+    """Callbacks from a connection to its link. Called from any thread; none may block.
+
+    Attributes:
+        room: A window that was full has room again.
+        large: Something large is sent, and `Attempts.watched` was not set.
+        lost: The connection is of no more use. Perhaps more than once.
+    """
 
     answered: Callable[[Answer], None]
     late: Callable[[Answer], None]
@@ -85,6 +90,7 @@ class Attempts:
     """The attempts of one connection.
 
     Args:
+        origin: What the headers of all its requests say (`frame.origin`).
         cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
 
     Attributes:
@@ -149,7 +155,7 @@ class Attempts:
         more: bool = False,
         handling: Handling = Handling.NORMAL,
     ) -> bool:
-        """Take an attempt, or return False. Never blocks. With `more`, `send` must follow."""
+        """Accept an attempt, or return False. Never blocks. With `more`, `send` must follow."""
         if service not in self._services or self._queue.qsize() >= _QUEUE_LIMIT:
             return False
         now = time.monotonic()
@@ -186,7 +192,7 @@ class Attempts:
             self._lose(error, attempt)
 
     def send(self) -> None:
-        """Send what was offered with `more`. Never blocks: it was small, and reserved."""
+        """Send attempts offered with `more`. Never blocks: they are small and have credit."""
         self._send_together(self._batch.take())
 
     def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
@@ -231,7 +237,7 @@ class Attempts:
         return self.window.admit(attempt)
 
     def forget(self, request_id: bytes) -> None:
-        """Free the room and the bytes of a request, also where its sender is stuck."""
+        """Free the window of a request, even if its sender is stuck."""
         attempt = self.window.forget(request_id)
         if attempt is None:
             return
@@ -248,7 +254,7 @@ class Attempts:
             self._room()
 
     def flush(self) -> None:
-        """Have the replica told of what was forgotten and not answered."""
+        """Send cancellations for forgotten, unanswered requests."""
         if self._cancellations and not self._telling:  # there are some
             self._telling = True
             self._queue.put(_TELL)
@@ -328,7 +334,7 @@ class Attempts:
         if large:
             self._held_by_zenoh = time.monotonic(), min(attempt.size, _ZENOH_HOLDS_BYTES)
         if time.monotonic() - began > _STUCK_S and not self._outlet.alive():
-            self._outlet.lose("it took nothing more, and Zenoh gave the session up")
+            self._outlet.lose("it stopped reading, and Zenoh closed the session")
 
     def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
         compression, rate = self._compressions.get(attempt.service), self._progress.bytes_per_s
@@ -353,7 +359,7 @@ class Attempts:
     # -- what came (Zenoh's threads) ------------------------------------------------------
 
     def heard(self, stamp: bytes, answers: Iterable[Answer], *, packed: bool = False) -> None:
-        """Take answers and their stamp; `packed`: one, whose payload is compressed."""
+        """Take answers and their stamp; `packed`: one answer, with a compressed payload."""
         self._seen = stamp
         for answer in answers:
             self._take_answer(answer, packed=packed)
@@ -361,7 +367,7 @@ class Attempts:
     def _take_answer(self, answer: Answer, *, packed: bool) -> None:
         attempt = self._unanswered.answered(answer.request_id)
         if self._unanswered.owed < 0:
-            self._outlet.lose("it answers more than it was asked")
+            self._outlet.lose("it sends more answers than it was sent requests")
         if attempt is None:
             return  # it was answered before
         if answer.payload is not None:
@@ -394,7 +400,7 @@ class Attempts:
 
     @property
     def sending(self) -> bool:
-        """Whether something large is being sent."""
+        """Whether a large message is being sent."""
         return self._sending_since is not None
 
     @property
@@ -403,14 +409,14 @@ class Attempts:
         return len(self._unanswered) > 0
 
     def look(self, now: float) -> float:
-        """Note whether large things are still sent; return for how long the present one is."""
+        """Track large sends; return for how long the current one has taken."""
         if self.watched and now - self._large_since > _WATCH_S and not self._queue.qsize():
             self.watched = False
         since = self._sending_since
         return 0.0 if since is None else now - since
 
     def sweep(self) -> bool:
-        """End the attempts whose time is up; return whether the replica ignores what it is sent."""
+        """End attempts past their deadline; return whether the replica ignores its requests."""
         now = time.monotonic()
         for attempt in self.window.attempts():
             if attempt.deadline <= now:
@@ -418,7 +424,7 @@ class Attempts:
         return self._unanswered.are_ignored(now)
 
     def close(self) -> None:
-        """Take nothing more: what is open is lost. Returns at once; `end` must follow."""
+        """Accept nothing more; open attempts end as lost. Returns at once; `end` must follow."""
         ended = self.window.close()
         join_at_exit(self._thread)
         for attempt in ended:
@@ -426,5 +432,5 @@ class Attempts:
             self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
 
     def end(self) -> None:
-        """Have the sender thread end, once it is through with what it sends: 11 s at the most."""
+        """End the sender thread once its current send is done: within 11 s."""
         self._queue.put(None)

@@ -1,4 +1,4 @@
-"""One Zenoh session of a robot towards one replica, used once and thrown away.
+"""One Zenoh session from a robot to one replica, used once and then discarded.
 
 A request is published at its service's key; the answers to all of them come as the replies to
 one query, which stays open for as long as the connection. A query for each request would cost
@@ -9,8 +9,8 @@ Everything of Zenoh's that can block (`put`, `close`) is called by the sender th
 attempts, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's threads. What
 sends raises `zenoh.ZError` where the session is closed.
 
-Owns: a session. Not here: the requests open on it (`attempts`), when to open and when to give
-up (`link`).
+Owns: a session, and what those of one robot share. Not here: the requests open on it (`attempts`),
+when to open and when to give up (`link`).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from __future__ import annotations
 import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -26,17 +27,51 @@ from zenoh import handlers
 
 from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
-from fogft.link.cancellations import Cancellations
-from fogft.link.port import Answer, Peer
+from fogft.link.credit import LargeSendGate
+from fogft.link.port import DEFAULT_OPTIONS, Answer, Peer, SendOptions
+from fogft.link.window import Cancellations
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.flow_watch import FlowWatch
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
-from fogft.link.zenoh.robot.shared import Shared
+from fogft.link.zenoh.settings import LinkSettings
 from fogft.link.zenoh.sockets import address
 from fogft.model import names, refusal
+from fogft.model.credentials import CredentialPaths
 from fogft.model.plain import as_line
 from fogft.model.refusal import Refusal
+from fogft.records.signing import Signer
+
+
+@dataclass
+class Shared:
+    """What all links of one robot share. Written by the dialer, read by its links.
+
+    Attributes:
+        suspect_after_s: Probes unanswered for so long make a link suspect.
+        tell_losers: Whether replicas are told which requests are no longer wanted.
+        records: Signed records for every replica, packed; empty for none.
+        newer: Slot -> what its replica said last in place of records that are out of date.
+    """
+
+    credentials: CredentialPaths
+    robot: str
+    suspect_after_s: float
+    settings: LinkSettings
+    tell_losers: bool
+    options: SendOptions = DEFAULT_OPTIONS
+    gate: LargeSendGate = field(default_factory=LargeSendGate)
+    records: bytes = b""
+    newer: dict[int, bytes] = field(default_factory=dict)
+    _signer: Signer | None = None
+
+    @property
+    def signer(self) -> Signer:
+        """The robot's key, read once. Raises CredentialError where it cannot be used."""
+        if self._signer is None:
+            self._signer = Signer(self.credentials.certificate, self.credentials.key)
+        return self._signer
+
 
 _ALL = zenoh.QueryTarget.ALL
 # NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
@@ -50,7 +85,7 @@ _ANSWERS_TIMEOUT_S = 1e9
 
 _REFUSED = {
     Refusal.REVOKED: "our certificate is revoked",
-    Refusal.NOT_ADMITTED: "the replica does not let us in: our certificate is not good for asking",
+    Refusal.NOT_ADMITTED: "the replica refuses us: our certificate does not allow requests",
     Refusal.EXPIRED_CERTIFICATE: "our certificate is not valid now, by the replica's clock",
 }
 
@@ -59,13 +94,15 @@ _TELL_RECORDS_TIMEOUT_S = 5.0
 
 
 class Connection:
-    """An open session whose peer was found to be the right one.
+    """An open session whose peer has been verified.
 
     Attributes:
+        certificate: Ours (DER), which it uses.
         lost_because: Why it is of no more use; empty while it is.
         told: The records that the replica has taken from us.
 
     Raises:
+        zenoh.ZError: Nothing was reached.
         WireError: Somebody else was reached. Nothing was sent to them.
         CredentialError: Our own certificate or key cannot be used.
     """
@@ -122,19 +159,22 @@ class Connection:
         links = self._session.info.links()
         found = {link.auth_identifier for link in links}
         if not found:
-            raise WireError(f"`{peer.endpoint}` was lost as soon as it was reached")
+            raise WireError(f"`{peer.endpoint}` closed the connection at once")
         for name in found - {peer.certificate_name}:
             raise WireError(wrong_name(name, peer), "another machine has this address now")
         return FlowWatch(address(links[0].src), address(links[0].dst))
 
     def begin(self) -> bool:
-        """Ask for answers once the replica hears us; before, what is published would be lost."""
+        """Ask for the answers to come, once the replica has let us in; return whether it hears.
+
+        What is published before Zenoh knows that it is heard there would be lost.
+        """
         if self._begun:
             return True
         for publisher in self._publishers.values():
             if not publisher.matching_status.matching:  # type: ignore[attr-defined]
                 return False
-        ended = partial(self.lose, "the replica ended our answers")
+        ended = partial(self.lose, "the replica closed the stream of answers")
         answers = handlers.Callback(self._heard, ended, indirect=False)
         self._ask(self._answers_key, answers, _ANSWERS_TIMEOUT_S, attachment=self._bare)
         self._begun = True
@@ -148,11 +188,11 @@ class Connection:
     # -- for its attempts -----------------------------------------------------------------
 
     def publish(self, service: str, content: bytes, header: bytes) -> None:
-        """Send a message to a service. May block for as long as the peer takes nothing."""
+        """Send a message to a service. May block while the peer does not read."""
         self._publishers[service].put(content, attachment=header)
 
     def cancel(self, ids: Sequence[bytes]) -> None:
-        """Tell the replica that these are no longer wanted. May block likewise."""
+        """Send cancellations of these requests. May block likewise."""
         self._session.put(
             self._cancel_key,
             frame.encode_cancel(ids),
@@ -160,7 +200,7 @@ class Connection:
         )
 
     def lose(self, because: str) -> None:
-        """It is of no more use. Any thread, perhaps more than once."""
+        """Note that the connection is lost. Any thread, perhaps more than once."""
         self.lost_because = self.lost_because or because
         self._on_lost()
 
@@ -191,7 +231,7 @@ class Connection:
     def probe(
         self, key: str, payload: bytes, timeout_s: float, heard: Callable[[bytes], None]
     ) -> None:
-        """Send a probe ahead of all requests; `heard` gets the answer's bytes, if one comes."""
+        """Send a probe ahead of all requests; `heard` gets the answer's bytes, if any."""
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -223,7 +263,10 @@ class Connection:
         self.lose(words)
 
     def tell_records(self, key: str, records: bytes, newer: Callable[[bytes], object]) -> None:
-        """Send signed records: `told` once taken; `newer` is given what replaces them."""
+        """Send signed records; `told` is them once the replica has taken them.
+
+        `newer` is given what it says in place of those that are out of date, from any thread.
+        """
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -243,7 +286,7 @@ class Connection:
         )
 
     def close(self) -> None:
-        """End it: what is open is lost. Returns at once; the sender thread closes the session."""
+        """Close it; open attempts are lost. Returns at once: the sender thread ends the session."""
         self.attempts.close()
         # A large send that goes on is for nobody any more, and may block for minutes.
         threading.Thread(target=self._end_flow, name="fogft-end-link", daemon=True).start()

@@ -1,4 +1,4 @@
-"""Makes links over Zenoh, and holds what all of a robot's links share.
+"""Creates links over Zenoh, and holds what all links of a robot share.
 
 Owns: the robot's credentials in use, what its replicas are to be told. Not here: a link's
 life (`link`).
@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 
 from fogft.errors import CredentialError, WireError
 from fogft.link.port import LinkEvents, Peer, SendOptions
+from fogft.link.zenoh.robot.connection import Shared
 from fogft.link.zenoh.robot.link import ZenohLink
-from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
@@ -24,7 +24,14 @@ _CLOSE_WAIT_S = 3.0
 
 
 class ZenohDialer:
-    """Makes links over Zenoh; see `port.Dialer`."""
+    """Creates links over Zenoh; see `port.Dialer`.
+
+    Args:
+        credentials: The robot's certificate and key, and the pool's CA.
+        pool_uid: The pool; peers of another are refused.
+        suspect_after_s: Probes unanswered for so long make a link suspect.
+        tell_losers: Whether replicas are told which requests are no longer wanted.
+    """
 
     def __init__(
         self,
@@ -48,11 +55,15 @@ class ZenohDialer:
         self._links: list[ZenohLink] = []
 
     def adopt(self, options: SendOptions) -> None:
-        """Set what services want of their links, from the next connection on."""
+        """Set the options of services, from the next connection on."""
         self._shared.options = options
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
-        """Start a link; return at once, in state CONNECTING."""
+        """Start a link; return at once, in state CONNECTING.
+
+        Raises:
+            WireError: The peer belongs to another pool.
+        """
         if peer.id.pool_uid != self._pool_uid:
             raise WireError(f"replica `{peer.id}` belongs to another pool than this robot")
         link = ZenohLink(self._shared, peer, services, events, self._closed)
@@ -61,18 +72,18 @@ class ZenohDialer:
         return link
 
     def renew(self) -> None:
-        """Take the credentials that now stand in their files into use, link by link."""
+        """Reload the credentials from their files, link by link."""
         with self._lock:
             links = list(self._links)
         for link in links:
             link.renew()
 
     def tell(self, records: Sequence[SignedRecord]) -> None:
-        """Tell every replica these records, with the next probe of each link."""
+        """Send these records to every replica, with the next probe of each link."""
         self._shared.records = frames.pack(records) if records else b""
 
     def newer(self) -> list[SignedRecord]:
-        """Return what replicas said last in place of what they were told; nothing is verified."""
+        """Return newer records that replicas sent in reply; nothing is verified."""
         said: list[SignedRecord] = []
         for packed in list(self._shared.newer.values()):
             with contextlib.suppress(RecordError):

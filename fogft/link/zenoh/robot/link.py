@@ -1,4 +1,4 @@
-"""Links over Zenoh: keep a connection to a replica, probe it, replace it when it is silent.
+"""Links over Zenoh: connect to a replica, probe it, and reconnect when it falls silent.
 
 A thread of each link (`fogft-keep-...`) opens the connection, sends probes, and replaces the
 connection when it is lost or when probes go unanswered: never because a service is slow.
@@ -22,11 +22,10 @@ from fogft import __version__
 from fogft.errors import CredentialError, WireError
 from fogft.link.port import Answer, LinkEvents, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.link.zenoh import settings
+from fogft.link.zenoh.diagnosis import Opening
 from fogft.link.zenoh.robot.attempts import Callbacks
-from fogft.link.zenoh.robot.connection import Connection
-from fogft.link.zenoh.robot.opening import Opening
+from fogft.link.zenoh.robot.connection import Connection, Shared
 from fogft.link.zenoh.robot.probing import Probing
-from fogft.link.zenoh.robot.shared import Shared
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.replica import LinkState
@@ -42,7 +41,7 @@ _LOOK_EVERY_S = 0.1  # while something large is sent
 
 
 class ZenohLink:
-    """A link to one replica; see `port.Link`. Made by `ZenohDialer`."""
+    """A link to one replica; see `port.Link`. Created by `ZenohDialer`."""
 
     def __init__(
         self,
@@ -98,13 +97,13 @@ class ZenohLink:
 
     @property
     def sending(self) -> bool:
-        """Whether an attempt is just being handed to the network."""
+        """Whether an attempt is being sent right now."""
         live = self._live
         return live is not None and live.attempts.sending
 
     @property
     def draining(self) -> bool:
-        """Whether the replica asked to be left alone."""
+        """Whether the replica is draining."""
         answer = self._probing.answer
         return answer is not None and answer.draining
 
@@ -115,7 +114,7 @@ class ZenohLink:
         return b"" if live is None else live.certificate
 
     def send(self) -> None:
-        """Send what was offered with `more`. Never blocks."""
+        """Flush requests that were offered with `more`. Never blocks."""
         live = self._live
         if live is not None:
             live.attempts.send()
@@ -131,7 +130,7 @@ class ZenohLink:
             retiring.attempts.forget(request_id)
 
     def flush(self) -> None:
-        """Tell the replica of all that was forgotten and not answered."""
+        """Send cancellations for forgotten, unanswered requests."""
         self.send()
         live = self._live
         if live is not None:
@@ -148,14 +147,13 @@ class ZenohLink:
             silent_for_s=self._probing.silent_s(now),
             rtt_s=self._probing.rtt_s,
             in_flight=len(live.attempts.window) if live else 0,
-            in_flight_bytes=live.attempts.window.held_bytes if live else 0,
             reopened=max(self._opened - 1, 0),
             detail=self._detail,
             ignores=self._ignores,
         )
 
     def close(self) -> None:
-        """End the link; its thread lets go of the rest within moments."""
+        """Close the link; its thread frees the rest shortly afterwards."""
         self._closed = True
         join_at_exit(self._thread)
         self._wake.set()
@@ -166,7 +164,7 @@ class ZenohLink:
         self._on_close(self)
 
     def renew(self) -> None:
-        """Take new credentials into use, by another connection; at once, and no request is lost."""
+        """Switch to new credentials over a new connection; returns at once, no request is lost."""
         self._renew.set()
         self._wake.set()
 
@@ -306,7 +304,7 @@ class ZenohLink:
         self._probing.excuse(moved_s, now)
         longest_s, shortest_s = self._suspect_after_s, self._shared.settings.stall_after_s
         if connection.flow.progress.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
-            connection.lost_because = "it takes nothing more of what is sent"
+            connection.lost_because = "it no longer reads what is sent"
         return not connection.lost_because
 
     def _doubt(self, now: float) -> float:
@@ -347,7 +345,11 @@ class ZenohLink:
             connection.lost_because = "the connection was lost"
 
     def _listen(self, connection: Connection) -> bool:
-        """Take what was heard; return whether the link is up by it."""
+        """Take what was heard; return whether the link is up by it.
+
+        Raises:
+            WireError: Another replica answers here, or nothing that can be read.
+        """
         up = False
         for heard in self._probing.heard(connection):
             if connection.begin():

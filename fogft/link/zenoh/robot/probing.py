@@ -1,4 +1,4 @@
-"""The probes of a link: what its replica says to them, and for how long it has said nothing.
+"""The probes of a link: the replica's answers, and for how long it has been silent.
 
 Owns: two silences, that of the replica over all connections, which people see, and that of the
 present connection, by which it is given up. Not here: when to probe, and what becomes of the link
@@ -24,28 +24,28 @@ if TYPE_CHECKING:
 
 
 class Silence:
-    """How long a replica has not answered probes. Times are monotonic seconds."""
+    """For how long a replica has not answered probes. Times are monotonic seconds."""
 
     def __init__(self) -> None:
         self._since: float | None = None
 
     def began(self, now: float) -> None:
-        """A probe was sent, or none can be sent. Silence that goes on is not begun anew."""
+        """Note that a probe was sent or cannot be sent. Continuing silence is not restarted."""
         if self._since is None:
             self._since = now
 
     def ended(self) -> None:
-        """An answer came."""
+        """Note an answer."""
         self._since = None
 
     def excuse(self, held_up_s: float, now: float) -> None:
-        """Leave out `held_up_s` up to `now`, in which this process did not run."""
+        """Exclude `held_up_s` before `now`, in which this process did not run."""
         if self._since is not None and held_up_s > 0:
             self._since = min(self._since + held_up_s, now)
 
     @property
     def lasts(self) -> bool:
-        """Whether it has begun, and no answer has come since."""
+        """Whether a probe is unanswered."""
         return self._since is not None
 
     def for_s(self, now: float) -> float:
@@ -67,7 +67,7 @@ class Heard:
 
 
 class Probing:
-    """Probes to one replica. For the link's thread; any may read the attributes.
+    """Probes to one replica. For the link's thread; any thread may read the attributes.
 
     Args:
         came: Called, from any thread, when an answer came.
@@ -107,7 +107,7 @@ class Probing:
         connection.probe(self._key, probe_frames.encode_probe(probe), _TIMEOUT_S, heard)
 
     def heard(self, connection: Connection) -> Iterator[Heard]:
-        """Return what came over a connection since the last call; that of others is dropped."""
+        """Return the answers of this connection since the last call; others are dropped."""
         while True:
             try:
                 heard = self._queue.get_nowait()
@@ -117,7 +117,11 @@ class Probing:
                 yield heard
 
     def take(self, heard: Heard) -> ProbeAnswer:
-        """Take an answer, which ends the silence, and return it."""
+        """Take an answer, which ends the silence, and return it.
+
+        Raises:
+            WireError: Another replica answers here, or nothing that can be read.
+        """
         answer = self._read(heard.content)
         self._of_connection.ended()
         self._of_replica.ended()
@@ -136,7 +140,7 @@ class Probing:
             raise WireError(f"`{at}` answers probes with {error}") from error
         if (answer.slot, answer.generation) != (id.slot, id.generation):
             raise WireError(
-                f"`{at}` says that it is {answer.slot}.{answer.generation}, not {id.short}"
+                f"`{at}` identifies itself as {answer.slot}.{answer.generation}, not {id.short}"
             )
         self._content, known = content, self.answer
         if not answer.types and known is not None and known.incarnation == answer.incarnation:
@@ -146,20 +150,20 @@ class Probing:
     # -- silence --------------------------------------------------------------------------
 
     def another_connection(self) -> None:
-        """What is asked from now on goes over another connection."""
+        """Send probes over another connection from now on."""
         self._of_connection = Silence()
 
     def excuse(self, seconds: float, now: float) -> None:
-        """Leave out time up to `now` in which nobody could be heard."""
+        """Exclude time before `now` in which nothing could be received."""
         for silence in (self._of_replica, self._of_connection):
             silence.excuse(seconds, now)
 
     def unheard_s(self, now: float) -> float:
-        """Return for how long the present connection has brought no answer, in seconds."""
+        """Return for how long the current connection has received no answer, in seconds."""
         return self._of_connection.for_s(now)
 
     def late(self, now: float) -> tuple[bool, float]:
-        """Return whether an answer is late, true once a silence; and how long it has still.
+        """Return whether an answer is late (true once per silence), and the time left until then.
 
         The second is infinite once it is late, and while none is awaited.
         """

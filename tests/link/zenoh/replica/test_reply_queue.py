@@ -34,7 +34,8 @@ class Reply:
 
 
 def test_a_thread_that_cannot_be_started_costs_only_the_reply_it_was_for(monkeypatch):
-    queues = ReplyQueues(Counters(), idle_s=0.01)
+    queues = ReplyQueues(Counters())
+    queues.idle_s = 0.01
     start, tries, sent = threading.Thread.start, [], []
 
     def fails_once(thread: threading.Thread) -> None:

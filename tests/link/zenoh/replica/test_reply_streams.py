@@ -32,7 +32,8 @@ from tests.link.wire_pool import (
 @given(st.lists(st.integers(0, 9)), st.integers(1, 5))
 def test_every_query_is_either_open_or_ended_once(tokens: list[int], limit: int) -> None:
     """The last of each of the youngest tokens stays; all others are given back to be ended."""
-    streams, ended, opened = Streams(limit), [], []
+    streams, ended, opened = Streams(), [], []
+    streams.limit = limit
     for number, token in enumerate(tokens):
         query: Any = (token, number)
         opened.append(query)
@@ -48,7 +49,8 @@ def test_every_query_is_either_open_or_ended_once(tokens: list[int], limit: int)
 @given(st.lists(st.tuples(st.booleans(), st.integers(0, 20))), st.integers(8, 12))
 def test_an_answer_finds_its_request_once(steps: list[tuple[bool, int]], limit: int) -> None:
     """Beyond the bound it is the oldest that are not found."""
-    unanswered, sent = Unanswered(limit), {}
+    unanswered, sent = Unanswered(), {}
+    unanswered.limit = limit
     for sends, number in steps:
         if sends:
             attempt = OpenAttempt("/s", request_id(number), b"", 0, offered=0.0, deadline=1.0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -10,6 +12,7 @@ from fogft.link.frame import Greeting, greeted_bytes
 from fogft.link.zenoh.replica.sessions import (
     HOLDERS_LIMIT,
     TOKENS_LIMIT,
+    TOKENS_WITHIN_S,
     AuthenticatedSessions,
     NotAdmittedError,
 )
@@ -109,13 +112,35 @@ def test_a_token_cannot_be_taken_over(sessions: AuthenticatedSessions) -> None:
 @given(st.integers(1, 3 * TOKENS_LIMIT))
 def test_one_holder_cannot_push_out_another(count: int) -> None:
     """However often somebody greets, only its own oldest connections are forgotten."""
-    sessions = AuthenticatedSessions(UID, SELF, verify)
+    times = itertools.count(0.0, TOKENS_WITHIN_S)
+    sessions = AuthenticatedSessions(UID, SELF, verify, clock=lambda: next(times))
     sessions.greet(greeting(10_000, ADA))
     for number in range(count):
         sessions.greet(greeting(number, EVE))
     assert sessions.admits(token(10_000))
     assert sum(sessions.admits(token(n)) for n in range(count)) == min(count, TOKENS_LIMIT)
     assert sessions.admits(token(count - 1))
+
+
+def test_who_greets_too_often_is_refused_and_keeps_what_he_has() -> None:
+    now = 0.0
+    sessions = AuthenticatedSessions(UID, SELF, verify, clock=lambda: now)
+    for number in range(TOKENS_LIMIT):
+        sessions.greet(greeting(number, EVE))
+    assert refusal(sessions, greeting(TOKENS_LIMIT, EVE)) == Refusal.OVERLOADED
+    assert all(sessions.admits(token(number)) for number in range(TOKENS_LIMIT))
+    sessions.greet(greeting(10_000, ADA))
+    now = TOKENS_WITHIN_S
+    sessions.greet(greeting(TOKENS_LIMIT, EVE))
+    assert not sessions.admits(token(0))
+
+
+def test_a_robot_s_connection_asks_in_its_name_and_a_gateway_s_in_any(
+    sessions: AuthenticatedSessions,
+) -> None:
+    sessions.greet(greeting(1, ADA))
+    sessions.greet(greeting(2, certificate_names.gateway(UID, "edge"), "gateway"))
+    assert [sessions.robot(token(number)) for number in (1, 2, 3)] == ["ada", "", ""]
 
 
 def test_what_is_remembered_is_bounded(sessions: AuthenticatedSessions) -> None:

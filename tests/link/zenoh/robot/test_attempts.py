@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link import batch_frames, compression, frame
-from fogft.link.cancellations import Cancellations
-from fogft.link.large_send_gate import LARGE_BYTES, LargeSendGate
+from fogft.link.credit import LARGE_BYTES, LargeSendGate
 from fogft.link.port import DEFAULT_OPTIONS, Answer, SendOptions
 from fogft.link.socket_progress import SocketProgress
+from fogft.link.window import Cancellations
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.model.refusal import Refusal
 from tests.link.wire_pool import request_id, wait_for
@@ -209,5 +209,5 @@ def test_nothing_is_unpacked_that_was_not_asked_for(monkeypatch: pytest.MonkeyPa
     assert scene.late == [request_id(2)]
     assert not scene.outlet.lost
     scene.attempts.heard(b"once", [Answer(request_id(3), bomb)], packed=True)
-    assert scene.outlet.lost == ["it answers more than it was asked"]
+    assert scene.outlet.lost == ["it sends more answers than it was sent requests"]
     scene.close()

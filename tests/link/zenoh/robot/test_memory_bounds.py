@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 
 from fogft.link.counters import Counters
+from fogft.link.frame import Greeting
 from fogft.link.zenoh.replica.control_queries import ControlQueries
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
@@ -15,7 +16,7 @@ from fogft.link.zenoh.replica.reply_streams import Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
-from fogft.link.zenoh.work_queue import WorkQueue
+from fogft.link.zenoh.work_queue import LIMIT, WorkQueue
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import LazyVerifier
 from tests.link.wire_pool import POOL_UID, SERVICE, Authority, ReplicaProcess, request_id, wait_for
@@ -48,7 +49,7 @@ def test_a_forgotten_request_is_not_kept_for_a_sender_that_is_stuck(
     del payload
     held = sum(sys.getrefcount(payloads[n]) > free for n in range(len(payloads)))
     assert held <= IN_THE_SENDERS_HANDS
-    assert link.status().in_flight_bytes == 0
+    assert link.status().in_flight == 0
 
 
 def test_a_stuck_sender_is_not_given_requests_without_end(
@@ -100,7 +101,7 @@ def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authorit
     )
     for turn in range(3000):
         turns.came()
-        control.later(lambda: None, QueryEnd(Query(), turn))
+        control.later(Greeting(bytes(8)), lambda: None, QueryEnd(Query(), turn))
     dropped = counters.snapshot()["control_queries_dropped"]
-    assert 0 < len(work) == 3000 - dropped <= 1024
+    assert 0 < len(work) == 3000 - dropped <= LIMIT
     wait_for(lambda: Query.ended == dropped)

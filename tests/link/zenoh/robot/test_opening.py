@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fogft.link.zenoh import diagnosis
-from fogft.link.zenoh.robot.opening import Opening
+from fogft.link.zenoh.diagnosis import Opening
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from tests.link.wire_pool import peer

@@ -88,7 +88,9 @@ def test_another_replica_is_told_from_the_right_one(other):
     scene = Scene()
     scene.ask()
     scene.wire.answer(other)
-    with pytest.raises(WireError, match=rf"says that it is {other.slot}\.{other.generation}, not"):
+    with pytest.raises(
+        WireError, match=rf"identifies itself as {other.slot}\.{other.generation}, not"
+    ):
         scene.take()
     assert scene.probing.answer is None
     assert scene.probing.silent_s(1.0) == 1.0

@@ -7,8 +7,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.window import OpenAttempt
-from fogft.link.zenoh.robot.send_queue import SendQueue
+from fogft.link.window import OpenAttempt, SendQueue
 
 
 def attempt(service: str, born: float, number: int = 0) -> OpenAttempt:

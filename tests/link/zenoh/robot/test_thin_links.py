@@ -31,6 +31,7 @@ from tests.link.wire_pool import (
     request_id,
     wait_for,
 )
+from tests.needs import needs
 
 pytestmark = pytest.mark.timeout(180)
 MEGABYTE = os.urandom(1_000_000)
@@ -53,7 +54,9 @@ def never_given_up(owner: Owner, links: list[ZenohLink], asked: int) -> None:
 
 
 @pytest.mark.own_process
-@pytest.mark.parametrize(("mbit", "reply_bytes"), [(1, 16), (2, 16), (5, -1)])
+@pytest.mark.parametrize(
+    ("mbit", "reply_bytes"), [(1, 16), pytest.param(2, 16, marks=needs("night")), (5, -1)]
+)
 def test_a_megabyte_gets_through_a_thin_uplink(authority, net, owner, mbit, reply_bytes):
     """At 1, 2 and 5 Mbit/s, up, and down at 5; so much silence would be suspected."""
     robot_at, replica_at = net.add("r"), net.add("p")

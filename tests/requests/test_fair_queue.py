@@ -5,18 +5,18 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.admission import AdmissionQueue
+from fogft.requests.fair_queue import FairQueue
 
 
-def filled(*entries: tuple[str, float]) -> AdmissionQueue[str]:
+def filled(*entries: tuple[str, float]) -> FairQueue[str]:
     """Return a queue of ``(robot, deadline)``; an item is its place, such as ``a1``."""
-    queue: AdmissionQueue[str] = AdmissionQueue()
+    queue: FairQueue[str] = FairQueue()
     for n, (robot, deadline) in enumerate(entries):
         queue.put(bytes([n]), robot, deadline, f"{robot}{n}")
     return queue
 
 
-def drained(queue: AdmissionQueue[str]) -> list[str]:
+def drained(queue: FairQueue[str]) -> list[str]:
     return list(iter(queue.take, None))
 
 
@@ -73,7 +73,7 @@ operations = st.lists(
 def test_each_comes_out_once_and_nobody_starves(operations):
     """What is put in comes out once; with n robots waiting each is served every n-th time;
     of two of one robot the earlier deadline goes first."""
-    queue: AdmissionQueue[int] = AdmissionQueue()
+    queue: FairQueue[int] = FairQueue()
     waiting: dict[int, tuple[str, float]] = {}
     since: dict[str, int] = {}
     for n, (operation, robot, value) in enumerate(operations):
@@ -109,7 +109,7 @@ def test_each_comes_out_once_and_nobody_starves(operations):
 @given(st.lists(st.tuples(robots, st.floats(0, 100)), min_size=1, max_size=20))
 def test_where_the_latest_is_wanted_the_newest_of_each_robot_goes_first(entries):
     """Everybody still gets a turn; what gives way when there is no room is the stalest."""
-    queue: AdmissionQueue[tuple[str, float]] = AdmissionQueue(latest=True)
+    queue: FairQueue[tuple[str, float]] = FairQueue(latest=True)
     for n, entry in enumerate(entries):
         queue.put(bytes([n]), *entry, entry)
     served = list(iter(queue.take, None))
@@ -120,7 +120,7 @@ def test_where_the_latest_is_wanted_the_newest_of_each_robot_goes_first(entries)
 
 
 def test_the_stalest_gives_way_to_a_newer_one_of_its_own_robot():
-    queue: AdmissionQueue[str] = AdmissionQueue(latest=True)
+    queue: FairQueue[str] = FairQueue(latest=True)
     queue.put(b"old", "a", 1.0, "old")
     queue.put(b"new", "a", 7.0, "new")
     assert queue.evict("a", 0.5) is None

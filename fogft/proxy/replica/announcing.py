@@ -1,4 +1,4 @@
-"""What a replica tells the rendezvous of itself, and what it learns there.
+"""A replica's exchange with the rendezvous: its own record, and the members it learns.
 
 Owns: the replica's record, when it is written anew, and the doors that it dials.
 Not here: what is told with each probe (`server`), records (`fogft.records.record`).
@@ -24,7 +24,12 @@ _NOTHING = Known()
 
 
 class Announcer:
-    """Keeps one replica's record true: where it is reached, or that it dials out."""
+    """Keeps one replica's record current: its endpoint, or that it dials out.
+
+    Args:
+        endpoint: ``host:port`` as it was told; empty if it was not.
+        dials_out: It cannot be reached.
+    """
 
     def __init__(
         self,
@@ -42,7 +47,7 @@ class Announcer:
         self._said: SlotState | None = None
 
     def look(self, ready: frozenset[str], *, draining: bool) -> bool:
-        """Publish what has changed; return whether anything did."""
+        """Publish changes; return whether there were any."""
         seen = self._records.known.seen_host
         host = f"[{seen}]" if ":" in seen else seen
         state = replace(
@@ -61,7 +66,14 @@ class Announcer:
 
 
 class Presence:
-    """A replica at the rendezvous and at the doors that it dials. Raises CredentialError."""
+    """A replica's connections to the rendezvous and to dial-in ports.
+
+    Args:
+        listening: ``host:port`` of its own listener.
+
+    Raises:
+        CredentialError: The credentials cannot be used.
+    """
 
     def __init__(self, config: ServerProxyConfig, listening: str) -> None:
         ours = config.credentials
@@ -88,7 +100,7 @@ class Presence:
             self._dial_out.follow(config.dial_out)
 
     def look(self, ready: frozenset[str], *, draining: bool) -> Known:
-        """Say what is new of us, dial new doors; return what is known there."""
+        """Publish changes, dial new dial-in ports; return the known records."""
         if self._client is None or self._announcer is None:
             return _NOTHING
         self._announcer.look(ready, draining=draining)
@@ -100,7 +112,7 @@ class Presence:
         return known
 
     def close(self) -> None:
-        """Leave."""
+        """Disconnect."""
         if self._dial_out is not None:
             self._dial_out.close()
         if self._client is not None:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from fogft.cloud.local.reservations import (
+from fogft.ros.reservations import (
     DOMAINS,
     reserve_domain,
     reserve_port,
@@ -29,7 +29,7 @@ def test_a_domain_is_given_once_and_again_after_its_release():
 
 def test_a_domain_of_another_process_is_not_given_until_that_ends():
     code = (
-        "from fogft.cloud.local.reservations import reserve_domain\n"
+        "from fogft.ros.reservations import reserve_domain\n"
         "kept = reserve_domain(); print(kept.number, flush=True); input()"
     )
     pipe = subprocess.PIPE
@@ -54,7 +54,7 @@ def test_a_port_on_which_somebody_listens_is_not_given(monkeypatch):
     mine = reserve_port()
     with socket.create_server(("127.0.0.1", mine.number)):
         mine.release()
-        monkeypatch.setattr("fogft.cloud.local.reservations.PORTS", [mine.number])
+        monkeypatch.setattr("fogft.ros.reservations.PORTS", [mine.number])
         assert reserve_port() is None
-    monkeypatch.setattr("fogft.cloud.local.reservations.PORTS", [mine.number])
+    monkeypatch.setattr("fogft.ros.reservations.PORTS", [mine.number])
     wait_for(lambda: (got := reserve_port()) and (got.release(), True))

@@ -1,4 +1,4 @@
-"""What a sequencer must not forget when its process is killed: term, last answer, and whose.
+"""The durable state of a sequencer: term, last answer and its version.
 
 Four numbers in a memory-mapped file. A write is one store into memory that belongs to the
 kernel: it survives SIGKILL, and costs less than a microsecond.
@@ -25,7 +25,14 @@ _VERSION = re.compile(r"[0-9a-f]{16}")
 
 
 class OrderMark:
-    """The mark of one stateful service on one robot. Raises StateError: it cannot be used."""
+    """The mark of one stateful service on one robot.
+
+    Args:
+        path: Where it lies; made if it is not there, with its folder.
+
+    Raises:
+        StateError: It cannot be used, or belongs to another pool.
+    """
 
     def __init__(self, path: Path, pool_uid: str) -> None:
         uid = int(pool_uid, 16)
@@ -39,7 +46,8 @@ class OrderMark:
         except (OSError, ValueError) as error:
             raise StateError(
                 f"`{path}` cannot be used: {error}",
-                "it says how far a stateful service has come; `fogft down` and `up` begin anew",
+                "it records how far a stateful service is; recreate the pool with `fogft down`, "
+                "then `fogft up`",
             ) from error
         self._words = memoryview(self._map).cast("Q")
         if self._words[0] != _MAGIC or self._words[1] != uid:
@@ -52,12 +60,12 @@ class OrderMark:
 
     @property
     def holder(self) -> str | None:
-        """The version of the replicas that it came from; None where that is not known."""
+        """The version of the replicas that it came from; None if unknown."""
         word = self._words[_HOLDER]
         return f"{word:016x}" if word else None
 
     def new_term(self, nonce: int, *, above: int = 0) -> int:
-        """Return an epoch above `above` and all that the file knows of; it is remembered."""
+        """Return, and store, an epoch above `above` and all earlier ones."""
         self._version = self.holder or ""  # another process may have written meanwhile
         epoch = orders.next_epoch(max(self._words[_TERM], above), nonce)
         self._words[_TERM] = epoch
@@ -65,7 +73,7 @@ class OrderMark:
         return epoch
 
     def write(self, position: Position, version: str = "") -> None:
-        """Remember that this answer is being returned, and which version it comes from."""
+        """Store that this answer is being returned, and the version it comes from."""
         # In this order: killed between the two, the file asks for no more than there is,
         # for an index never falls when a term begins.
         if self._words[_EPOCH] != position.epoch:
@@ -76,6 +84,6 @@ class OrderMark:
             self._words[_HOLDER] = int(version, 16) if _VERSION.fullmatch(version) else 0
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._words.release()
         self._map.close()

@@ -8,13 +8,13 @@ import os
 import subprocess
 import sys
 
-from fogft.proxy import start
+from fogft.process import begin_start, end_start, load_numpy
 from tests.needs import needs
 
 _LOADED = """
 import json, os, sys
-from fogft.proxy import start
-start.load_numpy()
+from fogft.process import load_numpy
+load_numpy()
 import numpy
 
 threads = len(os.listdir("/proc/self/task"))
@@ -41,17 +41,17 @@ def test_what_the_user_says_stays():
 def test_no_numpy_is_no_error(monkeypatch):
     monkeypatch.setitem(sys.modules, "numpy", None)
     environ: dict[str, str] = {}
-    start.load_numpy(environ)
+    load_numpy(environ)
     assert environ == {}
 
 
 def test_what_a_start_made_is_not_looked_through_again():
     before = gc.get_freeze_count()
     try:
-        start.begin()
+        begin_start()
         assert not gc.isenabled()
         made = [[] for _ in range(1000)]
-        start.settle()
+        end_start()
         assert gc.isenabled()
         assert gc.get_freeze_count() >= before + len(made)
         assert not any(one is made[0] for one in gc.get_objects())

@@ -1,4 +1,4 @@
-"""What waits at a replica: by deadline within a robot, in fair shares between robots. Pure.
+"""The queue at a replica: by deadline within a robot, fair between robots. Pure.
 
 Each robot has a queue of its own, the earliest deadline first. Whose turn it is goes by a
 count of what each robot was given (start-time fair queueing): the one that was given least is
@@ -48,8 +48,8 @@ class _Robot(Generic[T]):
         return self.heap[0]
 
 
-class AdmissionQueue(Generic[T]):
-    """What waits for one service of a replica, by request id.
+class FairQueue(Generic[T]):
+    """The queue of one service at a replica, by request id.
 
     Args:
         latest: The newest request of a robot goes first, and the oldest gives way: with one
@@ -67,7 +67,7 @@ class AdmissionQueue(Generic[T]):
         return len(self._entries)
 
     def put(self, id: bytes, robot: str, deadline: float, item: T) -> None:
-        """Let an item wait. Its id must not be waiting already."""
+        """Queue an item. Its id must not be queued already."""
         entry = _Entry(self._sign * deadline, next(self._order), id, robot, item)
         queue = self._robots.get(robot)
         if queue is None:
@@ -77,7 +77,7 @@ class AdmissionQueue(Generic[T]):
         self._entries[id] = entry
 
     def take(self) -> T | None:
-        """Return what is next, and take it out; None when nothing waits."""
+        """Remove and return the next item; None if empty."""
         if not self._robots:
             return None
         queue = min(self._robots.values(), key=_standing)
@@ -89,7 +89,7 @@ class AdmissionQueue(Generic[T]):
         return item
 
     def remove(self, id: bytes) -> T | None:
-        """Take an item out; None when it does not wait."""
+        """Remove and return an item; None if it is not queued."""
         entry = self._entries.get(id)
         if entry is None:
             return None
@@ -109,7 +109,7 @@ class AdmissionQueue(Generic[T]):
             heapq.heapify(queue.heap)
 
     def evict(self, robot: str, deadline: float) -> T | None:
-        """Take out what must go for a newcomer to fit in; None if the newcomer itself must."""
+        """Remove the item that must make room for a new one; None if the new one must go."""
         most = max(self._robots.values(), key=lambda queue: queue.waiting, default=None)
         own = self._robots.get(robot)
         if most is None:
@@ -126,7 +126,7 @@ class AdmissionQueue(Generic[T]):
         return item
 
     def ahead(self, robot: str, deadline: float) -> int:
-        """Return about how many will be served before a request that comes now."""
+        """Return about how many will be served before a request that arrives now."""
         own = self._robots.get(robot)
         before, rank = 0, self._sign * deadline
         if own is not None:

@@ -1,4 +1,4 @@
-"""Take a ROS domain and a TCP port that no other machine on this computer has.
+"""Reserve a ROS domain and a TCP port that no other machine on this computer uses.
 
 A reservation is an abstract socket name: the kernel gives it to one process, of whatever
 user, and takes it back when the process ends. What others use without asking us shows in

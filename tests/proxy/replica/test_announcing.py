@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fogft.model.replica import ReplicaId
-from fogft.proxy.announcing import Announcer, doors
+from fogft.proxy.replica.announcing import Announcer, doors
 from fogft.records.client import Known
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import slot_state

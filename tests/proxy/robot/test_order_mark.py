@@ -11,7 +11,7 @@ import pytest
 
 from fogft.errors import StateError
 from fogft.ordering.orders import START, Position
-from fogft.proxy.order_mark import OrderMark
+from fogft.proxy.robot.order_mark import OrderMark
 
 UID = "0123456789abcdef"
 
@@ -30,7 +30,8 @@ def test_what_was_written_survives_sigkill(tmp_path):
     """The process writes, says so, and is killed without a chance to flush anything."""
     program = (
         "import sys; from pathlib import Path\n"
-        "from fogft.ordering.orders import Position\nfrom fogft.proxy.order_mark import OrderMark\n"
+        "from fogft.ordering.orders import Position\n"
+        "from fogft.proxy.robot.order_mark import OrderMark\n"
         f"mark = OrderMark(Path(sys.argv[1]), '{UID}')\nepoch = mark.new_term(5)\n"
         "for i in range(1000): mark.write(Position(epoch, i))\n"
         "print(epoch, flush=True)\nimport time; time.sleep(60)\n"

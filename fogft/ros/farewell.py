@@ -1,4 +1,4 @@
-"""Tell a DDS domain that a process which was killed is gone, in its name.
+"""Announce to a DDS domain, on its behalf, that a killed process is gone.
 
 Others go on believing in a killed process for 20 seconds, DDS's lease: `service_is_ready` stays
 true, and a client with `KEEP_ALL` keeps its requests for it. A process that ends well takes its
@@ -27,12 +27,12 @@ _IDS = 64  # participants of one machine that are told, one by one
 
 
 def is_known(prefix: bytes) -> bool:
-    """Whether an id is of a middleware that understands the message."""
+    """Whether a participant id is of a middleware that understands the message."""
     return len(prefix) == PREFIX_BYTES and prefix.startswith(_VENDORS)
 
 
 def message_of(prefix: bytes) -> bytes:
-    """Return the message by which the participant of this id prefix leaves its domain."""
+    """Return the DDS disposal message of the participant with this id prefix."""
     guid = prefix + _PARTICIPANT
     parameters = struct.pack("<HH", 0x70, 16) + guid  # PID_KEY_HASH
     parameters += struct.pack("<HH", 0x71, 4) + b"\x00\x00\x00\x03"  # disposed, unregistered
@@ -48,7 +48,7 @@ def message_of(prefix: bytes) -> bytes:
 def declare_gone(
     prefix: bytes, domain_id: int | None, environ: Mapping[str, str] = os.environ
 ) -> bool:
-    """Send a killed participant's farewell to its domain; return whether it was sent.
+    """Send a killed participant's disposal message; return whether it was sent.
 
     Args:
         prefix: The first 12 bytes of its id.
@@ -59,7 +59,7 @@ def declare_gone(
         return False
     if domain_id is None:
         written = environ.get("ROS_DOMAIN_ID") or "0"
-        domain_id = int(written) if written.isdigit() else 0
+        domain_id = int(written) if written.isdecimal() else 0
     port = _BASE_PORT + _DOMAIN_GAIN * domain_id
     message = message_of(prefix)
     peers = re.split(r"[;\s]+", environ.get("ROS_STATIC_PEERS", ""))

@@ -1,0 +1,30 @@
+"""Who makes room where too many have connected that have not proved yet who they are. Pure.
+
+One host cannot keep others out for longer than these take to greet: where the room is used up, the
+oldest connection of the host that has most of them is ended.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections import Counter
+from collections.abc import Mapping
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def oldest_of_most(greeting: Mapping[T, str]) -> T:
+    """Return who has to go of those (oldest first) that are greeting, each with its host."""
+    networks = {one: _network(host) for one, host in greeting.items()}
+    (most, _), *_ = Counter(networks.values()).most_common(1)
+    return next(one for one, network in networks.items() if network == most)
+
+
+def _network(host: str) -> str:
+    """Return an IPv6 address's first 64 bits, for who has one has them all; else the host."""
+    try:
+        address = ipaddress.ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    return host if address.version == 4 else str(int(address) >> 64)
