@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +17,7 @@ from fogft.errors import FogftError
 from fogft.pool.commands import composition
 
 if TYPE_CHECKING:
+    from fogft.model.reason import Reason
     from fogft.pool.commands.status import Seen
     from fogft.pool.manager.status import PoolStatus
 
@@ -111,16 +113,13 @@ def up(
     except KeyboardInterrupt:
         output.say(f"interrupted: `{name}` continues to start; `fogft down {name}` shuts it down")
         raise typer.Exit(130) from None
-    if outcome is Outcome.WITHDRAWN and seen.status.update is not None:
-        raise FogftError(
-            f"`{name}` was not updated: {seen.status.update.fault}",
-            "see `fogft logs`; this file is not tried again: change it and run `fogft up`",
-        )
+    if outcome is Outcome.WITHDRAWN:
+        raise not_updated(seen.status)
     if outcome is not Outcome.ANSWERING:
         what = {
             Outcome.RUN_KEEPS_ENDING: "does not answer: `run` keeps exiting",
             Outcome.NEVER_READY: "does not answer: no replica has become ready",
-            Outcome.TYPES_DIFFER: "cannot answer: robot and replicas define its type differently",
+            Outcome.TYPES_DIFFER: "cannot answer: robot and replicas disagree on its type",
         }
         raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
     found = seen.status
@@ -144,10 +143,43 @@ def services_at_fault(status: PoolStatus) -> list[str]:
     return sorted(differing) or [one.name for one in status.services if not one.ready_replicas]
 
 
-def not_answering(seen: Seen, what: str) -> FogftError:
-    """Return the error for an `up` that failed, with everything known about the reason."""
+def not_updated(status: PoolStatus) -> FogftError:
+    """Return the error for an `up` whose update was stopped, with the end of the log behind it."""
+    why = "" if status.update is None else status.update.fault
+    lines = [f"`{status.pool}` was not updated: {why}"]
+    if replica := replica_at_fault(status.reasons):
+        lines += end_of_log(status, replica)
+    hint = "see `fogft logs`; this file is not tried again: change it and run `fogft up`"
+    return FogftError("\n".join(lines), hint)
+
+
+def replica_at_fault(reasons: Iterable[Reason]) -> str:
+    """Return the replica for which an update was given up; empty where it was for none."""
+    from fogft.model.reason import Cause
+
+    for reason in reasons:
+        if reason.cause is Cause.REPLICA_FAILS:
+            return reason.replica
+        if found := replica_at_fault(reason.because):
+            return found
+    return ""
+
+
+def end_of_log(status: PoolStatus, of: str = "") -> list[str]:
+    """Return the last lines of a replica's log; by default the last replica's or the proxy's."""
     from fogft import logfile
     from fogft.pool.commands import logs
+
+    store = composition.make_store(status.pool)
+    found = logs.find(store, composition.cloud_of(store.identity()))
+    last = found[-1] if status.proxy_alive else found[1]
+    label, path = next((one for one in found if one[0] == of), last)
+    last_lines = logfile.tail(path, lines=8).splitlines()
+    return [f"the end of the log of `{label}`:", *(f"  {line}" for line in last_lines)]
+
+
+def not_answering(seen: Seen, what: str) -> FogftError:
+    """Return the error for an `up` that failed, with everything known about the reason."""
     from fogft.pool.commands.outcome import is_given_up
 
     status = seen.status
@@ -157,11 +189,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     lines = [f"{listed} of `{status.pool}` {what}"]
     lines += [f"  {note}" for note in status.notes]
     lines += [f"  replica {r.slot}.{r.generation}: {r.detail}" for r in status.replicas if r.detail]
-    store = composition.make_store(status.pool)
-    found = logs.find(store, composition.cloud_of(store.identity()))
-    label, path = found[-1] if status.proxy_alive else found[1]
-    lines += [f"the end of the log of `{label}`:"]
-    lines += [f"  {line}" for line in logfile.tail(path, lines=8).splitlines()]
+    lines += end_of_log(status)
     tries = "the manager keeps trying: see `fogft status` and `fogft logs`"
     if is_given_up(seen):
         tries = "change the file and run `fogft up` again, or `fogft retry`; nothing is running now"

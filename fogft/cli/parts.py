@@ -220,8 +220,11 @@ def status(*, system: System = False) -> None:
     from fogft.pool.commands import service as units
 
     where = units.services(system=system)
-    for name, state in units.states(where, units.installed(where)).items():
+    found = units.installed(where)
+    for name, state in units.states(where, found).items():
         output.data(f"{name}  {state}")
+    if not found:
+        output.say(f"no units are installed in {where.folder}")
 
 
 @service.command(cls=Command, epilog="fogft service remove")

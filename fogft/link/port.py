@@ -127,7 +127,8 @@ class ProbeAnswer(ReplicaWord):
         incarnation: Random text made when the server proxy started. A new one at the
             same id means that it forgot every request.
         work: What became of requests since its start, by name (`Responder.report`).
-        offered: Service name -> type of what `run` offers, where it is to be found out.
+        offered: Service name -> type of what `run` offers, where it is to be found out or is not
+            the configured one.
         types: Type name -> its definition on the replica. Told only where a probe asks for
             it; a link keeps what it was told.
         accepts: Names of compressions that it reads, or does by itself; since 0.2.0 all of them.

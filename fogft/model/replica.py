@@ -206,7 +206,7 @@ class LinkReport:
         failed: How many came to a crash, a refusal or a response that was not ok.
         detail: Last error in words (connection refused, wrong certificate, ...).
         differs: A service's type is not the same there as on the robot, or cannot be loaded.
-        offered: Name and type of each service that `run` offers, where that is found out.
+        offered: Name and type of each service that `run` offers, where that is found out or wrong.
     """
 
     id: ReplicaId

@@ -121,7 +121,14 @@ def alive(paths: PoolPaths) -> Iterator[None]:
         yield
 
 
-def lay_down(home: Path, status: PoolStatus | None = STATUS, *, age_s: float = 0.4) -> PoolPaths:
+def lay_down(
+    home: Path,
+    status: PoolStatus | None = STATUS,
+    *,
+    age_s: float = 0.4,
+    file: str | Path = FILE,
+    cloud: str = "local",
+) -> PoolPaths:
     """Write a pool's files as `up` and a manager leave them."""
     name = status.pool if status else "planner"
     paths = PoolPaths.of(name, home)
@@ -132,5 +139,5 @@ def lay_down(home: Path, status: PoolStatus | None = STATUS, *, age_s: float = 0
         observed: dict[str, Any] = replace(status, observed_at=time.time() - age_s).to_json()
         disk.write_json(paths.status, observed)
         report(paths, status)
-    write_identity(paths, Identity(name, UID, "local", FILE, time.time()))
+    write_identity(paths, Identity(name, UID, cloud, str(file), time.time()))
     return paths

@@ -92,7 +92,7 @@ def test_a_replica_that_is_lost_meanwhile_is_told(file, looks, capsys):
 
 
 def test_it_gives_up_with_the_reason_and_says_what_still_runs(home, file, looks, capsys):
-    paths = lay_down(home)
+    paths = lay_down(home, file=file)
     paths.proxy_log.write_text("first\nlast words\n")
     silent = replace(UP.services[0], ready_replicas=0)
     never = replace(
@@ -114,7 +114,7 @@ def test_it_gives_up_with_the_reason_and_says_what_still_runs(home, file, looks,
 
 
 def test_it_gives_up_at_once_when_run_keeps_ending(home, file, looks, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     silent = replace(UP.services[0], ready_replicas=0)
     detail = "`run` exited with status 1: see `fogft logs 0`"
     hopeless = replace(STARTING, restarts=4, detail=detail)
@@ -134,7 +134,7 @@ def test_one_replica_that_still_starts_is_worth_waiting_for(file, looks, capsys)
 
 
 def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, monkeypatch, capsys):
-    lay_down(home).manager_log.write_text("its last words\n")
+    lay_down(home, file=file).manager_log.write_text("its last words\n")
     monkeypatch.setattr(progress, "MANAGER_GONE_S", 0.01)
     looks(Seen(STATUS, 0.1, False))
     assert main.run(["up", str(file)]) == 1
@@ -204,7 +204,7 @@ def test_a_file_for_another_cloud_can_be_tried_here(file, looks, capsys):
 
 
 def test_a_changed_file_is_told_in_words(home, file, looks, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     file.write_text(POOL.replace("replicas: 3", "replicas: 2").replace("_service", "_node"))
     looks(updated(file))
     assert main.run(["up", str(file)]) == 0
@@ -225,7 +225,7 @@ def updated(file: Path, state: str = "", fault: str = "", **others: object) -> P
 
 def test_an_update_is_waited_for(home, file, looks, capsys):
     """The pool answers all the time: that does not say that the update has come to its end."""
-    lay_down(home)
+    lay_down(home, file=file)
     file.write_text(POOL.replace("_service", "_node"))
     looks(UP, updated(file, "in progress"), updated(file, "in progress"), updated(file))
     assert main.run(["up", str(file)]) == 0
@@ -233,7 +233,7 @@ def test_an_update_is_waited_for(home, file, looks, capsys):
 
 
 def test_an_update_that_is_rolled_back_is_an_error_with_its_reason(home, file, looks, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     file.write_text(POOL.replace("_service", "_node"))
     fault = "replica 0.2: `run` exited 4 times"
     looks(
@@ -249,7 +249,7 @@ def test_an_update_that_is_rolled_back_is_an_error_with_its_reason(home, file, l
 
 
 def test_a_file_that_was_given_up_is_not_announced_as_a_change(home, file, looks, capsys):
-    paths = lay_down(home)
+    paths = lay_down(home, file=file)
     disk.write_whole(paths.good_spec, paths.spec.read_text())
     file.write_text(POOL.replace("_service", "_node"))
     disk.write_whole(paths.spec, file.read_text())
@@ -264,7 +264,7 @@ def test_a_file_that_was_given_up_is_not_announced_as_a_change(home, file, looks
 
 
 def test_no_room_for_both_is_said_before(home, file, looks, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     cap = POOL.replace("  replicas: 3", "  replicas: 3\n  max_usd_per_hour: 0.21")
     file.write_text(cap.replace("_service", "_node"))
     looks(updated(file))
@@ -275,7 +275,7 @@ def test_no_room_for_both_is_said_before(home, file, looks, capsys):
 
 
 def test_the_same_file_changes_nothing(home, file, looks, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     file.write_text(SPEC)
     looks(UP, started=False)
     assert main.run(["up", str(file)]) == 0
@@ -285,7 +285,7 @@ def test_the_same_file_changes_nothing(home, file, looks, capsys):
 
 
 def test_up_again_gives_a_pool_its_manager_back(home, file, looks, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     file.write_text(SPEC)
     looks(UP)
     assert main.run(["up", str(file)]) == 0
@@ -347,7 +347,7 @@ def test_down_with_nothing_there_is_done(capsys):
 
 
 def test_down_ends_a_pool_whose_manager_is_dead(home, capsys):
-    paths = lay_down(home)
+    paths = lay_down(home, file=file)
     assert main.run(["down", "--yes"]) == 0
     assert not paths.folder.exists()
     assert capsys.readouterr().err.endswith("done: `planner` is shut down; nothing is left\n")
@@ -356,7 +356,7 @@ def test_down_ends_a_pool_whose_manager_is_dead(home, capsys):
 
 def test_down_of_another_name_is_a_mistake(home, capsys):
     """A misspelt name must not look like success while the real pool goes on costing money."""
-    paths = lay_down(home)
+    paths = lay_down(home, file=file)
     assert main.run(["down", "planer"]) == 1
     assert (
         "error: there is no pool `planer`\n\nhint: there are: `planner`" in capsys.readouterr().err
@@ -368,7 +368,7 @@ def test_down_of_another_name_is_a_mistake(home, capsys):
 
 
 def test_logs_of_manager_and_proxy(home, capsys):
-    paths = lay_down(home)
+    paths = lay_down(home, file=file)
     paths.manager_log.write_text("2026-01-01T00:00:01.000 INFO manager_started\n")
     paths.proxy_log.write_text("2026-01-01T00:00:00.000 INFO proxy_started\n")
     assert main.run(["logs"]) == 0
@@ -379,7 +379,7 @@ def test_logs_of_manager_and_proxy(home, capsys):
 
 
 def test_logs_of_a_slot_that_never_was(home, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     assert main.run(["logs", "4"]) == 1
     assert "no log of a replica in slot 4" in capsys.readouterr().err
 
@@ -388,7 +388,7 @@ def test_logs_of_a_slot_that_never_was(home, capsys):
 
 
 def test_refresh_without_a_manager_shows_what_was_seen_last_and_says_so(home, capsys):
-    lay_down(home)
+    lay_down(home, file=file)
     assert main.run(["status", "--refresh"]) == 0
     said = capsys.readouterr()
     assert said.out.startswith("planner  not answering  ? of 3 ready  $0.063/h on local  seen ")
@@ -396,7 +396,7 @@ def test_refresh_without_a_manager_shows_what_was_seen_last_and_says_so(home, ca
 
 
 def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
-    paths = lay_down(home)
+    paths = lay_down(home, file=file)
     with disk.locked(paths.manager_lock):
         with pytest.raises(FogftError, match="did not refresh"):
             renewed(paths, limit_s=0.2)
@@ -411,7 +411,7 @@ def test_refresh_fails_when_a_manager_hangs(home, monkeypatch):
 )
 def test_an_update_that_is_under_way_is_joined(home, file, looks, capsys, end, status, said):
     """The same file again: `up` waits for the update, and ends as that ends."""
-    paths = lay_down(home)
+    paths = lay_down(home, file=file)
     file.write_text(POOL.replace("_service", "_node"))
     disk.write_whole(paths.spec, file.read_text())
     last = updated(file, end, "it crashes") if end else updated(file)

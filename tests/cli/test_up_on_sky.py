@@ -102,7 +102,7 @@ def test_a_person_is_asked(scene, file, started, monkeypatch, capsys, text, goes
 
 def test_a_pool_that_stays_as_it_is_asks_nothing(home, scene, file, started, monkeypatch):
     """`up` gives a pool its manager back: what runs was agreed to."""
-    paths = lay_down(home)
+    paths = lay_down(home, file=file, cloud="sky")
     paths.spec.write_text(POOL)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert main.run(["up", str(file)]) == 0
@@ -135,7 +135,7 @@ def test_a_pool_gets_its_manager_back_though_credentials_have_expired(
     home, scene, file, started, capsys
 ):
     """Its replicas go on serving; only new ones cannot be had."""
-    lay_down(home).spec.write_text(POOL)
+    lay_down(home, file=file, cloud="sky").spec.write_text(POOL)
     scene.sky.credentials = {"aws": "the key has expired"}
     assert main.run(["up", str(file)]) == 0
     assert "`aws` cannot be used: the key has expired" in capsys.readouterr().err
@@ -207,7 +207,7 @@ def test_a_section_that_a_pool_decides_itself_is_refused_before_anything_runs(
 
 @pytest.mark.parametrize(("text", "ends"), [("y\n", True), ("n\n", False)])
 def test_down_asks_a_person(home, scene, monkeypatch, capsys, text, ends):
-    paths = lay_down(home)
+    paths = lay_down(home, file=file, cloud="sky")
     paths.identity.write_text(paths.identity.read_text().replace('"local"', '"sky"'))
     answer(monkeypatch, text)
     assert main.run(["down"]) == (0 if ends else 1)
@@ -217,7 +217,7 @@ def test_down_asks_a_person(home, scene, monkeypatch, capsys, text, ends):
 
 def test_down_without_a_terminal_does_as_it_is_told(home, scene, monkeypatch):
     """Ending costs nothing: a script that ends a pool need not say so twice."""
-    paths = lay_down(home)
+    paths = lay_down(home, file=file, cloud="sky")
     paths.identity.write_text(paths.identity.read_text().replace('"local"', '"sky"'))
     monkeypatch.setattr("sys.stdin", io.StringIO())
     assert main.run(["down"]) == 0

@@ -74,7 +74,7 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
     for key, place in (("PYTHONPATH", other), ("LD_LIBRARY_PATH", libraries)):
         pool.environ[key] = f"{place}:{bare.get(key, '')}"
     said = pool.fogft("up", str(pool.file), "--yes", ok=False, limit_s=200)
-    assert "cannot answer: robot and replicas define its type differently" in said
+    assert "cannot answer: robot and replicas disagree on its type" in said
     assert "field `response.words` is `uint64` here and `uint32` on the replica" in said
     pool.environ = bare
 

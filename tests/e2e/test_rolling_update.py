@@ -51,6 +51,8 @@ def test_a_version_that_crashes_is_rolled_back_and_the_next_one_taken_with_an_up
     said = pool.fogft("up", str(pool.file), "--yes", ok=False)
     assert "new before old" in said
     assert "error: `e2e` was not updated: replica " in said
+    assert "can't open file" in said, "the end of that replica's log"
+    assert "update stopped" in pool.fogft("events")
     assert "`run` exited " in said
     status = pool.wait(lambda: rolled_back(pool))
     assert "`run` exited " in status["update"]["fault"]

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from fogft.model.reason import Cause, Reason
-from fogft.planning.observed.history import MOVING, Event, EventKind
+from fogft.planning.observed.history import OF_NO_REPLICA, Event, EventKind
 from tests.nightly import by_day
 from tests.simulation.test_pools import FAULTS, PLACES, kill_the_manager, make_world, recover
 from tests.simulation.world import UID, World
@@ -45,7 +45,7 @@ def happened(world: World) -> list[tuple[object, ...]]:
     return [
         (e.kind, e.slot, e.generation, e.location, e.reason)
         for e in world.store.events
-        if e.kind not in MOVING
+        if e.kind not in OF_NO_REPLICA
     ]
 
 

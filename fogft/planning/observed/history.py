@@ -41,9 +41,14 @@ class EventKind(str, Enum):
     GONE = "gone"  # gone, unasked: preempted, crashed or ended by someone else
     CLOCK = "clock"  # of no replica: the clock on the wall was set
     SLEPT = "slept"  # of no replica: the manager's machine slept
+    UPDATING = "updating"  # of no replica: a changed file is being applied
+    UPDATE_STOPPED = "update_stopped"  # of no replica: and was given up
+    PROXY_REPLACED = "proxy_replaced"  # of no replica: another client proxy serves
 
 
 MOVING = frozenset({EventKind.CLOCK, EventKind.SLEPT})
+TOLD_ONLY = frozenset({EventKind.UPDATING, EventKind.UPDATE_STOPPED, EventKind.PROXY_REPLACED})
+OF_NO_REPLICA = MOVING | TOLD_ONLY
 CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
 _ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
 
@@ -155,8 +160,9 @@ class History:
     def add(self, event: Event) -> None:
         """Take one more event into account. Events come in the order they happened."""
         self.version += 1
-        if event.kind in MOVING:
-            self._move(event)
+        if event.kind in OF_NO_REPLICA:
+            if event.kind in MOVING:
+                self._move(event)
             return
         key = (event.slot, event.generation)
         if event.generation > self._generations.get(event.slot, -1):
@@ -376,7 +382,8 @@ def compacted(
     Kept in part: the latest launch of each slot, so that generations stay used; the latest failed
     launches of a version, and one that was ready, so that it is known what was given up. Of a
     kept launch's comings and goings of readiness the first READY and the last two stay. That the
-    clock was set is never forgotten, that the machine slept only with all that was before.
+    clock was set is never forgotten, that the machine slept only with all that was before. What
+    no decision reads (`TOLD_ONLY`) stays for `keep_s`.
 
     Args:
         history: What follows from these very events, where that is known already.
@@ -385,11 +392,15 @@ def compacted(
     history = history or History(events)
     kept = {(r.slot, r.generation) for r in history.open()}
     later_s = 0.0
-    for event in reversed(events):
+    told = set()
+    for index, event in reversed(list(enumerate(events))):
         if event.kind in MOVING:
             later_s += event.by_s
         elif now - (event.at + later_s) < keep_s:
-            kept.add((event.slot, event.generation))
+            if event.kind in TOLD_ONLY:
+                told.add(index)
+            else:
+                kept.add((event.slot, event.generation))
     flapping: dict[tuple[int, int], list[int]] = {}
     for index, event in enumerate(events):
         if event.kind in (EventKind.READY, EventKind.UNREADY):
@@ -405,7 +416,12 @@ def compacted(
         if (
             e.kind is EventKind.CLOCK
             or (e.kind is EventKind.SLEPT and out)
-            or (e.kind not in MOVING and index not in dropped and (e.slot, e.generation) in kept)
+            or index in told
+            or (
+                e.kind not in OF_NO_REPLICA
+                and index not in dropped
+                and (e.slot, e.generation) in kept
+            )
             or (is_last and (e.kind is EventKind.LAUNCH or e.kind in CLOSING))
         ):
             out.append(e)

@@ -12,7 +12,7 @@ from pathlib import Path
 from fogft.cloud.port import Cloud
 from fogft.errors import CloudError, FogftError, known_slots
 from fogft.model.replica import ReplicaId
-from fogft.planning.observed.history import MOVING
+from fogft.planning.observed.history import OF_NO_REPLICA
 from fogft.pool.folder.store import PoolStore
 
 EVENTS = 200
@@ -24,7 +24,7 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
     Of one slot where it is given: then only those of its replicas.
     """
     uid = store.identity().uid
-    launched = {(e.slot, e.generation) for e in store.recent(EVENTS) if e.kind not in MOVING}
+    launched = {(e.slot, e.generation) for e in store.recent(EVENTS) if e.kind not in OF_NO_REPLICA}
     with contextlib.suppress(CloudError):
         launched |= {(m.id.slot, m.id.generation) for m in cloud.machines(uid)}
     found = []

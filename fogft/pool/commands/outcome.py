@@ -25,7 +25,7 @@ class Outcome(Enum):
     WITHDRAWN = auto()  # the update was stopped and rolled back
     RUN_KEEPS_ENDING = auto()  # on every replica
     NEVER_READY = auto()  # no replica ever was: nothing more is launched
-    TYPES_DIFFER = auto()  # every replica defines a service's type otherwise than this machine
+    TYPES_DIFFER = auto()  # every replica has another type for a service than this machine
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ Not here: doing it (`startup`) and saying it (`fogft.cli`).
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +25,7 @@ from fogft.planning.rollout import has_room
 from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
 from fogft.pool.commands.plan import far
 from fogft.pool.commands.sweep import left_of
-from fogft.pool.folder.store import PoolStore, digest
+from fogft.pool.folder.store import Identity, PoolStore, digest
 from fogft.pool.manager import offers
 from fogft.poolfile import file as pool_file
 from fogft.poolfile.changes import changes, replaces_replicas
@@ -86,7 +87,10 @@ def order(
     spec = parse(source, str(file), checks_here(), file.parent)
     cloud_name = cloud or cloud_named_by(spec, source, file)
     concrete = make_cloud(cloud_name, file.resolve().parent)
-    before, rolled_back = _before(make_store(spec.name), source)
+    store = make_store(spec.name)
+    with contextlib.suppress(PoolNotFound):
+        check_same(store.identity(), spec, file.resolve(), cloud_name)
+    before, rolled_back = _before(store, source)
     notes: list[str] = []
     accounts: Mapping[str, str] = {}
     sold: tuple[Offer, ...] = ()
@@ -143,6 +147,20 @@ def order(
         costs_money=isinstance(concrete, Accounts),
         accounts=accounts,
     )
+
+
+def check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> None:
+    """Raise SpecError where a pool of this name runs from another file or on another cloud."""
+    if Path(identity.file) != file:
+        raise SpecError(
+            f"{file}: name: pool `{spec.name}` was started from `{identity.file}`",
+            f"give this one another `name`, or shut that one down with `fogft down {spec.name}`",
+        )
+    if identity.cloud != cloud:
+        raise SpecError(
+            f"{file}: pool `{spec.name}` runs on cloud `{identity.cloud}`, not `{cloud}`",
+            f"shut it down with `fogft down {spec.name}` first",
+        )
 
 
 def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:

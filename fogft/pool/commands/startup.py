@@ -18,13 +18,13 @@ from pathlib import Path
 
 from fogft import __version__, disk, logfile
 from fogft.child import detached
-from fogft.errors import FogftError, PoolBusy, PoolNotFound, SpecError
+from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.model import intent
 from fogft.model.intent import Intent
 from fogft.model.spec import PoolSpec
 from fogft.planning import lifetime
 from fogft.pool.commands.composition import make_store
-from fogft.pool.commands.preview import Preview
+from fogft.pool.commands.preview import Preview, check_same
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
@@ -51,8 +51,8 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
         try:
             identity = read_identity(paths)
         except PoolNotFound:
-            return _create(store, spec, source, Path(file), cloud)
-        _check_same(identity, spec, Path(file), cloud)
+            return _create(store, spec, source, file, cloud)
+        check_same(identity, spec, file, cloud)
         try:
             before, old_source = store.spec(), paths.spec.read_text()
         except FogftError:  # written by a version that knew other keys
@@ -81,19 +81,6 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
     identity = Identity(spec.name, uid, cloud, str(file), time.time())
     write_identity(paths, identity)
     return identity
-
-
-def _check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> None:
-    if Path(identity.file) != file:
-        raise SpecError(
-            f"{file}: name: pool `{spec.name}` was started from `{identity.file}`",
-            f"give this one another `name`, or shut that one down with `fogft down {spec.name}`",
-        )
-    if identity.cloud != cloud:
-        raise SpecError(
-            f"{file}: pool `{spec.name}` runs on cloud `{identity.cloud}`, not `{cloud}`",
-            f"shut it down with `fogft down {spec.name}` first",
-        )
 
 
 def manager_version(paths: PoolPaths, pid: int | None = None) -> str:

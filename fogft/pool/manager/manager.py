@@ -27,6 +27,7 @@ from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkReport
 from fogft.model.spec import PoolSpec
 from fogft.planning import lifetime
+from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.planner import PlannedLaunch
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.costs import CostBook, path_of
@@ -269,7 +270,10 @@ class Manager:
         if self._keeps_proxy and not self._store.intent().stopping and not over:
             report = self._fresh_report(time.time())
             version = "" if report is None else report.version
+            before = self._proxy.replacements
             self._proxy.look(outdated=version not in ("", __version__))
+            if self._proxy.replacements != before:
+                self._store.append(Event(now, EventKind.PROXY_REPLACED, 0, 0))
 
     def _fresh_report(self, now: float) -> ProxyReport | None:
         report = proxy_report.read(self._paths.proxy_status, self._identity.uid)

@@ -48,6 +48,9 @@ class ProxySupervisor:
     Args:
         command: What to start, alone; ``python -m fogft proxy --config ...`` unless told.
         ended: Called, from any thread, when a proxy has ended: then `look` is due at once.
+
+    Attributes:
+        replacements: How often another client proxy was seen to serve than the one before.
     """
 
     def __init__(
@@ -72,6 +75,8 @@ class ProxySupervisor:
         self._hanging = {lock: Hanging(HANGS_AFTER_S, clock) for lock in locks}
         self._next_at = 0.0
         self._failures = 0
+        self._serving = 0
+        self.replacements = 0
 
     def look(self, *, outdated: bool = False) -> bool:
         """Start missing proxies; return whether one works or is starting.
@@ -89,6 +94,9 @@ class ProxySupervisor:
             return True  # it is about to take over
         if waiting == working:  # it has just taken over
             waiting = None
+        if working and working != self._serving:
+            self.replacements += self._serving != 0
+            self._serving = working
         if outdated:
             self._hand_over(working, waiting)
         placed = {working, waiting}

@@ -17,7 +17,7 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
 from fogft.model.topic import PREFIX, Origin
 from fogft.model.topology import Gateway, RobotRoute, Topology, trouble
-from fogft.planning.observed.history import MOVING, Event, EventKind, History
+from fogft.planning.observed.history import OF_NO_REPLICA, Event, EventKind, History
 from fogft.pool.manager.proxy_report import Counters, GatewayLink, ProxyReport, TopicCounted
 from fogft.reason_words import words
 
@@ -44,6 +44,9 @@ WORDS = {
     EventKind.GONE: "gone",
     EventKind.CLOCK: "clock set",
     EventKind.SLEPT: "slept",
+    EventKind.UPDATING: "updating",
+    EventKind.UPDATE_STOPPED: "update stopped",
+    EventKind.PROXY_REPLACED: "proxy replaced",
 }
 
 
@@ -469,7 +472,7 @@ def event_status(event: Event) -> EventStatus:
     return EventStatus(
         at=event.at,
         event=WORDS[event.kind],
-        replica="" if event.kind in MOVING else f"{event.slot}.{event.generation}",
+        replica="" if event.kind in OF_NO_REPLICA else f"{event.slot}.{event.generation}",
         location=event.location,
         detail=words(event.reason),
         reason=event.reason,

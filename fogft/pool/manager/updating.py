@@ -17,7 +17,7 @@ from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
 from fogft.planning import rollout
 from fogft.planning.observed.health import Health, judge
-from fogft.planning.observed.history import History
+from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.rollout import Trial, Update
 from fogft.pool.folder.store import Store
 from fogft.reason_words import words
@@ -39,6 +39,8 @@ class Updating:
             trial = Trial(store.applied(), began_at=observed.now)
             store.write_trial(trial)
             log.info("file_applied file=%s", trial.file)
+            if good is not None:
+                store.append(Event(observed.now, EventKind.UPDATING, 0, 0))
         if good is None or good is spec or trial.fault or observed.machines is None:
             return spec, trial
         health = judge(uid, spec, observed, history)
@@ -48,6 +50,7 @@ class Updating:
         trial = replace(trial, fault=fault)
         store.write_trial(trial)
         log.error("update_stopped file=%s reason=%r", trial.file, words(fault))
+        store.append(Event(observed.now, EventKind.UPDATE_STOPPED, 0, 0, reason=fault))
         return store.spec(), trial
 
     def move(self, by_s: float) -> None:

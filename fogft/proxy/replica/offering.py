@@ -47,7 +47,10 @@ class Offering:
     def look(self, node: RosNode, *, complete: bool) -> tuple[ServiceSpec, ...]:
         """Return services that are new in the graph. `complete`: all listed ones answer."""
         now = self._clock()
-        if now < self._looked_at + LOOK_EVERY_S or (complete and not self._finds_out):
+        if complete and not self._finds_out:
+            self._seen = {}
+            return ()
+        if now < self._looked_at + LOOK_EVERY_S:
             return ()
         self._looked_at = now
         offered = node.offered()
@@ -68,10 +71,17 @@ class Offering:
 
     @property
     def told(self) -> dict[str, str]:
-        """Return name -> type of the discovered services, once stable; else nothing."""
-        if not self._finds_out or self._clock() < self._seen_since + SETTLED_S:
+        """Return name -> type of the services to tell, once stable; else nothing.
+
+        All that were discovered, or those listed that `run` offers as another type.
+        """
+        if self._clock() < self._seen_since + SETTLED_S:
             return {}
-        return dict(self._seen)
+        return dict(self._seen) if self._finds_out else self._mistyped()
+
+    def _mistyped(self) -> dict[str, str]:
+        offered = ((one, self._seen.get(one.name, one.type)) for one in self.services)
+        return {one.name: found for one, found in offered if found != one.type}
 
     def types(self) -> dict[str, Definition]:
         """Return the definitions of all types here; nothing until each is known."""
@@ -93,9 +103,8 @@ class Offering:
             limit = f"may have {NAMES_BYTES_LIMIT} bytes together"
             return f"{what} {limit}" if self._left_out and self._finds_out else ""
         listed = {service.name: service.type for service in self.services}
-        for name in missing:
-            if (offered := self._seen.get(name)) and offered != listed[name]:
-                return f"`run` offers {name} as {offered}, not as {listed[name]}"
+        for name, offered in self._mistyped().items():
+            return f"`run` offers {name} as {offered}, not as {listed[name]}"
         others = [f"{n} ({t})" for n, t in sorted(self._seen.items()) if listed.get(n) != t]
         more = "; it offers " + ", ".join(others[:_TOLD]) if others else ""
         if len(others) > _TOLD:

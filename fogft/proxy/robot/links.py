@@ -142,27 +142,32 @@ class TypeCheck:
     def differences(self, link: Link, services: Iterable[ServiceSpec]) -> Mapping[str, str]:
         """Return the services that a replica cannot answer because of their types, with reasons."""
         answer = link.status().probe_answer
-        if self._define is None or answer is None or not answer.types:
+        if answer is None or not (answer.types or answer.offered):
             return {}
         found = {}
         for service in services:
             theirs = answer.types.get(service.type)
-            why = "" if theirs is None else self._compare(link.peer.id, service.type, theirs)
-            if why:
+            if (offered := answer.offered.get(service.name, service.type)) != service.type:
+                found[service.name] = (
+                    f"`run` offers {service.name} as {offered}, not as {service.type}"
+                )
+            elif theirs and (why := self._compare(link.peer.id, service.type, theirs)):
                 found[service.name] = why
         return found
 
     def _compare(self, id: ReplicaId, type_name: str, theirs: Definition) -> str:
+        if self._define is None:
+            return ""
         known = self._found.get((id, type_name))
         if known is not None and known[0] is theirs:
             return known[1]
         ours = self._ours.get(type_name)
-        if ours is None and self._define is not None:
+        if ours is None:
             ours = self._define(type_name)
             if not ours.known:
                 return ""  # until it is: where no types are loaded, a client tells its hash
             self._ours[type_name] = ours
-        why = difference(type_name, ours or Definition(), theirs)
+        why = difference(type_name, ours, theirs)
         if why and (known is None or known[1] != why):
             log.error("type_differs replica=%s reason=%r", id.short, why)
         self._found[(id, type_name)] = (theirs, why)

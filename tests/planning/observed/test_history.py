@@ -8,13 +8,20 @@ from hypothesis import strategies as st
 
 from fogft.model.plain import from_plain, to_plain
 from fogft.model.reason import Cause, Reason
-from fogft.planning.observed.history import MOVING, Event, EventKind, History, compacted
+from fogft.planning.observed.history import (
+    OF_NO_REPLICA,
+    TOLD_ONLY,
+    Event,
+    EventKind,
+    History,
+    compacted,
+)
 
 events = st.lists(
     st.builds(
         Event,
         st.floats(0, 200_000),
-        st.sampled_from(sorted(set(EventKind) - MOVING)),
+        st.sampled_from(sorted(set(EventKind) - OF_NO_REPLICA)),
         st.integers(0, 3),
         st.integers(1, 4),
         st.sampled_from(["", "c/r/a", "c/r/b"]),
@@ -84,6 +91,17 @@ def test_a_flapping_service_does_not_fill_the_disk() -> None:
     record = History(kept).record(0, 1)
     assert record is not None
     assert (record.first_ready_at, record.unready_since) == (1.0, 1000.0)
+
+
+def test_what_is_only_told_decides_nothing_and_goes_after_a_day() -> None:
+    """Updates and replaced client proxies are of no replica; the first launch stays what it was."""
+    told = [Event(at, kind, 0, 0) for at, kind in enumerate(TOLD_ONLY)]
+    found = [*told, Event(5, EventKind.LAUNCH, 0, 1, "c/r/a"), *told]
+    history = History(found)
+    assert [(r.slot, r.generation) for r in history.open()] == [(0, 1)]
+    assert dict(history.generations) == {0: 1}
+    assert compacted(found, 100.0) == found
+    assert compacted(found, 100_000.0) == [found[len(told)]]
 
 
 def test_a_listed_machine_thought_gone_is_open_again() -> None:

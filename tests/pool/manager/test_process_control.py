@@ -184,6 +184,23 @@ WORKS += "disk.Lock(Path(sys.argv[1])).acquire(wait=True)\nprint('held', flush=T
 WORKS += "while True: time.sleep(0.01)"
 
 
+def test_a_proxy_that_was_replaced_is_counted(tmp_path: Path) -> None:
+    """Not the first one, nor one that is looked at again."""
+    proxy = Proxy(tmp_path, "pass")
+    for replaced in (0, 1):
+        works = subprocess.Popen(
+            [sys.executable, "-c", WORKS, str(proxy.paths.proxy_lock)], stdout=subprocess.PIPE
+        )
+        assert works.stdout is not None
+        works.stdout.readline()
+        proxy.supervisor.look()
+        proxy.supervisor.look()
+        assert proxy.supervisor.replacements == replaced
+        works.kill()
+        works.communicate()
+        proxy.supervisor.look()
+
+
 @pytest.mark.parametrize("which", ["proxy_lock", "standby_lock"])
 def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
     """Stopped, it holds its place for ever, and nobody can take over; one that works is let be."""

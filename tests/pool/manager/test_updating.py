@@ -77,6 +77,8 @@ def test_a_rollback_puts_the_good_file_in_force_and_stays_over_a_restart(store):
     assert [(why.cause, why.count) for why in fault.because] == [(Cause.RUN_ENDS, 9)]
     assert tick(again, whole(again)).task["run"] == "good"
     assert store.paths.good_spec.read_text() == "good"
+    told = [(event.kind, event.reason) for event in store.recent()]
+    assert told == [(EventKind.UPDATING, None), (EventKind.UPDATE_STOPPED, fault)]
 
 
 def test_another_file_is_tried_and_the_bad_one_again_after_it(store):

@@ -104,6 +104,13 @@ def test_a_replica_whose_type_is_another_names_both():
     scene.node.clients["/s"].there = False
     scene.look()
     assert scene.probe().detail == "`run` offers /s as a_b/srv/C, not as std_srvs/srv/SetBool"
+    assert scene.probe().offered == {}
+    scene.clock.now += SETTLED_S
+    assert scene.probe().offered == {"/s": "a_b/srv/C"}
+    scene.node.clients["/s"].there = True  # it was mended there, without a restart of `run`
+    scene.look()
+    scene.look()
+    assert scene.probe().offered == {}
 
 
 def test_a_replica_without_the_type_stays_and_says_so():

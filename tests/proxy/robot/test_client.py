@@ -298,6 +298,23 @@ def test_a_replica_whose_type_differs_is_not_asked_and_says_which_field():
     assert "field `request.data` is `boolean` here and `int64` on the replica" in bad["detail"]
 
 
+def test_a_replica_that_offers_the_service_as_another_type_says_so():
+    """No type of that name may be known here; the names alone tell."""
+    scene = Scene()
+    scene.follow(member(0))
+    [link] = scene.dialer.links
+    link.told = replace(told(0, "boolean"), types={}, offered={"/s": "a_b/srv/C", "/t": SET_BOOL})
+    scene.ready(link)
+    [report] = scene.proxy.report()["links"]
+    assert (report["differing"], report["detail"]) == (
+        ["/s"],
+        f"`run` offers /s as a_b/srv/C, not as {SET_BOOL}",
+    )
+    link.told = replace(link.told, offered={})
+    scene.ready(link)
+    assert not scene.proxy.report()["links"][0]["differs"]
+
+
 def test_what_a_replica_that_says_it_hangs_has_is_sent_to_another():
     scene = Scene()
     scene.proxy.serve([ServiceSpec("/s", SET_BOOL, hedging=HedgingMode.FAILOVER)])
