@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -22,6 +23,13 @@ os.execvp(sys.argv[2], sys.argv[2:])
 def tied(command: Sequence[str]) -> list[str]:
     """Return a command that gets SIGKILL when the thread that starts it ends: use the main one."""
     return [sys.executable, "-IS", "-c", _PROGRAM, str(os.getpid()), *command]
+
+
+def how_it_ended(status: int) -> str:
+    """Return in words how a process ended, from its return code: negative for a signal."""
+    if status < 0:
+        return f"was killed by {signal.Signals(-status).name}"
+    return f"exited with status {status}"
 
 
 def detached(

@@ -233,7 +233,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.NO_PROXY_REPORT: "the client proxy has not reported yet",
     Cause.STALE_PROXY_REPORT: "the client proxy has not reported lately",
     Cause.PROXY_KEEPS_ENDING: (
-        "the client proxy exited {r.count} times in a row; its log is `{r.name}`"
+        "the client proxy {r.words}, {r.count} times in a row; its log is `{r.name}`"
     ),
     Cause.NO_CERTIFICATE: (
         "gateway `{r.name}` has no certificate: `fogft credentials issue gateway {r.name}`"

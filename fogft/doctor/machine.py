@@ -72,7 +72,10 @@ def shared_memory(_: Situation) -> Iterator[Finding]:
         return
     usage = shutil.disk_usage(_SHARED_MEMORY)
     text = f"{_megabytes(usage.free)} of {_megabytes(usage.total)} free in /dev/shm"
-    if usage.free < _SHARED_MEMORY_WANTED_BYTES:
+    if usage.free < 1 << 20:
+        left = "`fogft down` removes what killed ROS processes left there"
+        yield fail("shared memory", f"{text}: ROS nodes may end with SIGBUS", f"{left}; {advice}")
+    elif usage.free < _SHARED_MEMORY_WANTED_BYTES:
         yield warn("shared memory", f"only {text}; large messages will be slow", advice)
     else:
         yield ok("shared memory", text)

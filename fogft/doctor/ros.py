@@ -17,6 +17,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import fogft
+from fogft.child import how_it_ended
 from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
 from fogft.ros import environment
 
@@ -218,7 +219,7 @@ def _self_test(*arguments: str) -> dict[str, Any]:
         result = json.loads(ended.stdout.strip().splitlines()[-1])
     except (ValueError, IndexError):
         said = ended.stderr.strip().splitlines() or ["it printed nothing"]
-        return {"error": f"it exited with status {ended.returncode}: {said[-1]}"}
+        return {"error": f"it {how_it_ended(ended.returncode)}: {said[-1]}"}
     return result if isinstance(result, dict) else {"error": "no answer"}
 
 

@@ -157,7 +157,7 @@ class Machine:
         code = self._statuses.pop(pid)
         if code:
             tail = logfile.tail(self._folder.log, begin)
-            raise _Failed(Cause.SETUP, f"{_in_words(code)}\n{tail}".rstrip())
+            raise _Failed(Cause.SETUP, f"{child.how_it_ended(code)}\n{tail}".rstrip())
         log.info("setup_done")
 
     # -- serve ------------------------------------------------------------------------------
@@ -189,8 +189,8 @@ class Machine:
         code = self._statuses.pop(pid)
         if code > 0 and self._relay is not None and not self._relay.reached:
             tail = logfile.tail(self._folder.log, begin)
-            raise _Failed(Cause.ERROR, f"serve {_in_words(code)}\n{tail}".rstrip())
-        raise _Ended(f"serve {_in_words(code)}")
+            raise _Failed(Cause.ERROR, f"serve {child.how_it_ended(code)}\n{tail}".rstrip())
+        raise _Ended(f"serve {child.how_it_ended(code)}")
 
     def _start_server(self, workdir: Path, domain: Reservation, port: Reservation) -> int:
         folder = self._folder.path
@@ -288,12 +288,6 @@ class Machine:
 
     def _on_signal(self, number: int, _: object) -> None:
         self._signal = number
-
-
-def _in_words(code: int) -> str:
-    if code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"exited with status {code}"
 
 
 if __name__ == "__main__":

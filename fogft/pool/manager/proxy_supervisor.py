@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fogft import disk
-from fogft.child import detached
+from fogft.child import detached, how_it_ended
 from fogft.model.reason import Cause, Reason
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
@@ -75,6 +75,7 @@ class ProxySupervisor:
         self._hanging = {lock: Hanging(HANGS_AFTER_S, clock) for lock in locks}
         self._next_at = 0.0
         self._failures = 0
+        self._last_end = ""
         self._serving = 0
         self.replacements = 0
 
@@ -149,6 +150,7 @@ class ProxySupervisor:
 
     def _ended(self, status: int, ran_s: float) -> None:
         self._failures = 0 if ran_s > STEADY_S else self._failures + 1
+        self._last_end = how_it_ended(status)
         log.warning("proxy_ended status=%d ran_s=%.1f", status, ran_s)
         if self._failures > 1:
             wait_s = min(BACKOFF_S * 2.0 ** min(self._failures - 2, 16), BACKOFF_LIMIT_S)
@@ -159,8 +161,12 @@ class ProxySupervisor:
         """Return the problem with the client proxy; None without one."""
         if self._failures < 2 or self._children:
             return None
-        log_name = str(self._paths.proxy_log)
-        return Reason(Cause.PROXY_KEEPS_ENDING, count=self._failures, name=log_name)
+        return Reason(
+            Cause.PROXY_KEEPS_ENDING,
+            count=self._failures,
+            name=str(self._paths.proxy_log),
+            words=self._last_end,
+        )
 
 
 def allow_restart(paths: PoolPaths, environ: Mapping[str, str] = os.environ) -> None:

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from fogft.child import tied
+from fogft.child import how_it_ended, tied
 
 log = logging.getLogger(__name__)
 
@@ -101,11 +101,7 @@ class Supervisor:
         ran_s = self._clock() - self._started_at
         if ran_s > self.backoff_s[1] or at_work:
             self._wait_s = 0.0
-        self.last_exit = (
-            f"was killed by {signal.Signals(-status).name}"
-            if status < 0
-            else f"exited with status {status}"
-        )
+        self.last_exit = how_it_ended(status)
         log.warning("run_ended status=%d ran_s=%.1f again_in_s=%.1f", status, ran_s, self._wait_s)
         self._child = None
         self._delay_next_start()

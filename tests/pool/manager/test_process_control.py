@@ -158,6 +158,7 @@ def test_a_proxy_that_keeps_dying_is_started_less_and_less_often(tmp_path: Path)
     trouble = proxy.supervisor.trouble
     assert trouble is not None
     assert (trouble.cause, trouble.name) == (Cause.PROXY_KEEPS_ENDING, str(proxy.paths.proxy_log))
+    assert trouble.words == "exited with status 3"
 
 
 def test_a_proxy_that_ran_well_is_started_again_at_once(tmp_path: Path) -> None:
