@@ -213,6 +213,8 @@ def test_a_refusal_arrives_with_its_reason(
     replica.requests[0].refuse(reason)
     world.wait_for(lambda: owner.answers)
     assert [(a.payload, a.refusal) for a in owner.of(1)] == [(None, reason)]
+    replica.requests[0].refuse(Refusal.LOST)
+    assert replica.listener.refusals() == {reason.value: 1}
 
 
 def test_answers_come_back_in_any_order_to_their_own_requests(

@@ -172,6 +172,7 @@ class MemoryListener:
         self.certificate_name = id.certificate_name
         self.frozen = False
         self.count: Counter[str] = Counter()
+        self.refused: Counter[str] = Counter()
 
     @property
     def endpoint(self) -> str:
@@ -228,6 +229,10 @@ class MemoryListener:
     def counters(self) -> Mapping[str, int]:
         """Counts by event name."""
         return dict(self.count)
+
+    def refusals(self) -> Mapping[str, int]:
+        """Refusals by value."""
+        return dict(self.refused)
 
     def close(self) -> None:
         """Stop; every link notices at once. Repeatable."""

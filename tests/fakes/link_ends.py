@@ -308,6 +308,8 @@ class MemoryIncoming:
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal."""
+        if self._send is not None:
+            self._listener.refused[reason.value] += 1
         answer = Answer(self.request_id, refusal=reason, detail=detail, load=load)
         self.answer(answer, "refused")
 

@@ -271,6 +271,9 @@ class FakeListener:
     def counters(self):
         return {}
 
+    def refusals(self):
+        return {}
+
     def close(self) -> None:
         self.closed = True
 

@@ -24,7 +24,7 @@ from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.known_requests import KnownRequests
 from fogft.proxy.replica.service_queue import Interruptions, Job, ServiceQueue
-from fogft.requests.load import Handling, Load
+from fogft.requests.load import Handling
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -78,7 +78,6 @@ class Responder:
         self._queues: dict[str, ServiceQueue] = {}
         self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
         self.ran_s = self.wasted_s = 0.0
-        self.refused: dict[Refusal, int] = {}
 
     @property
     def at_work(self) -> int:
@@ -100,8 +99,6 @@ class Responder:
             "interrupted": self.interrupted,
             "wasted": self.wasted,
             "wasted_s": round(self.wasted_s, 3),
-            "expired": self.refused.get(Refusal.EXPIRED, 0),
-            "overloaded": self.refused.get(Refusal.OVERLOADED, 0),
         }
 
     def hanging(self, *, stuck: bool = False) -> dict[str, float]:
@@ -164,7 +161,7 @@ class Responder:
             incoming.reply(answer)
         elif reason is not None:
             queue = self._queues.get(incoming.service)
-            self._refuse(incoming, reason, None if queue is None else queue.load(0.0))
+            incoming.refuse(reason, load=None if queue is None else queue.load(0.0))
         else:
             self._pass_on(incoming.service)
 
@@ -287,7 +284,7 @@ class Responder:
         try:
             for incoming in waiting:
                 if job.unwanted:  # its bytes would be dropped at the other end
-                    self._refuse(incoming, Refusal.LATE, load)
+                    incoming.refuse(Refusal.LATE, load=load)
                 else:
                     incoming.reply(payload, load=load, more=more)
         finally:
@@ -325,11 +322,7 @@ class Responder:
             elif job.passed_on:
                 queue.overdue(job, self._clock())
         for incoming in waiting:
-            self._refuse(incoming, reason, load)
-
-    def _refuse(self, incoming: Incoming, reason: Refusal, load: Load | None = None) -> None:
-        self.refused[reason] = self.refused.get(reason, 0) + 1
-        incoming.refuse(reason, load=load)
+            incoming.refuse(reason, load=load)
 
     def crashed(self, service: str | None = None) -> None:
         """Note that a service, or the whole command, died: refuse its requests."""

@@ -25,6 +25,7 @@ from fogft.errors import RosError
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.model import names
 from fogft.model.choices import Freshness
+from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import Part, ServiceSpec
 from fogft.model.state import StateSpec
@@ -298,9 +299,9 @@ class ServerProxy:
         """Return the counters of requests, for metrics."""
         answering = self._answering()
         return {
-            "work": self.responder.report(),
+            "work": self._work(),
             "limits": self.responder.limits,
-            "refused": {r.value: n for r, n in self.responder.refused.items()},
+            "refused": dict(self._listener.refusals()),
             "services": {s.name: s.name in answering for s in self._offering.services},
             "draining": self.draining,
             "lease_left_s": self._lease.left_s,
@@ -368,6 +369,13 @@ class ServerProxy:
     def _passing(self) -> frozenset[str]:
         return self._topics.ready() if self._topics and self.command.alive else frozenset()
 
+    def _work(self) -> dict[str, float]:
+        refused = self._listener.refusals()
+        told = {
+            why.value: refused.get(why.value, 0) for why in (Refusal.EXPIRED, Refusal.OVERLOADED)
+        }
+        return {**self.responder.report(), **told}
+
     def _probe(self, probe: Probe) -> ProbeAnswer:
         counts = self._listener.counters()
         return ProbeAnswer(
@@ -382,7 +390,7 @@ class ServerProxy:
             + self._goals.in_flight
             + sum(ordered.in_flight for ordered in self._ordered.values()),
             detail=self._detail(),
-            work=self.responder.report(),
+            work=self._work(),
             offered=self._offering.told,
             types=self._offering.types() if probe.describe else {},
             hanging=frozenset(self._hanging()),

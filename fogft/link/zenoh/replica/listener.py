@@ -305,6 +305,10 @@ class ZenohListener:
         """
         return self._counters.snapshot()
 
+    def refusals(self) -> Mapping[str, int]:
+        """Return how many requests and messages were refused, by the refusal's value."""
+        return self._queues.refusals.snapshot()
+
     def close(self) -> None:
         """Send what is queued, then stop. Repeatable; takes a second at most."""
         session, self._session = self._session, None

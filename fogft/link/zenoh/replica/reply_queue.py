@@ -153,6 +153,7 @@ class ReplyQueues:
     ) -> None:
         self.later = later
         self._counters = counters
+        self.refusals = Counters()
         self._turns = turns or QueryTurns()
         self._lock = threading.Lock()
         self._queues: dict[bytes, ReplyQueue] = {}
@@ -306,6 +307,8 @@ class ZenohIncoming:
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
         """Send a refusal. Never blocks."""
+        if self._streams:
+            self._queues.refusals.add(reason.value)
         self._send(b"", reason.text(detail), load, more=True)
 
     def _send(self, payload: bytes, refusal: str, load: Load | None, *, more: bool) -> None:
