@@ -1,4 +1,4 @@
 """One link for each replica: its port, its window, and the bytes on the wire.
 
-Not here: Zenoh (`zenoh`), and which link a request takes (`fogft.proxy.robot`).
+Not here: Zenoh (`zenoh`), and which replica is asked (`fogft.requests`).
 """

@@ -2,8 +2,9 @@
 
 A new kind of refusal is a row here, the code that raises it, and a test. The comment above a row
 is published: `scripts/docs` writes it into docs/reference/diagnostics.md. Requests are refused
-in `proxy/replica/responder` (services), `.goals_once`, `.topics`, `ordering/replica` (services
-with `state`), `proxy/gateway/gateway` and `link/zenoh/replica` (who may not ask).
+in `proxy/replica/responder` (services), `.goals_once`, `.topics`, `.ordered_responder` with
+`ordering/replica` (services with `state`), `proxy/gateway/gateway`, `link/zenoh/replica` (who may
+not ask), and on the robot in `link/zenoh/robot/attempts` and `link/uplinks` (what is lost).
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ class Refusal(str, Enum):
     # A spare copy that would have had to wait
     BUSY = "busy", Effect.BLAMELESS
 
-    # Of a stateful service; the detail is the number of the last three
+    # Of a stateful service; the last three have a detail
     # It obeys this term, and has not been brought to its state
     NOT_JOINED = "not-joined"
     # Another number is expected next: decimal

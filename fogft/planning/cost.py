@@ -17,8 +17,7 @@ from fogft.model.spec import HedgingMode, ServiceSpec
 
 HOURS_A_MONTH = 730.0
 GB = 1e9
-# To the Internet, US dollars per GB: the list prices of the first paid tier.
-EGRESS_AS_OF = "2024-11"
+# To the Internet, US dollars per GB: the list prices of the first paid tier, as of 2024-11.
 EGRESS_USD_PER_GB = {"aws": 0.09, "azure": 0.087, "gcp": 0.12, "local": 0.0}
 UNKNOWN_EGRESS_USD_PER_GB = 0.12
 

@@ -1,4 +1,4 @@
-"""Signed membership records, and the rendezvous that passes them on.
+"""Signed records (memberships, leases, revocations), and the rendezvous that passes them on.
 
 Not here: application data, which goes over links only (`fogft.link`).
 """

@@ -37,6 +37,7 @@ class Pending(Generic[T]):
         rejection: The last response that was real but not ok.
         deaths: How often a service died while it worked on this: those that died together over
             copies of it, and of other requests, count as one.
+        died_at: The replicas where they died.
         alone_at: The replicas that got it with nothing beside it, since a service has died.
         alone_until: When another one is asked, if none of these has answered: half of the time left
             is over then.

@@ -1,4 +1,4 @@
-"""Conclusions from observations: health, history, backoff, expiring prices. Pure.
+"""Conclusions from observations: health, history, backoff, hazards. Pure.
 
 Not here: what to do about them (`fogft.planning`).
 """

@@ -1,4 +1,4 @@
-"""A pool on disk: every file has one writer.
+"""A pool on disk: who writes which file, see `PoolPaths`.
 
 Not here: what is written (`fogft.pool.manager`).
 """

@@ -39,10 +39,11 @@ class _File:
 
 @dataclass(frozen=True)
 class PoolPaths:
-    """The files of one pool; each has one writer.
+    """The files of one pool.
 
-    Commands write `identity`, `spec` and `intent` (under `intent_lock`), the client proxy its own
-    `proxy_status` (under `proxy_lock`), and the manager all else (under `manager_lock`).
+    Commands write `identity`, `spec` and `intent` (under `intent_lock`; who ends a pool takes its
+    `identity` away), the client proxy `proxy_status` and `records` (under `proxy_lock`), and the
+    manager all else (under `manager_lock`).
     """
 
     folder: Path

@@ -55,7 +55,7 @@ class ReplicaStatus:
     """One replica with its `LinkReport`. Ages and durations in seconds; None: unknown.
 
     Attributes:
-        verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck`` or
+        verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck``, ``disagrees`` or
             ``at risk``.
         age_s: Since its launch; None where that was somebody else's.
         reason: Why the verdict is not ``good``, as ``{cause, ...}``; None when it is.

@@ -1,4 +1,4 @@
 """The robot's end of a link: dial, probe, send attempts, take answers.
 
-Not here: which link a request takes (`fogft.proxy.robot`).
+Not here: which replica is asked (`fogft.requests`).
 """
