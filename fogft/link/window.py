@@ -45,6 +45,7 @@ class OpenAttempt:
         mark: What the connection had sent once this was sent (`credit`).
         reads_packed: The answer may be compressed.
         elsewhere: It was sent, and another replica answered its request in time.
+        forgotten: It is not wanted any more, and was not sent.
     """
 
     service: str
@@ -57,6 +58,7 @@ class OpenAttempt:
     mark: int = 0
     reads_packed: bool = False
     elsewhere: bool = False
+    forgotten: bool = False
 
 
 class LinkWindow:
@@ -109,8 +111,10 @@ class LinkWindow:
     def forget(self, request_id: bytes) -> OpenAttempt | None:
         """End the attempt of a request, whichever it is, and return it if there was one."""
         with self._lock:
-            attempt = self._open.pop(request_id, None)
+            attempt = self._open.get(request_id)
             if attempt is not None:
+                attempt.forgotten = attempt.payload is not None  # before it is seen to be gone
+                del self._open[request_id]
                 self.held_bytes -= attempt.size
             return attempt
 

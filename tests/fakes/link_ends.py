@@ -24,13 +24,14 @@ _PROBE_EVERY_S = 1.0
 _FIRST_PROBES_EVERY_S = 0.1
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Attempt:
     service: str
     request_id: bytes
     payload: bytes
     deadline: float
     handling: Handling
+    forgotten: bool = False
 
     @property
     def size(self) -> int:

@@ -19,10 +19,12 @@ from fogft.link.window import (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Attempt:
     request_id: bytes
     size: int
+    payload: bytes | None = b""
+    forgotten: bool = False
 
 
 class WindowMachine(RuleBasedStateMachine):

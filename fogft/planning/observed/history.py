@@ -5,8 +5,8 @@ who was ever ready, which locations failed, and since when a replica drains. It 
 the only memory that must outlive a crash of the manager. Pure: events in, facts out.
 
 Owns: the events and the facts derived from them.
-Not here: the file they are stored in (`fogft.pool.folder.history_file`) and what to make of failures
-(`backoff`).
+Not here: the file they are stored in (`fogft.pool.folder.history_file`) and what to make of
+failures (`backoff`).
 """
 
 from __future__ import annotations

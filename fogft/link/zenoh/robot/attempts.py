@@ -209,6 +209,8 @@ class Attempts:
                 remaining_s = max(attempt.deadline - now, 0.0)
                 parts.append((attempt.request_id, remaining_s, attempt.handling, payload))
                 self._unanswered.add(attempt)
+            else:
+                self._skipped(attempt)
         if not parts:
             return
         header, content = batch_frames.encode_requests(parts, self._origin, seen=self._seen)
@@ -305,10 +307,18 @@ class Attempts:
         for attempt in attempts:
             self._end(attempt, Refusal.LOST)
 
+    def _skipped(self, attempt: OpenAttempt) -> None:
+        """Tell the end of an attempt that was forgotten while it waited: no answer will."""
+        if attempt.forgotten:
+            self._late(
+                Answer(attempt.request_id, refusal=Refusal.CANCELLED, service=attempt.service)
+            )
+
     def _send(self, attempt: OpenAttempt) -> None:
         payload = attempt.payload  # read once: `forget` may take it away at any moment
         if payload is None or not self.window.holds(attempt):
-            return  # forgotten while it waited
+            self._skipped(attempt)
+            return
         remaining_s = attempt.deadline - time.monotonic()
         if remaining_s <= 0:
             self._end(attempt, Refusal.LOST)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import zlib
 from collections import Counter
 from collections.abc import Sequence
@@ -179,6 +180,29 @@ def test_an_answer_after_it_was_forgotten_is_late() -> None:
     scene.attempts.heard(b"once", [Answer(request_id(1), b"y")])
     scene.close()
     assert (scene.answers, scene.late) == ([], [request_id(1)])
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_one_that_was_forgotten_before_it_was_sent_is_late_by_itself(together: bool) -> None:
+    """The replica never heard of it; without a word its owner would wait for its end for ever."""
+    scene = Scene()
+    if together:
+        for number in (1, 2):
+            assert scene.attempts.offer(SERVICE, request_id(number), b"x", 60.0, more=True)
+        scene.attempts.forget(request_id(2))
+        scene.attempts.send()
+    else:
+        goes_on, publish = threading.Event(), scene.outlet.publish
+        scene.outlet.publish = lambda *sent: (goes_on.wait(20), publish(*sent))  # type: ignore[func-returns-value,method-assign]
+        for number in (1, 2):
+            assert scene.attempts.offer(SERVICE, request_id(number), bytes(LARGE_BYTES), 60.0)
+        scene.attempts.forget(request_id(2))
+        assert scene.late == []
+        goes_on.set()
+    wait_for(lambda: scene.outlet.sent == [request_id(1)])
+    wait_for(lambda: scene.late == [request_id(2)])
+    scene.close()
+    assert scene.late == [request_id(2)]
 
 
 def test_a_packed_answer_is_unpacked_where_it_was_asked_for() -> None:
