@@ -204,8 +204,8 @@ class Attempts:
         parts = []
         for attempt in attempts:
             payload = attempt.payload  # read once, as in `_send`
-            attempt.payload = None
             if payload is not None and self.window.holds(attempt):
+                attempt.payload = None
                 remaining_s = max(attempt.deadline - now, 0.0)
                 parts.append((attempt.request_id, remaining_s, attempt.handling, payload))
                 self._unanswered.add(attempt)
@@ -326,7 +326,6 @@ class Attempts:
         if not self._deadline.may_arrive(attempt, remaining_s, time.monotonic()):
             self._end(attempt, Refusal.TOO_SLOW)
             return
-        attempt.payload = None
         large = attempt.size >= LARGE_BYTES
         turn = self._gate.take() if large else None
         began = time.monotonic()
@@ -337,7 +336,10 @@ class Attempts:
                 self._on_large()
         try:
             if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
+                attempt.payload = None
                 self._publish(attempt, payload, remaining_s)
+            else:
+                self._skipped(attempt)
         finally:
             self._sending_since = None
             self._gate.give(turn)

@@ -63,7 +63,7 @@ class Outlet:
 
 class Scene:
     def __init__(self, options: SendOptions = DEFAULT_OPTIONS) -> None:
-        self.outlet = Outlet()
+        self.outlet, self.gate = Outlet(), LargeSendGate()
         self.answers: list[Answer] = []
         self.late: list[bytes] = []
         self.ended = 0
@@ -72,7 +72,7 @@ class Scene:
             [SERVICE],
             frame.origin("ada", bytes(frame.TOKEN_BYTES)),
             options=options,
-            gate=LargeSendGate(),
+            gate=self.gate,
             cancellations=Cancellations(),
             tell=Callbacks(
                 answered=self.answers.append,
@@ -182,27 +182,32 @@ def test_an_answer_after_it_was_forgotten_is_late() -> None:
     assert (scene.answers, scene.late) == ([], [request_id(1)])
 
 
-@pytest.mark.parametrize("together", [False, True])
-def test_one_that_was_forgotten_before_it_was_sent_is_late_by_itself(together: bool) -> None:
+@pytest.mark.parametrize("waits_for", ["the others of a burst", "the sender", "its turn"])
+def test_one_that_was_forgotten_before_it_was_sent_is_late_by_itself(waits_for: str) -> None:
     """The replica never heard of it; without a word its owner would wait for its end for ever."""
     scene = Scene()
-    if together:
-        for number in (1, 2):
-            assert scene.attempts.offer(SERVICE, request_id(number), b"x", 60.0, more=True)
-        scene.attempts.forget(request_id(2))
-        scene.attempts.send()
+    size, more = LARGE_BYTES, False
+    if waits_for == "the others of a burst":
+        size, more = 1, True
+        goes_on = scene.attempts.send
+    elif waits_for == "the sender":
+        blocked, publish = threading.Event(), scene.outlet.publish
+        goes_on = blocked.set
+        scene.outlet.publish = lambda *sent: (blocked.wait(20), publish(*sent))  # type: ignore[func-returns-value,method-assign]
     else:
-        goes_on, publish = threading.Event(), scene.outlet.publish
-        scene.outlet.publish = lambda *sent: (goes_on.wait(20), publish(*sent))  # type: ignore[func-returns-value,method-assign]
-        for number in (1, 2):
-            assert scene.attempts.offer(SERVICE, request_id(number), bytes(LARGE_BYTES), 60.0)
-        scene.attempts.forget(request_id(2))
-        assert scene.late == []
-        goes_on.set()
-    wait_for(lambda: scene.outlet.sent == [request_id(1)])
-    wait_for(lambda: scene.late == [request_id(2)])
+        scene.gate.patience_s = 20.0
+        turn = scene.gate.take()
+        goes_on = lambda: scene.gate.give(turn)  # noqa: E731
+    for number in (1, 2):
+        assert scene.attempts.offer(SERVICE, request_id(number), bytes(size), 60.0, more=more)
+    forgotten, sent = (1, 2) if waits_for == "its turn" else (2, 1)
+    scene.attempts.forget(request_id(forgotten))
+    assert scene.late == []
+    goes_on()
+    wait_for(lambda: scene.outlet.sent == [request_id(sent)])
+    wait_for(lambda: scene.late == [request_id(forgotten)])
     scene.close()
-    assert scene.late == [request_id(2)]
+    assert scene.late == [request_id(forgotten)]
 
 
 def test_a_packed_answer_is_unpacked_where_it_was_asked_for() -> None:
