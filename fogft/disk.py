@@ -85,7 +85,7 @@ def read_bytes(path: Path) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:  # a folder, a link to itself, another user's
-        hint = "move it away, or see that this user may read it"
+        hint = "move it away, or let this user read it"
         raise StateError(f"`{path}` cannot be read: {error.strerror}", hint) from error
 
 

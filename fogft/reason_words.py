@@ -113,7 +113,7 @@ def _worse_score(reason: Reason) -> str:
         said.append(f"{'farther' if is_farther else 'nearer'}: {_ms(far)}, not {_ms(near)}")
         better = better or not is_farther
     if not said:
-        return f"as good as `{chosen.location}`, which is first by name (slot {reason.slot})"
+        return f"as good as `{chosen.location}`, which comes first by name (slot {reason.slot})"
     return f"{(' but ' if better else ', ').join(said)} (slot {reason.slot})"
 
 
@@ -170,10 +170,10 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.FOLLOWS: lambda r: _launch(f"successor of {r.replica}", r.because),
     Cause.NEW_SLOT: lambda r: _launch("fills a new slot", r.because),
     Cause.STANDS_IN: "fills in until enough spot machines are ready",
-    Cause.FAILED_LONGEST_AGO: "all locations are backing off, this one longest",
+    Cause.FAILED_LONGEST_AGO: "all locations are backing off, this one the longest",
     Cause.NOTHING_OFFERED: "no cloud offers these resources at the moment",
     Cause.IMPOSSIBLE_PRICE: _impossible_price,
-    Cause.LOCATION_FULL: "no location may hold more of the replicas",
+    Cause.LOCATION_FULL: "no location may hold more replicas",
     Cause.ALL_EXCLUDED: "every offered location is excluded",
     Cause.BACKING_OFF: _backing_off,
     Cause.ALL_BACKING_OFF: _all_backing_off,
@@ -202,8 +202,8 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
         "to reach {r.share:.6g}, and {main}"
     ),
     Cause.FULL_TOGETHER: (
-        "no location has spot capacity {r.share:.2%} of the time: on-demand "
-        "machines in their place (`fallback: true`) bridge that"
+        "{r.share:.2%} of the time no location has spot capacity: on-demand "
+        "machines (`fallback: true`) bridge that"
     ),
     Cause.MOST_REPLICAS: "{r.count} is the maximum",
     Cause.OVER_CAP: _over_cap,
@@ -227,13 +227,13 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.CLOCK_SET: _clock_set,
     Cause.CLOCK_DOUBTED: (
         "the clock was set by {r.seconds:+.0f} s: nothing is launched or ended because of it; "
-        "schedules follow in a minute"
+        "schedules adjust in a minute"
     ),
     Cause.SLEPT: "this machine slept for {r.seconds:.0f} s",
     Cause.NO_PROXY_REPORT: "the client proxy has not reported yet",
     Cause.STALE_PROXY_REPORT: "the client proxy has not reported lately",
     Cause.PROXY_KEEPS_ENDING: (
-        "the client proxy {r.words}, {r.count} times in a row; its log is `{r.name}`"
+        "the client proxy {r.words}, {r.count} times in a row; see its log, `{r.name}`"
     ),
     Cause.NO_CERTIFICATE: (
         "gateway `{r.name}` has no certificate: `fogft credentials issue gateway {r.name}`"

@@ -126,7 +126,7 @@ def await_whole(story: Story, but_not: tuple[int, int] | None) -> dict[int, int]
         if len(found) >= REPLICAS and (but_not is None or found.get(but_not[0]) != but_not[1]):
             return found
         time.sleep(0.1)
-    raise DemonstrationError(f"the pool was not whole within {WHOLE_LIMIT_S:.0f} s")
+    raise DemonstrationError(f"the pool was not fully ready within {WHOLE_LIMIT_S:.0f} s")
 
 
 def note_winners(story: Story, status: dict[str, Any]) -> None:
@@ -151,7 +151,7 @@ def break_things(commands: Commands, story: Story, client: subprocess.Popen[byte
         commands.fogft("status")
         await_whole(story, (slot, generation))
         story.whole_after_s.append((f"{action} {slot}", time.monotonic() - since))
-        say(f"\nwhole again {story.whole_after_s[-1][1]:.1f} s after the {action}")
+        say(f"\nfully ready again {story.whole_after_s[-1][1]:.1f} s after the {action}")
 
 
 def with_three(pool_file: str) -> str:
@@ -206,7 +206,7 @@ def report(story: Story) -> None:
         return "-" if summary.get(key) is None else f"{summary[key] * 1000:.0f} ms"
 
     say("\nreport")
-    say(f"  requests        {summary['requests']}, one each {PERIOD_S:g} s")
+    say(f"  requests        {summary['requests']}, one every {PERIOD_S:g} s")
     say(f"  failed          {summary['failed']}")
     say(f"  wrong           {summary['wrong']}")
     say(
@@ -216,7 +216,7 @@ def report(story: Story) -> None:
     say(f"  longest gap     {milliseconds('longest_gap_s')} between two answers")
     say(f"  won by replica  {winners}")
     for fault, after_s in story.whole_after_s:
-        say(f"  {fault:<14}  whole again after {after_s:.1f} s")
+        say(f"  {fault:<14}  fully ready again after {after_s:.1f} s")
     if summary["failed"] or summary["wrong"]:
         raise DemonstrationError(
             f"{summary['failed']} requests failed, {summary['wrong']} answers were wrong"
@@ -257,7 +257,7 @@ def main() -> int:
     try:
         fcntl.flock(alone, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        print("error: the quick start runs already in this folder", file=sys.stderr)
+        print("error: the quick start is already running in this folder", file=sys.stderr)
         return 1
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, interrupt)

@@ -39,7 +39,7 @@ def test_every_cause_has_words(cause: Cause) -> None:
                 replica="1.2",
                 because=(Reason(Cause.SILENT, seconds=8.2), Reason(Cause.FAILED_LONGEST_AGO)),
             ),
-            "replaces 1.2: silent for 8 s; all locations are backing off, this one longest",
+            "replaces 1.2: silent for 8 s; all locations are backing off, this one the longest",
         ),
         (
             Reason(

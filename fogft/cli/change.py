@@ -109,7 +109,7 @@ def include(
 
 
 def retry(pool: PoolOption = None) -> None:
-    """Launch replicas again after a pool file was given up."""
+    """Launch replicas again after fogft gave up on a pool file."""
     from fogft.model import intent
     from fogft.pool.commands.change import change
 

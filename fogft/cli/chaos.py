@@ -44,7 +44,7 @@ def preempt(
     ] = None,
     pool: PoolOption = None,
 ) -> None:
-    """Preempt a replica's machine as a spot market does: a notice, then termination."""
+    """Preempt a replica's machine as a spot market would: a notice, then termination."""
     machine = _machine(pool, slot)
     left_s = _chaos().preempt(machine, notice)
     output.done(
@@ -86,7 +86,8 @@ def slow(
         float, typer.Argument(min=0, metavar="MS", help="Milliseconds added each way.")
     ],
     rate: Annotated[
-        float | None, typer.Option(min=0.001, metavar="MBPS", help="Megabits per second.")
+        float | None,
+        typer.Option(min=0.001, metavar="MBPS", help="Bandwidth limit in megabits per second."),
     ] = None,
     lasting: Duration = None,
     pool: PoolOption = None,

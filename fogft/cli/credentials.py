@@ -180,7 +180,7 @@ def rotate(
 
 def join(
     bundle: Annotated[
-        Path, typer.Argument(metavar="BUNDLE", help="From `fogft credentials issue`.")
+        Path, typer.Argument(metavar="BUNDLE", help="File from `fogft credentials issue`.")
     ],
     passphrase_file: PassphraseFile = None,
 ) -> None:
@@ -220,8 +220,8 @@ def export(
 ) -> None:
     """Write a sealed file that moves a pool to another machine.
 
-    This machine stops managing it; `fogft import` resumes that, here or there. Replicas and this
-    machine's client proxy continue to answer.
+    This machine stops managing it; `fogft import` takes it over, here or elsewhere. Replicas and
+    this machine's client proxy keep answering.
     """
     from fogft.pool.commands import moving
     from fogft.pool.folder.paths import home
@@ -239,7 +239,7 @@ def export(
     output.done(f"`{pool}` is exported; this machine no longer manages it")
     if identity.cloud != composition.LOCAL:
         output.warn(
-            "the file does not contain SkyPilot's own state: use the same API server there, or "
+            "the file does not include SkyPilot's own state: use the same API server there, or "
             "copy `~/.sky` and `~/.ssh/sky-key*` before the import"
         )
     output.hint(f"run `fogft import {file.name}` on the other machine within {hours:g} hours, then "
@@ -247,7 +247,7 @@ def export(
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="From `fogft export`.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="File from `fogft export`.")],
     *,
     pool_file: Annotated[
         Path | None,
@@ -258,7 +258,7 @@ def import_(
     """Take over a pool that another machine exported.
 
     Starts its manager here, and deletes the file. If copies are imported on several machines, all
-    but one step back once a replica tells them, within a minute.
+    but one stop once a replica tells them, within a minute.
     """
     from fogft.pool.commands import moving, startup
     from fogft.pool.folder.paths import home
@@ -273,9 +273,9 @@ def import_(
 
 def _alone(holder: Holder) -> str:
     return (
-        f"the pool has no rendezvous: {holder.role.value} `{holder.short}` knows the replicas that "
-        "there were when its bundle was made, and hears of none that come or move later; nor can "
-        "anybody tell whether a copy of the bundle is used on another machine"
+        f"the pool has no rendezvous: {holder.role.value} `{holder.short}` knows only the replicas "
+        "that existed when its bundle was made, and nobody can tell whether a copy of the bundle "
+        "is used on another machine"
     )
 
 

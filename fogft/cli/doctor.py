@@ -26,7 +26,7 @@ def doctor(
 ) -> None:
     """Check this machine, ROS 2 and the pools, and suggest fixes.
 
-    Each finding comes with its remedy. Changes nothing. Exit status 1 when something does not work.
+    Each finding comes with its remedy. Changes nothing. Exits with 1 if a check fails.
     """
     from fogft.doctor import checks
     from fogft.doctor.finding import Verdict

@@ -64,7 +64,7 @@ def up(
         typer.Option(
             min=1,
             metavar="S",
-            help="Seconds to wait for the services; 300, or 1800 on real clouds.",
+            help="Seconds to wait for the services; by default 300, or 1800 on real clouds.",
         ),
     ] = None,
 ) -> None:
@@ -203,7 +203,7 @@ def down(
 ) -> None:
     """Shut down a pool: its replicas, client proxy and manager.
 
-    Works even if the manager is dead, and is safe to repeat. If the pool was exported, ends only
+    Works even if the manager is dead, and is safe to repeat. For an exported pool, stops only
     what this machine still runs.
     """
     from fogft.pool.manager import shutdown
@@ -228,7 +228,9 @@ def down(
     if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
         told(f"{len(swept)} shared-memory files of dead processes")
     if elsewhere:
-        output.done(f"nothing of `{store.name}` remains on this machine; another one manages it")
+        output.done(
+            f"nothing of `{store.name}` remains on this machine; another machine manages it"
+        )
         return
     output.done(f"`{store.name}` is shut down; nothing is left")
     if paid and not composition.pools():

@@ -86,7 +86,7 @@ Cloud = Annotated[
     str | None,
     typer.Option(metavar="NAME", help="Cloud; by default the one in the file, else `local`."),
 ]
-Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip the confirmation, if there is any.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip confirmation.")]
 Plot = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Plot to a PNG, SVG or PDF file as well.")
 ]

@@ -132,7 +132,7 @@ def manager(
 def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
     """Run a rendezvous, where robots and replicas find each other.
 
-    Needs a port that everybody can reach, and carries no requests. Run two, on two machines.
+    Needs a port that every member can reach, and carries no requests. Run two, on two machines.
     """
     from fogft.pool.commands.rendezvous import read_config, run
 
@@ -142,7 +142,7 @@ def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -
 def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
     """Run a gateway: robots ask it once, and it asks the replicas.
 
-    Run it where the network is wide: on a machine of its own, or on a replica's.
+    Run it where bandwidth is ample: on its own machine, or on a replica's.
     """
     from fogft.proxy.gateway import process
 
@@ -157,17 +157,19 @@ System = Annotated[
 Gateway = Annotated[
     Path | None,
     typer.Option(
-        "--gateway", metavar="FILE", help="Install a gateway with this configuration instead."
+        "--gateway", metavar="FILE", help="Units of a gateway with this configuration instead."
     ),
 ]
 Rendezvous = Annotated[
     Path | None,
     typer.Option(
-        "--rendezvous", metavar="FILE", help="Install a rendezvous with this configuration instead."
+        "--rendezvous",
+        metavar="FILE",
+        help="Units of a rendezvous with this configuration instead.",
     ),
 ]
 
-service = group("Have systemd start what a pool needs at boot, and restart it.")
+service = group("Let systemd start a pool's processes at boot, and restart them.")
 
 
 def _units(
@@ -209,7 +211,7 @@ def install(
         return
     if paths is not None:
         units.hand_over(where, paths, wanted)
-    output.done("systemd starts them at boot, and restarts what dies")
+    output.done("systemd starts them at boot, and restarts any that die")
     if not system:
         output.hint("`loginctl enable-linger` starts them before you log in")
 

@@ -19,7 +19,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         typer.Option(metavar="CSV", help="Take prices from a CSV file in SkyPilot's format."),
     ] = None,
     offline: Annotated[
-        bool, typer.Option("--offline", help="Use known round trips; measure none.")
+        bool, typer.Option("--offline", help="Use known round trips; do not measure.")
     ] = False,
     everything: Annotated[
         bool, typer.Option("--all", help="Show every offer, not just the best of each region.")
@@ -57,7 +57,7 @@ def bake(
     ] = None,
     push: Annotated[bool, typer.Option("--push", help="Also push it to its registry.")] = False,
 ) -> None:
-    """Build a Docker image with a pool's set-up already done.
+    """Build a Docker image with a pool's setup already done.
 
     Replicas that start from it are ready sooner: they use what fits and set up the rest.
     """

@@ -150,7 +150,7 @@ def _summary(shown: PlanShown) -> list[str]:
         out.append(f"  ${extras:.3f}/h of it for disks and addresses")
     if shown.ready_p90_s is not None:
         out.append(
-            f"ready         within {shown.ready_p90_s:.0f} s of being ordered (p90 of "
+            f"ready         within {shown.ready_p90_s:.0f} s of the order (p90 of "
             f"{shown.launches} "
             "launches; used as the recovery below)"
         )
@@ -202,7 +202,7 @@ def _verdict(shown: PlanShown) -> list[str]:
 
 def _availability(shown: PlanShown) -> list[str]:
     plan, assumed = shown.explanation, shown.explanation.assumed
-    target = "" if plan.target is None else f", {plan.target:.6g} is asked for"
+    target = "" if plan.target is None else f", target {plan.target:.6g}"
     levels, least = assumed.correlation, plan.expected
     return [
         f"availability  {least.correlated:.6f} expected{target} "

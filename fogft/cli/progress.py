@@ -80,8 +80,8 @@ def _no_room(spec: PoolSpec) -> str:
     else:
         why = f"${spec.max_usd_per_hour:g}/h (`max_usd_per_hour`) leaves no room for both"
     if spec.replicas == 1:
-        return f"{why}, and the only replica is never ended first: it is not updated"
-    return f"{why}: one replica fewer serves in the meantime"
+        return f"{why}, and the only replica is never ended first, so it is not updated"
+    return f"{why}: one fewer replica serves in the meantime"
 
 
 def _show_launches(preview: Preview) -> None:

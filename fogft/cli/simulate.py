@@ -54,7 +54,7 @@ def simulate(
     plot: Plot = None,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate a pool in spot markets, next to fixed policies.
+    """Simulate a pool and fixed policies in spot markets.
 
     Runs the real planner, and launches nothing. The same seeds give the same results.
     """

@@ -36,7 +36,7 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
     ] = False,
     watch: Annotated[bool, typer.Option("--watch", "-w", help="Update every second.")] = False,
     refresh: Annotated[
-        bool, typer.Option("--refresh", "-r", help="Have the manager look at the cloud first.")
+        bool, typer.Option("--refresh", "-r", help="Have the manager query the cloud first.")
     ] = False,
     check: Annotated[
         bool,
@@ -52,7 +52,7 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
 ) -> None:
     """Show a pool: its replicas, links, and request counters.
 
-    What is not known at the moment is shown as `?`. FIRST counts requests that a replica answered
+    Unknown values are shown as `?`. FIRST counts requests that a replica answered
     first, LATE answers that came after another's, WAITING requests without an answer yet. Slots
     from 100 on stand in for spot machines, those from 2000 on were started by hand. Counters start
     at 0 with each client proxy.
@@ -114,8 +114,8 @@ def _remark(seen: Seen, folder: Path) -> None:
             f"start one with `fogft up {seen.status.file}`, or shut the pool down with `fogft down`"
         )
     elif why := disk.unwritable(folder):
-        output.warn(f"the disk of `{folder}` is {why}: what is shown is old, nothing is launched")
-        output.hint("requests continue, and the manager as soon as there is room")
+        output.warn(f"the disk of `{folder}` is {why}: this output is old, and nothing is launched")
+        output.hint("requests continue; the manager resumes once there is space")
     elif seen.status.manager_version not in ("", __version__):
         output.warn(
             f"the pool runs fogft {seen.status.manager_version}, this command is {__version__}"
@@ -123,7 +123,7 @@ def _remark(seen: Seen, folder: Path) -> None:
         output.hint(f"`fogft up {seen.status.file}` upgrades it while it serves")
     elif seen.age_s is not None and seen.stale:
         output.warn(f"the manager has not observed the pool for {seen.age_s:.0f} s")
-        output.hint("see `fogft logs`, and `fogft doctor`")
+        output.hint("see `fogft logs` and `fogft doctor`")
 
 
 def logs(

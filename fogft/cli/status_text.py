@@ -130,7 +130,7 @@ def notes(status: PoolStatus) -> list[Text]:
         needed = row.counters.get("needed_replicas")
         if needed:
             found.append(
-                f"`{row.name}`: load exceeds the capacity of its replicas; {needed} would do"
+                f"`{row.name}`: load exceeds the capacity of its replicas; {needed} would suffice"
             )
         poison = row.counters.get("poison")
         if poison:

@@ -66,5 +66,5 @@ def run(checks: Iterable[Check], situation: Situation) -> Iterator[Finding]:
             yield fail(
                 name,
                 f"the check itself failed: {type(error).__name__}: {error}",
-                "report this as a defect of `fogft doctor`",
+                "report this as a bug in `fogft doctor`",
             )

@@ -73,8 +73,8 @@ def shared_memory(_: Situation) -> Iterator[Finding]:
     usage = shutil.disk_usage(_SHARED_MEMORY)
     text = f"{_megabytes(usage.free)} of {_megabytes(usage.total)} free in /dev/shm"
     if usage.free < 1 << 20:
-        left = "`fogft down` removes what killed ROS processes left there"
-        yield fail("shared memory", f"{text}: ROS nodes may end with SIGBUS", f"{left}; {advice}")
+        left = "`fogft down` removes leftovers of killed ROS processes"
+        yield fail("shared memory", f"{text}: ROS nodes may die with SIGBUS", f"{left}; {advice}")
     elif usage.free < _SHARED_MEMORY_WANTED_BYTES:
         yield warn("shared memory", f"only {text}; large messages will be slow", advice)
     else:

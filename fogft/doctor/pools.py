@@ -42,16 +42,16 @@ def orphaned_processes(situation: Situation) -> Iterator[Finding]:
         return
     yield warn(
         "leftovers",
-        f"{len(orphans)} processes of replicas run whose pool is not in `{situation.home}`",
-        "they belong to a pool in another state folder: set FOGFT_HOME to it, and `fogft down` "
-        "ends the pool. If the folder is lost, they end after `unmanaged_max_hours`",
+        f"{len(orphans)} replica processes belong to no pool in `{situation.home}`",
+        "their pool is in another state folder: set FOGFT_HOME to it and run `fogft down`. "
+        "If that folder is lost, they exit after `unmanaged_max_hours`",
     )
 
 
 def chaos(situation: Situation) -> Iterator[Finding]:
     """No faults injected by `fogft chaos` are active."""
     broken = faults.read_cloud(situation.home / "local")
-    found = [f"`{place}` is out" for place in broken.out(situation.now)]
+    found = [f"outage in `{place}`" for place in broken.out(situation.now)]
     found += [
         f"`{place}` has room for {n} machines" for place, n in sorted(broken.capacity.items())
     ]
@@ -59,7 +59,7 @@ def chaos(situation: Situation) -> Iterator[Finding]:
         yield warn(
             "leftovers",
             f"faults of `fogft chaos` are still active, for every pool: {', '.join(found)}",
-            "undo it with `fogft chaos clear`",
+            "clear them with `fogft chaos clear`",
         )
 
 
@@ -152,7 +152,7 @@ def processes(situation: Situation) -> Iterator[Finding]:
         yield from judge_traffic(pool, seen)
         folder = PoolPaths.of(pool, situation.home).folder
         if why := disk.unwritable(folder):
-            remedy = "change that: the manager launches nothing before, and goes on by itself then"
+            remedy = "fix that: until then the manager launches nothing; it resumes by itself"
             yield fail("disk", f"pool `{pool}`: the disk of `{folder}` is {why}", remedy)
         else:  # or its links' report is old for that
             yield from judge_links(pool, seen)
@@ -174,7 +174,7 @@ def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
         remedy = f"the manager restarts it; see `{log}`" if seen.manager_alive else up
         yield fail("client proxy", f"pool `{pool}` has none: no request is answered", remedy)
     if seen.answers:
-        yield ok("answers", f"pool `{pool}`: each service has a ready replica")
+        yield ok("answers", f"pool `{pool}`: every service has a ready replica")
     elif seen.answers is None and not seen.links_known:
         yield warn("answers", f"pool `{pool}`: unknown", "see `links` and `client proxy`")
     elif seen.answers is False and proxy and seen.status.target:
@@ -205,11 +205,11 @@ def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
         return
     if not seen.links_known:
         age_s, pid = seen.report_age_s, status.proxy_pid
-        said = "has not written a readable report" if pid is None else f"last did {age_s:.0f} s ago"
+        said = "has written no readable report" if pid is None else f"last did {age_s:.0f} s ago"
         yield fail(
             "links",
-            f"pool `{pool}`: its client proxy reports twice a second, and {said}",
-            f"it hangs or is stopped; end process {pid}: the manager, or {_UP}, starts another"
+            f"pool `{pool}`: its client proxy should report twice a second, but {said}",
+            f"it hangs or is stopped; kill process {pid}: the manager, or {_UP}, starts another"
             if pid
             else f"see `{PoolPaths.of(pool).proxy_log}`",
         )

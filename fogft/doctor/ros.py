@@ -59,10 +59,10 @@ def rclpy(_: Situation) -> Iterator[Finding]:
 def judge_middleware(rmw: str) -> Finding:
     """Report which middleware is in use, and how well it is tested with fogft."""
     if rmw == _RMW_WITH_PROFILE:
-        return ok("middleware", f"{rmw}: fogft's measurements were made with it")
+        return ok("middleware", f"{rmw}: the one that fogft is measured with")
     return warn(
         "middleware",
-        f"{rmw}: {_KNOWN.get(rmw, 'not tried with fogft')}",
+        f"{rmw}: {_KNOWN.get(rmw, 'not tested with fogft')}",
         f"set the same RMW_IMPLEMENTATION for your nodes, or {_RMW_WITH_PROFILE} for all",
     )
 
@@ -100,13 +100,13 @@ def judge_domain(environ: Mapping[str, str]) -> Iterator[Finding]:
         yield fail(
             "discovery range",
             "ROS_AUTOMATIC_DISCOVERY_RANGE is `OFF` and there are no ROS_STATIC_PEERS: "
-            "no node finds any other",
+            "nodes cannot discover each other",
             "set it to LOCALHOST",
         )
     elif environ.get("ROS_LOCALHOST_ONLY"):
         yield warn(
             "discovery range",
-            "ROS_LOCALHOST_ONLY is set; newer ROS versions drop it",
+            "ROS_LOCALHOST_ONLY is set; newer ROS versions ignore it",
             "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST instead",
         )
     else:
@@ -150,9 +150,9 @@ def judge_segment(segment_bytes: int, variable: str, ours: str) -> Finding:
                 "your nodes use none: messages over 0.5 MB take ten times as long",
                 f"export {variable}={ours} where your nodes start, as fogft's processes do",
             )
-        return ok("Fast DDS profile", f"yours: a segment of {segment_bytes / 1e6:.0f} MB is mapped")
+        return ok("Fast DDS profile", f"yours maps a segment of {segment_bytes / 1e6:.0f} MB")
     if not segment_bytes:
-        return ok("Fast DDS profile", "not used: your nodes map no shared memory of Fast DDS")
+        return ok("Fast DDS profile", "not used: your nodes map no Fast DDS shared memory")
     return warn(
         "Fast DDS profile",
         f"a node maps only {segment_bytes / 1e6:.1f} MB of shared memory: messages over 0.5 MB "

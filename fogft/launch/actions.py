@@ -37,7 +37,7 @@ _NOT_CARRIED = {
     "prefix": "a debugger or wrapper runs on the replica; put it into the pool file's `run`",
     "env": "a replica has its own environment; use `additional_env` to add to it",
     "cwd": "a replica works in the pool file's `workdir`",
-    "on_exit": "a replica starts its nodes again by itself",
+    "on_exit": "a replica restarts its own nodes",
     "shell": "write the pool file's `run` instead",
     "log_cmd": "`fogft logs` shows the commands of replicas",
 }

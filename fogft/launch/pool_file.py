@@ -103,7 +103,7 @@ def pool_tree(
     """
     if base.get("run"):
         raise FogftError(
-            "the pool file of a fog pool has a `run` of its own",
+            "the pool file of a fog pool has its own `run`",
             "remove it: replicas run the cloud nodes of the launch file",
         )
     tree = {**base, **task, "run": run}

@@ -20,10 +20,13 @@ _COUNTS = {
     "request_bytes": ("fogft_request_bytes_total", "Bytes of all requests that callers sent."),
     "response_bytes": ("fogft_response_bytes_total", "Bytes of the first responses."),
     "rejected": ("fogft_rejected_responses_total", "Responses whose ok_field was false."),
-    "undelivered": ("fogft_undelivered_responses_total", "Responses that ROS did not take."),
+    "undelivered": ("fogft_undelivered_responses_total", "Responses that ROS did not accept."),
     "fallback_failed": ("fogft_fallback_failures_total", "Fallback calls without a response."),
 }
-LEASE = ("fogft_replica_lease_seconds", "Time until a replica that hears of no manager ends.")
+LEASE = (
+    "fogft_replica_lease_seconds",
+    "Time until a replica shuts down if it hears from no manager.",
+)
 _LINK_GAUGES = {
     "silent_for_s": ("fogft_link_silent_seconds", "Time since the oldest unanswered probe."),
     "rtt_s": ("fogft_link_round_trip_seconds", "Round trip of the last probe."),
@@ -31,7 +34,10 @@ _LINK_GAUGES = {
     "lease_left_s": LEASE,
 }
 _LINK_COUNTS = {
-    "reopened": ("fogft_link_reconnects_total", "Connections to a replica that were opened again."),
+    "reopened": (
+        "fogft_link_reconnects_total",
+        "Times that the connection to a replica was reopened.",
+    ),
     "restarts": ("fogft_replica_restarts_total", "Restarts of a replica's command."),
 }
 _WORK_GAUGES = {"held": ("fogft_requests_held", "Requests held and not yet answered.")}
@@ -40,12 +46,12 @@ _WORK_COUNTS = {
     "ran_s": ("fogft_request_run_seconds_total", "Time that services spent on requests."),
     "saved": (
         "fogft_requests_saved_total",
-        "Requests dropped before they began: answered elsewhere.",
+        "Requests dropped before they ran, as already answered elsewhere.",
     ),
     "interrupted": ("fogft_requests_interrupted_total", "Running requests that were cancelled."),
     "wasted": (
         "fogft_requests_wasted_total",
-        "Requests run to the end although answered elsewhere.",
+        "Requests completed although already answered elsewhere.",
     ),
     "wasted_s": ("fogft_request_wasted_seconds_total", "Time spent on those requests."),
 }
@@ -71,7 +77,7 @@ def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
     )
     yield counter(
         "fogft_topic_messages_total",
-        "Messages of topics, and what became of them.",
+        "Messages of topics, by outcome.",
         (
             (count, {"topic": topic, "event": event})
             for topic, counts in report.get("topics", {}).items()

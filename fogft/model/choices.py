@@ -123,23 +123,23 @@ class Assumption:
 
     spot_uptime_s: float = key(
         Number(1e9, "seconds"),
-        "Mean time from ready to preempted of a spot machine; FogROS2-FT's 15 h.",
+        "Mean time until a ready spot machine is preempted; 15 h as in FogROS2-FT.",
         default=54_000.0,
     )
     on_demand_uptime_s: float = key(
         Number(1e9, "seconds"),
-        "Mean time from ready to failed of an on-demand machine.",
+        "Mean time until a ready on-demand machine fails.",
         default=12_000_000.0,
     )
     recovery_s: float = key(
         Number(DAY_S, "seconds"),
-        "Time from the loss of a replica to a ready replacement; FogROS2-FT's 20 min.",
+        "Time from the loss of a replica to a ready replacement; 20 min as in FogROS2-FT.",
         default=1200.0,
     )
     no_room: float = key(
         Number(1.0, "one", from_zero=True),
         "Fraction of time that a location has no spot capacity; while no location has any, lost "
-        "spot replicas are not replaced.",
+        "spot replicas cannot be replaced.",
         default=0.0625,
     )
     correlation: Correlation = field(default_factory=Correlation)
@@ -167,7 +167,7 @@ class MetricsSpec:
 
     proxy: str = key(
         _metrics(9464),
-        "The client proxy of the robot that ran `fogft up`; another robot's is set in its own "
+        "The client proxy of the robot that ran `fogft up`; other robots set theirs in "
         "`proxy.yaml`.",
         default="",
         usual="off",
@@ -176,7 +176,7 @@ class MetricsSpec:
     replica: str = key(
         _metrics(9466),
         "The server proxies: replica `SLOT` listens on this port plus `SLOT`. Applies to replicas "
-        "launched from then on.",
+        "launched after a change.",
         default="",
         usual="off",
     )
@@ -198,8 +198,8 @@ class OnDemandSpec:
     )
     fallback: bool = key(
         Flag(),
-        "Use on-demand machines while too few spot machines are ready; the search for spot "
-        "continues. Within `max_usd_per_hour` and `max_surge`.",
+        "Use on-demand machines while too few spot machines are ready; fogft keeps looking for "
+        "spot. Within `max_usd_per_hour` and `max_surge`.",
         default=False,
     )
 
@@ -223,11 +223,13 @@ class GroupSpec:
     )
     resources: Mapping[str, Any] = key(
         Free("write resources as at the top level"),
-        "Merged over the file's own `resources`, key by key.",
+        "Merged into the file's `resources`, overriding them key by key.",
         default_factory=dict,
     )
     on_demand: OnDemandSpec = key(
-        Map(OnDemandSpec), "Like the pool's key, for this group.", default_factory=OnDemandSpec
+        Map(OnDemandSpec),
+        "Like the pool's `on_demand`, for this group.",
+        default_factory=OnDemandSpec,
     )
 
 
@@ -281,7 +283,7 @@ class WindowSpec:
     )
     begins_s: int = key(
         _CLOCK_FORM,
-        "Start, in local time: windows follow daylight-saving time.",
+        "Start, in local time, following daylight-saving time.",
         name="from",
         default=0,
         usual="0:00",
@@ -301,8 +303,8 @@ class WindowSpec:
     )
     max_usd_per_hour: float | None = key(
         Number(MAX_USD_PER_HOUR, "US dollars per hour"),
-        "Cap within the window. Replicas that do not fit under a lower cap are ended, the most "
-        "expensive first; one stays.",
+        "Cap within the window. Replicas that exceed a lower cap are ended, the most expensive "
+        "first; one stays.",
         default=None,
         usual="the pool's",
     )
@@ -318,7 +320,7 @@ class ScheduleSpec:
     )
     windows: tuple[WindowSpec, ...] = key(
         Maps(WindowSpec, "write `windows: [{days: mon-fri, from: 8:00, ...}]`"),
-        "The first window that matches applies; outside all windows, the pool's own numbers.",
+        "The first window that matches applies; outside all windows, the pool's own numbers apply.",
     )
     prelaunch_s: float = 600.0
 
@@ -355,7 +357,7 @@ class PlacementSpec:
 
     latency_weight: float = key(
         Number(100, "times", from_zero=True),
-        "Weight of one percent of round trip against one percent of price; 0 ignores distance.",
+        "Weight of one percent of round trip relative to one percent of price; 0 ignores distance.",
         default=1.0,
     )
     robot_at: tuple[float, float] | None = key(
@@ -364,7 +366,7 @@ class PlacementSpec:
             _robot_at,
             {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2},
         ),
-        "Where the robot is, in degrees: distances are estimated where they cannot be measured.",
+        "Where the robot is, in degrees, to estimate distances that cannot be measured.",
         default=None,
         usual="unknown",
     )
@@ -389,7 +391,7 @@ class TrafficSpec:
     """Load on one service, for cost estimates. Zero if not given."""
 
     requests_per_s: float = key(
-        Number(1e6, "requests", from_zero=True), "Mean over the whole month.", default=0.0
+        Number(1e6, "requests", from_zero=True), "Mean over a month.", default=0.0
     )
     request_bytes: float = key(
         Number(1e10, "bytes", from_zero=True),
@@ -418,14 +420,14 @@ class FallbackSpec:
     after_s: float | None = key(
         Number(DAY_S, "seconds"),
         "Call it this long after the request arrived, in parallel with the replicas: the first "
-        "answer wins. Below `timeout_s`.",
+        "answer wins. Must be below `timeout_s`.",
         default=None,
         usual="at the deadline",
     )
     while_none_ready: bool = key(
         Flag(),
-        "Call it at once while no replica is ready. The service is then offered on the robot "
-        "from the start.",
+        "Call it at once while no replica is ready. The robot then sees the service from the "
+        "start.",
         default=False,
     )
     limit_s: float = 1.0

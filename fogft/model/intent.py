@@ -76,7 +76,7 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
             f"cannot scale `{spec.name}` to {wanted} replicas: the {limit}",
             "`fogft down` ends a pool"
             if least == 1
-            else "a service has that `quorum`: change it in the pool file and run `fogft up`",
+            else "a service needs that `quorum`: change it in the pool file and run `fogft up`",
         )
     if wanted == spec.replicas:
         return replace(intent, target=None, scaled_from=None)

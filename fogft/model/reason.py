@@ -62,7 +62,7 @@ class Cause(str, Enum):
     STANDS_IN = "stands_in"  # on demand, until enough spot machines are ready
     FAILED_LONGEST_AGO = "failed_longest_ago"
 
-    # Why nothing is bought, or not this offer.
+    # Why nothing is launched, or this offer is not used.
     NOTHING_OFFERED = "nothing_offered"
     IMPOSSIBLE_PRICE = "impossible_price"
     LOCATION_FULL = "location_full"  # it would hold too many of the replicas

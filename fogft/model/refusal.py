@@ -35,7 +35,7 @@ class Refusal(str, Enum):
         kind.effect = effect
         return kind
 
-    # The service is not there
+    # The service is not available
     NOT_READY = "not-ready", Effect.BLAMELESS | Effect.GOALS_LOST
     # The replica's own window is full
     OVERLOADED = "overloaded", Effect.BLAMELESS
@@ -53,7 +53,7 @@ class Refusal(str, Enum):
     REVOKED = "revoked", Effect.BLAMELESS
     # The sender's certificate has expired by the replica's clock
     EXPIRED_CERTIFICATE = "expired-certificate"
-    # Dropped, because another replica answered first
+    # Dropped because another replica answered first
     CANCELLED = "cancelled"
     # It was run, but another replica answered first
     LATE = "late"
@@ -61,22 +61,22 @@ class Refusal(str, Enum):
     BUSY = "busy", Effect.BLAMELESS
 
     # Of a stateful service; the last three have a detail
-    # It obeys this term, and has not been brought to its state
+    # It follows this term, but does not have the state yet
     NOT_JOINED = "not-joined"
-    # Another number is expected next: decimal
+    # Another number is expected next (in decimal)
     GAP = "gap"
-    # A later term is obeyed: hexadecimal
+    # It follows a later term (in hexadecimal)
     FENCED = "fenced"
-    # Another robot is obeyed: its name
+    # It follows another robot (by name)
     HELD = "held"
 
-    # Made on the robot: a newer request took its place before it was sent
+    # On the robot: a newer request replaced it before it was sent
     SUPERSEDED = "superseded", Effect.BLAMELESS
     # It would not arrive in time over this link
     TOO_SLOW = "too-slow", Effect.BLAMELESS | Effect.OTHER_UPLINK
     # The link died before an answer came
     LOST = "lost", Effect.BLAMELESS | Effect.OTHER_UPLINK | Effect.GOALS_LOST
-    # A kind that this version does not know; the detail is what was said
+    # Unknown to this version; the detail has the original text
     UNKNOWN = "unknown"
 
     def __str__(self) -> str:

@@ -101,8 +101,8 @@ class ServiceSpec:
         service_type(
             "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`", has_parts=True
         ),
-        "Its type. It must be installed on the robot; with `rmw: zenoh` only where a policy looks "
-        "into responses.",
+        "Type of the service. Must be installed on the robot; with `rmw: zenoh`, only if a policy "
+        "reads responses.",
     )
     timeout_s: float = key(
         Number(DAY_S, "seconds"),
@@ -112,15 +112,16 @@ class ServiceSpec:
     )
     on_timeout: OnTimeout = key(
         OneOf(OnTimeout),
-        "What the caller gets at the deadline: no response (`silent`; an empty list of obstacles "
-        "is never mistaken for a clear road), a default-constructed one (`empty`), or that of a "
-        "service on the robot (`fallback`).",
+        "What the caller gets at the deadline: no response (`silent`, so that no empty list of "
+        "obstacles is mistaken for a clear road), a default-constructed one (`empty`), or that of "
+        "a service on the robot (`fallback`).",
         default=OnTimeout.SILENT,
         parameter=True,
     )
     ok_field: str = key(
         Text("the name of a field", "name a boolean field, such as `success`", only(is_field_name)),
-        "Boolean field of the response. While it is false, another replica's response is awaited.",
+        "Boolean field of the response; while it is false, fogft waits for another replica's "
+        "response.",
         default="",
         parameter=True,
     )
@@ -133,7 +134,7 @@ class ServiceSpec:
     )
     traffic: TrafficSpec = key(
         Map(TrafficSpec, "write `{requests_per_s: 10, request_bytes: 100000}`"),
-        "Load on the service, for the costs that `fogft plan` shows; measured where it is not set.",
+        "Load on the service, for the costs that `fogft plan` shows; measured if not set.",
         default_factory=TrafficSpec,
     )
     concurrency: int = key(
@@ -144,8 +145,8 @@ class ServiceSpec:
     )
     cancel: str = key(
         service_name("write a service's name, such as `cancel: /detect_cancel`"),
-        "Service (`std_srvs/srv/Trigger`) that cancels the running request, called when the "
-        "robot has an answer from another replica.",
+        "Service (`std_srvs/srv/Trigger`) that cancels the running request, called once another "
+        "replica has answered.",
         default="",
     )
     quorum: int = key(
@@ -186,7 +187,7 @@ class ServiceSpec:
     trace: bool = key(
         Flag(),
         "Write a line for each request to the client proxy's `trace.jsonl`, or export it as "
-        "OpenTelemetry spans where the environment has OTEL_EXPORTER_OTLP_ENDPOINT.",
+        "OpenTelemetry spans if the environment sets OTEL_EXPORTER_OTLP_ENDPOINT.",
         default=False,
         advanced=True,
         parameter=True,
@@ -200,7 +201,8 @@ class ServiceSpec:
     )
     compression: Compression = key(
         OneOf(Compression),
-        "Compress payloads on slow links where that is measured to pay (`auto`), or never (`off`).",
+        "Compress payloads on slow links where measurements show a gain (`auto`), or never "
+        "(`off`).",
         default=Compression.AUTO,
         advanced=True,
     )
@@ -239,20 +241,20 @@ class HealthSpec:
 
     suspect_after_s: float = key(
         Number(3600, "seconds"),
-        "Mark a replica suspect after this long without a probe reply; nothing more is sent "
-        "there. A slow service does not count.",
+        "Mark a replica suspect after this long without a probe reply; it is sent nothing more. A "
+        "slow service does not count.",
         default=2.0,
     )
     replace_after_s: float = key(
         Number(DAY_S, "seconds"),
-        "Replace a replica that has been suspect for this long while others answer. The only "
-        "replica: after four times as long.",
+        "Replace a replica that has been suspect for this long while others answer. A pool's only "
+        "replica is replaced after four times as long.",
         default=15.0,
     )
     start_limit_s: float = key(
         Number(DAY_S, "seconds"),
-        "Give up on a launch that is not ready this long after its `setup`, or whose machine is "
-        "not running within that time. `setup` itself may take an hour.",
+        "Give up on a launch that is not ready this long after `setup`, or whose machine is not "
+        "running this long after the order. `setup` itself may take an hour.",
         default=900.0,
     )
 
@@ -278,17 +280,17 @@ class PoolSpec:
             ServiceSpec,
             "write a list, such as `services: [{name: /detect, type: my_msgs/srv/Detect}]`",
         ),
-        "The services that the robot calls and the replicas run. If omitted: what `run` "
-        "advertises, except the services of ROS itself.",
+        "The services that the robot calls and the replicas run. If omitted, every service that "
+        "`run` advertises, except those of ROS itself.",
         default=(),
         usual="what `run` advertises",
     )
     namespace: str = key(
         service_name(
-            "write where the services are that may be offered, such as `namespace: /planner`",
+            "write the namespace of the services to offer, such as `namespace: /planner`",
             "a namespace",
         ),
-        "If `services` is omitted: offer only services below this namespace on the robot.",
+        "If `services` is omitted, offer only services below this namespace.",
         default="",
         usual="any",
     )
@@ -298,13 +300,13 @@ class PoolSpec:
     max_surge: int = key(
         Whole(0, 4, "machines"),
         "Extra machines during a replacement. With 0, a machine that still serves is replaced "
-        "only if the file has changed, and ends before its successor starts.",
+        "only if the file changes, and ends before its successor starts.",
         default=1,
     )
     max_usd_per_hour: float | None = key(
         Number(MAX_USD_PER_HOUR, "US dollars per hour"),
-        "Cap on the price of all machines together, those being launched or ended included. "
-        "Without headroom a launch waits, and `fogft status` says so.",
+        "Cap on the price of all machines together, including those being launched or ended. A "
+        "launch that would exceed it waits, and `fogft status` says so.",
         default=None,
         usual="no cap",
     )
@@ -330,7 +332,7 @@ class PoolSpec:
     )
     on_demand: OnDemandSpec = key(
         Map(OnDemandSpec),
-        "How spot and on-demand machines are mixed; the others are then spot.",
+        "How many machines are on demand; the rest are then spot.",
         default_factory=OnDemandSpec,
     )
     spread: Spread = key(
@@ -347,7 +349,7 @@ class PoolSpec:
     )
     schedule: ScheduleSpec | None = key(
         Map(ScheduleSpec, "write `time_zone` and `windows`"),
-        "Replicas and cap by the time of the week.",
+        "Replicas and cap by time of the week.",
         default=None,
     )
     migration: MigrationSpec | None = key(
@@ -355,20 +357,19 @@ class PoolSpec:
         "`false`: never move a replica to a cheaper or nearer location.",
         default_factory=MigrationSpec,
         advanced=True,
-        usual="moves for 30 % less",
+        usual="moves if 30 % better",
     )
     rendezvous: tuple[str, ...] = key(
         Listed(endpoint("write a list, such as `rendezvous: [meet.example.org:7450]`"), 4),
-        "Where `fogft rendezvous` runs, for pools with several robots, gateways, or replicas "
-        "whose "
-        "address the cloud does not know.",
+        "Addresses of `fogft rendezvous`, for pools with several robots, gateways, or replicas "
+        "whose address the cloud does not know.",
         default=(),
     )
     dial_in: str = key(
         endpoint(
             "write the robot's own address and a port, such as `dial_in: robot.example.org:7460`"
         ),
-        "The robot's own address, for replicas that cannot be reached: they dial the robot.",
+        "The robot's own address: replicas that cannot be reached dial it.",
         default="",
     )
     link_port: int = key(
@@ -387,14 +388,14 @@ class PoolSpec:
             ),
             20,
         ),
-        "Who may connect to a replica's VM, to ssh's port too: the public addresses of the robots "
-        "and of the computer that SkyPilot's API server runs on. Enforced on AWS only.",
+        "Who may connect to a replica's VM, including its ssh port: the public addresses of the "
+        "robots and of the computer that SkyPilot's API server runs on. Enforced on AWS only.",
         default=(),
         usual="anyone",
     )
     topology: Topology = key(
         Map(Topology),
-        "Gateways, and who uses them. Needs a `rendezvous`.",
+        "Gateways, and which robots use them. Needs a `rendezvous`.",
         default_factory=Topology,
     )
     uplinks: tuple[str, ...] = key(
@@ -406,8 +407,8 @@ class PoolSpec:
             ),
             4,
         ),
-        "Network interfaces of this machine's robot to use at once, the preferred one first. "
-        "Each needs its own route to the replicas.",
+        "Network interfaces that this machine's robot uses at once, preferred first. Each needs "
+        "its own route to the replicas.",
         default=(),
         usual="by route",
     )
@@ -422,14 +423,13 @@ class PoolSpec:
             "write a list, such as "
             "`topics: [{name: /map, type: nav_msgs/msg/OccupancyGrid, from: robot}]`",
         ),
-        "Topics that pass between the robot and the replicas. Not with `topology`.",
+        "Topics to forward between the robot and the replicas. Not with `topology`.",
         default=(),
     )
     rmw: Middleware = key(
         Map(Middleware, short=("robot", "replica")),
-        "How the proxies speak ROS: `rclpy`, by the ROS 2 that is installed where they run, or "
-        "`zenoh`, as nodes of `rmw_zenoh` do, with no ROS installed. One value for both sides, "
-        "or a map.",
+        "How the proxies talk to ROS nodes: with the installed ROS 2 (`rclpy`), or as `rmw_zenoh` "
+        "nodes do, without a ROS installation (`zenoh`). One value for both sides, or a map.",
         default_factory=Middleware,
     )
     actions: tuple[ActionSpec, ...] = key(
@@ -442,15 +442,14 @@ class PoolSpec:
     )
     spare: bool = key(
         Flag(),
-        "Keep a second process of `run` on each replica, started and idle in its own ROS domain, "
-        "which takes over when the first dies. For services that start slowly; doubles their "
-        "memory.",
+        "Keep a second `run` process on each replica, idle in its own ROS domain, which takes "
+        "over when the first dies. For services that start slowly; doubles their memory.",
         default=False,
     )
     unmanaged_max_hours: float = key(
         Number(MAX_HOURS, "hours"),
         "How long replicas keep serving after they last heard from the manager. Then they shut "
-        "their machines down, at the latest when `max_hours` ends.",
+        "down their machines, no later than `max_hours`.",
         default=24.0,
     )
     task: Mapping[str, Any] = field(default_factory=dict)

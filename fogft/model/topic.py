@@ -69,17 +69,17 @@ class TopicSpec:
     )
     depth: int = key(
         Whole(1, DEPTH_LIMIT, "messages"),
-        "Messages kept for a slow subscriber, and of a latched topic for a late one.",
+        "Messages kept for slow subscribers and, if latched, for late ones.",
         default=10,
     )
     reliable: bool = key(
         Flag(),
-        "Reliability at both ends; a publisher that offers best effort only needs `false`.",
+        "Reliable at both ends; use `false` if a publisher offers only best effort.",
         default=True,
     )
     latched: bool = key(
         Flag(),
-        "Transient local at both ends: nodes and replicas that come later get the last `depth` "
+        "Transient local at both ends: nodes and replicas that join later get the last `depth` "
         "messages.",
         default=False,
     )
@@ -113,11 +113,11 @@ class ActionSpec:
     )
     timeout_s: float = key(
         Number(DAY_S, "seconds"),
-        "Time until a goal is accepted or refused, or a cancellation answered.",
+        "Time allowed to accept or reject a goal, or to answer a cancellation.",
         default=10.0,
     )
     result_timeout_s: float = key(
         Number(30 * DAY_S, "seconds"),
-        "Time until a goal has its result; then there is no answer.",
+        "Time allowed for the result of a goal; after that there is no answer.",
         default=3600.0,
     )

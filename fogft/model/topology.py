@@ -34,7 +34,7 @@ class Gateway:
     name: str = key(_NAME, "Name of the gateway, as in its certificate.")
     endpoint: str = key(
         named_endpoint("write where robots reach it, such as `endpoint: edge.example.org:7470`"),
-        "Address where robots and other gateways reach it.",
+        "Address at which robots and other gateways reach it.",
     )
     through: tuple[str, ...] = key(
         _NAMES,
@@ -51,7 +51,9 @@ class RobotRoute:
     """The gateways of one robot."""
 
     name: str = key(_NAME, "Name of the robot, as in its certificate.")
-    gateways: tuple[str, ...] = key(_NAMES, "Its gateways; `[]` for the replicas themselves.")
+    gateways: tuple[str, ...] = key(
+        _NAMES, ("Gateways of the robot; `[]` for the replicas themselves.")
+    )
 
 
 @dataclass(frozen=True)

@@ -139,10 +139,10 @@ def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
     names = [*(one.name for one in spec.services), *(one.name for one in spec.topics)]
     size = sum(map(len, names))
     if size > NAMES_BYTES_LIMIT:
-        what = f"and topics have names of {size} bytes together; {NAMES_BYTES_LIMIT} are the most"
+        what = f"and topics have names of {size} bytes in total; the limit is {NAMES_BYTES_LIMIT}"
         raise ours.error("services", what, "use shorter names, or two pools", at_key=True)
     if spec.topics and Speaks.ZENOH in (spec.rmw.robot, spec.rmw.replica):
-        what = "cannot be combined with `rmw: zenoh`, which passes only services"
+        what = "cannot be combined with `rmw: zenoh`, which supports only services"
         raise ours.error(_topics_key(ours), what, "remove one of the two")
     return spec
 
@@ -160,7 +160,7 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
     for section, group in zip(ours.sections("groups", ""), made.groups, strict=True):
         rules.on_demand(section.section("on_demand"), group.on_demand, group.replicas)
     if len(made.groups) > MAX_GROUPS:
-        raise ours.error("groups", f"are {len(made.groups)}, the maximum is {MAX_GROUPS}")
+        raise ours.error("groups", f"has {len(made.groups)} entries; the maximum is {MAX_GROUPS}")
     total = sum(group.replicas for group in made.groups)
     if total > MAX_REPLICAS:
         raise ours.error("groups", f"ask for {total} replicas; the maximum is {MAX_REPLICAS}")
@@ -181,11 +181,11 @@ def _check_topology(ours: Section, services: tuple[ServiceSpec, ...], spec: Pool
     if not spec.rendezvous:
         raise ours.error(
             "topology",
-            "needs a `rendezvous`: gateways learn there where replicas are",
+            "needs a `rendezvous`, through which gateways find replicas",
             "add one, such as `rendezvous: [meet.example.org:7450]`",
         )
     if spec.topics:
-        what = "cannot be combined with `topology`: gateways pass only services"
+        what = "cannot be combined with `topology`: gateways support only services"
         raise ours.error(_topics_key(ours), what, "remove one of the two")
 
 

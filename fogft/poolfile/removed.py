@@ -22,11 +22,14 @@ Hint = tuple[str, str]  # what is to be said of a key, and what to do
 _AUTOSCALE = {
     "autoscale": (
         "is not supported yet",
-        "remove it: `fogft scale` or `schedule` say how many replicas there are",
+        "remove it: set the number of replicas with `fogft scale` or `schedule`",
     )
 }
 _DEFAULT_IS_RIGHT = "is no longer a key", "remove it: the default is right"
-_OWN_POOL = "is not a key of a service", "put this service into its own pool, with that many"
+_OWN_POOL = (
+    "is not a key of a service",
+    "put this service into its own pool, with that many replicas",
+)
 
 
 def _renamed(name: str, instead: str = "") -> Hint:
@@ -56,7 +59,7 @@ _HINTS: dict[type, dict[str, Hint]] = {
     StateSpec: {
         "shared": (
             "is no longer a key: a service with `state` is for one robot",
-            "for several robots remove `state` and let the service keep its state in a replicated "
+            "for several robots, remove `state` and keep the service's state in a replicated "
             "store, such as etcd; docs/how-to/state.md shows how",
         )
     },
@@ -67,7 +70,7 @@ _HINTS: dict[type, dict[str, Hint]] = {
 
 
 _VALUES: dict[tuple[type, str], str] = {
-    (HedgingMode, "adaptive"): "is now called `auto`, and is the default; write that"
+    (HedgingMode, "adaptive"): "is now called `auto`, which is the default"
 }
 
 

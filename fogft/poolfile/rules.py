@@ -40,7 +40,7 @@ def service(section: Section, made: ServiceSpec) -> ServiceSpec:
     if made.concurrency > 1 and made.cancel:
         raise section.error(
             "concurrency",
-            "must be 1 with a `cancel` service, which cannot name a request",
+            "must be 1 with a `cancel` service, which cannot tell requests apart",
             "remove one of the two",
         )
     _fallback(section, made)
@@ -59,7 +59,9 @@ def _stateful(section: Section, made: ServiceSpec) -> None:
             what = f"cannot be `{value}` for a service with `state`: its requests are kept in order"
             raise section.error(key, what, "remove it")
     if made.on_timeout is OnTimeout.FALLBACK:
-        what = "cannot be `fallback` for a service with `state`: the fallback does not have it"
+        what = (
+            "cannot be `fallback` for a service with `state`: the fallback does not have that state"
+        )
         raise section.error("on_timeout", what, "write `silent` or `empty`")
 
 
@@ -169,7 +171,7 @@ def window(section: Section, made: WindowSpec) -> WindowSpec:
 def on_demand(section: Section, made: OnDemandSpec, replicas: int) -> None:
     """Check `on_demand` against the number of replicas."""
     if made.base > replicas:
-        what = f"must not be above the {replicas} replicas that there are, and is {made.base}"
+        what = f"is {made.base}, but there are only {replicas} replicas"
         raise section.error("base", what, "write fewer, or ask for more replicas")
 
 
@@ -184,7 +186,7 @@ def topology(section: Section, made: Topology) -> Topology:
     for one, gateway in zip(below, made.gateways, strict=True):
         other = slots.setdefault(gateway_slot(gateway.name), gateway.name)
         if other != gateway.name:
-            what = f"`{gateway.name}` has the same number as `{other}`, which is made from the name"
+            what = f"`{gateway.name}` clashes with `{other}`: both names give the same number"
             raise one.error("name", what, "use another name")
         _check_known(one, "upstream", gateway.through, known)
     loop = find_loop({gateway.name: gateway.through for gateway in made.gateways})

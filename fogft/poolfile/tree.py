@@ -243,7 +243,7 @@ def _got(node: Node) -> str:
     if value is None:
         return "nothing"
     if isinstance(value, bool):
-        return f"the truth value `{str(value).lower()}`"
+        return f"the boolean `{str(value).lower()}`"
     if isinstance(value, (int, float)):
         return f"the number {shown(value)}"
     if isinstance(value, str):

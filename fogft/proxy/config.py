@@ -44,4 +44,4 @@ def read_server(path: Path, **override: Any) -> ServerProxyConfig:
 
 def _check(path: Path, config: ProxyConfig) -> None:
     if config.rmw is Speaks.ZENOH and config.topics:
-        raise StateError(f"`{path}` is not usable: rmw: zenoh passes services only; it has topics")
+        raise StateError(f"`{path}` cannot be used: `rmw: zenoh` supports only services, no topics")

@@ -137,7 +137,7 @@ class RmwZenohNode:
         if not known:
             raise RosError(
                 f"the type hash of `{type_name}` is not known here yet",
-                "a replica that is ready tells it, and so does a client on the robot",
+                "a ready replica or a client on the robot provides it",
             )
         server: Server = self._add(
             lambda: Server(

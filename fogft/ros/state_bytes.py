@@ -37,8 +37,9 @@ class StateBytes:
         self._in = _Field(self._restore.Request, spec.restore, "request")
         if self._out.is_text != self._in.is_text:
             raise RosError(
-                f"of `{spec.snapshot.field}` and `{spec.restore.field}` one is text, one bytes",
-                "name two fields that hold the same",
+                f"one of `{spec.snapshot.field}` and `{spec.restore.field}` is text, "
+                "the other bytes",
+                "name two fields of the same kind",
             )
 
     def snapshot_request(self) -> bytes:

@@ -45,8 +45,8 @@ def of_others(service: str, nodes: Iterable[str]) -> str:
     if not names:
         return ""
     return (
-        f"`{service}` is also offered by {names}: a request goes to each, and the first answer "
-        "counts; end that node, or rename one of the services"
+        f"`{service}` is also offered by {names}: each request goes to all, and the first answer "
+        "counts; stop that node, or rename one of the services"
     )
 
 

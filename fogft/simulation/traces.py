@@ -155,7 +155,7 @@ def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, 
             )
         if places[0] in found:
             raise FogftError(
-                f"{trace.file}: is of `{places[0]}`, as {found[places[0]][0]} is",
+                f"{trace.file}: is for `{places[0]}`, like {found[places[0]][0]}",
                 "keep the trace of the instance type that the pool uses",
             )
         found[places[0]] = trace.file, trace.timeline
@@ -164,7 +164,7 @@ def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, 
             raise FogftError(
                 f"{other.file}: gap_seconds is {other.gap_s:g}, but {traces[0].gap_s:g} in "
                 f"{traces[0].file}",
-                "use traces of one recording: others cover different times",
+                "use traces from one recording: others cover different times",
             )
     return {place: timeline for place, (_, timeline) in found.items()}
 

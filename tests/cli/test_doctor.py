@@ -176,10 +176,10 @@ def test_a_profile_that_is_no_xml_is_found(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("rmw", "verdict", "said"),
     [
-        ("rmw_fastrtps_cpp", Verdict.OK, "measurements were made with it"),
+        ("rmw_fastrtps_cpp", Verdict.OK, "fogft is measured with"),
         ("rmw_cyclonedds_cpp", Verdict.WARN, "service calls between it and Fast DDS"),
         ("rmw_zenoh_cpp", Verdict.WARN, "rmw: zenoh"),
-        ("rmw_connextdds", Verdict.WARN, "not tried"),
+        ("rmw_connextdds", Verdict.WARN, "not tested"),
     ],
 )
 def test_the_middleware_is_named_with_what_is_known_of_it(rmw, verdict, said):
@@ -367,7 +367,7 @@ def test_chaos_that_lasts_is_found(tmp_path):
     (tmp_path / "local").mkdir()
     faults.write(tmp_path / "local" / faults.FILE, outage)
     found = the_only(pools.chaos(situation(tmp_path)))
-    assert "`local/us-west-2` is out, `local/us-east-1` has room for 0 machines" in found.text
+    assert "outage in `local/us-west-2`, `local/us-east-1` has room for 0 machines" in found.text
     assert "us-west-1" not in found.text
 
 

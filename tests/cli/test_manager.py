@@ -14,7 +14,7 @@ def test_a_manager_run_by_hand_tells_why_it_cannot(home: Path) -> None:
     identity = lay_down(home, None).identity
     identity.write_text(identity.read_text().replace('"local"', '"mars"'))
     said = run_by_hand()
-    assert said.startswith("error: there is no cloud `mars`\n\nhint: there are: `local`, `sky`")
+    assert said.startswith("error: there is no cloud `mars`\n\nhint: clouds: `local`, `sky`")
     identity.unlink()
     assert "error: there is no pool `planner`" in run_by_hand()
 

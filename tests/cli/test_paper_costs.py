@@ -22,7 +22,7 @@ PRINTED = {
     "SAM": (0.53, 1.06, 0.44),
     "MPT-Home, MPT-Cubicles": (1.79, 3.58, 1.69),
     "MPT-TwistyCool": (3.58, 7.16, 1.68),
-    "MPT-Home, if any larger machine will do": (1.79, 3.58, 1.69),
+    "MPT-Home, larger machines allowed": (1.79, 3.58, 1.69),
 }
 
 

@@ -191,7 +191,7 @@ def test_how_long_launches_took_is_shown_and_taken_for_the_time_away(pool, capsy
         assert shown["ready_p90_s"] == known
         assert shown["availability"]["assumed"]["recovery_s"] == (known or 1200)
     assert main.run(["plan", str(pool)]) == 0
-    assert "within 700 s of being ordered (p90 of 5 launches" in capsys.readouterr().out
+    assert "within 700 s of the order (p90 of 5 launches" in capsys.readouterr().out
 
 
 @needs("matplotlib")
@@ -248,7 +248,7 @@ def test_a_target_out_of_reach_is_a_warning(pool, capsys):
     pool.write_text(POOL + "  availability: 0.99999\n  max_usd_per_hour: 0.3\n")
     assert main.run(["plan", str(pool)]) == 0
     captured = capsys.readouterr()
-    assert "0.99999 is asked for" in captured.out
+    assert "target 0.99999" in captured.out
     assert "cannot be met: 2 replicas are expected to reach 0.996346" in captured.err
 
 

@@ -68,7 +68,7 @@ def test_recorded_traces_are_replayed(file, traces, capsys):
     out, err = capsys.readouterr()
     assert json.loads(out)["market"] == "recorded"
     assert json.loads(out)["locations"] == 2
-    assert "note: no trace of 2 of the pool's 4 locations" in err
+    assert "note: 2 of the pool's 4 locations have no trace" in err
 
 
 def test_markets_like_the_traces_are_made_up(file, traces, capsys):

@@ -93,5 +93,5 @@ def test_a_pool_that_is_too_small_says_how_many_replicas_would_do():
     service = replace(STATUS.services[0], counters={"needed_replicas": 6})
     status = replace(STATUS, notes=(), excluded=(), services=(service,))
     assert [line.plain for line in notes(status)] == [
-        f"note: `{service.name}`: load exceeds the capacity of its replicas; 6 would do"
+        f"note: `{service.name}`: load exceeds the capacity of its replicas; 6 would suffice"
     ]

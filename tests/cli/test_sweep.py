@@ -80,8 +80,8 @@ def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys
     file = tmp_path / "pool.yaml"
     file.write_text(SPEC.replace("planner\n", "test\n", 1) + "resources: {infra: local}\n")
     (note,) = [one for one in preview.order(file).notes if "earlier pool" in one]
-    assert f"cost $0.070/h together: `{id}`." in note
-    assert "`fogft sweep` ends them" in note
+    assert f"at $0.070/h in total: `{id}`." in note
+    assert "`fogft sweep --end` ends them" in note
     file.write_text(SPEC + "resources: {infra: local}\n")
     assert "earlier pool" not in str(preview.order(file).notes), "another name"
     [line], _ = run(capsys)
@@ -135,7 +135,7 @@ def test_a_manager_that_comes_back_meanwhile_keeps_its_machines(
 
     monkeypatch.setattr("fogft.cli.output.confirm", yes)
     _, err = run(capsys, "--end")
-    assert f"`{id}` is left alone: its pool has a manager again" in err
+    assert f"`{id}` was left alone: its pool has a manager again" in err
     assert machines.machine(id)
     lock.release()
 
@@ -158,7 +158,7 @@ def test_a_vm_that_only_its_cloud_still_knows_is_found_and_ended(scene, capsys):
     scene.sky.forget_everything()
     scene.cloud.journal.close(replica())
     told = left_of("perception", "sky", scene.cloud)
-    assert "cost $0.021/h together" in told[0]
+    assert "at $0.021/h in total" in told[0]
     assert str(replica()) in told[0]
     assert left_of("planner", "sky", scene.cloud) == []
     [line], err = run(capsys)
@@ -173,12 +173,12 @@ def test_a_cloud_that_does_not_answer_is_no_empty_list(scene, capsys):
     scene.sky.unreachable = True
     out, err = run(capsys, status=1)
     assert out == []
-    assert err.startswith("error: SkyPilot gave no answer")
+    assert err.startswith("error: SkyPilot did not answer")
 
 
 def test_what_does_not_end_is_an_error_with_what_to_do(scene, capsys):
     name = scene.launched()
     scene.sky.fail_next("down", CloudUnreachable("no answer"), times=20)
     _, err = run(capsys, "--end", "--yes", status=1)
-    assert f"error: `{name}` may still run: no answer" in err
+    assert f"error: `{name}` may still be running: no answer" in err
     assert f"end it with `sky down {name}`" in err

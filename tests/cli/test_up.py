@@ -198,8 +198,8 @@ def test_a_file_for_another_cloud_can_be_tried_here(file, looks, capsys):
     assert main.run(["up", str(file), "--cloud", "aws"]) == 1
     assert capsys.readouterr().err == (
         "error: there is no cloud `aws`\n\n"
-        "hint: there are: `local`, `sky`; "
-        "`sky` stands for all real clouds, which the pool file names\n"
+        "hint: clouds: `local`, `sky`; "
+        "`sky` stands for the real clouds that the pool file names\n"
     )
 
 
@@ -271,7 +271,7 @@ def test_no_room_for_both_is_said_before(home, file, looks, capsys):
     assert main.run(["up", str(file)]) == 0
     said = capsys.readouterr().err
     assert "  replicas are replaced one at a time, old before new\n" in said
-    assert "  $0.21/h (`max_usd_per_hour`) leaves no room for both: one replica fewer" in said
+    assert "  $0.21/h (`max_usd_per_hour`) leaves no room for both: one fewer replica" in said
 
 
 def test_the_same_file_changes_nothing(home, file, looks, capsys):
@@ -358,9 +358,7 @@ def test_down_of_another_name_is_a_mistake(home, capsys):
     """A misspelt name must not look like success while the real pool goes on costing money."""
     paths = lay_down(home, file=file)
     assert main.run(["down", "planer"]) == 1
-    assert (
-        "error: there is no pool `planer`\n\nhint: there are: `planner`" in capsys.readouterr().err
-    )
+    assert "error: there is no pool `planer`\n\nhint: pools: `planner`" in capsys.readouterr().err
     assert paths.identity.exists()
 
 

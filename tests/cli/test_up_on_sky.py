@@ -164,7 +164,7 @@ def test_files_that_every_vm_gets_are_told_before_anything_is_launched(
     scene.sky.uploaded = ["~/.runpod/config.toml"]
     assert main.run(["up", str(file)]) == 1
     said = capsys.readouterr().err
-    assert "warning: SkyPilot gives every VM these files of yours" in said
+    assert "warning: SkyPilot copies these files of yours" in said
     assert "`~/.runpod/config.toml`" in said
     assert "port 7448" in said
     assert "are open to the world: on AWS, `fogft.allow_from` limits who may connect" in said
@@ -172,11 +172,10 @@ def test_files_that_every_vm_gets_are_told_before_anything_is_launched(
 
 
 def test_what_cannot_be_told_of_credentials_hinders_no_up(scene, file, started, capsys):
-    scene.sky.fail_next("uploaded_credentials", CloudUnreachable("SkyPilot gave no answer"))
+    scene.sky.fail_next("uploaded_credentials", CloudUnreachable("SkyPilot did not answer"))
     assert main.run(["up", str(file), "--yes"]) == 0
     assert (
-        "it is unknown now which files a VM gets: SkyPilot gave no answer"
-        in capsys.readouterr().err
+        "cannot tell now which files a VM gets: SkyPilot did not answer" in capsys.readouterr().err
     )
 
 

@@ -22,7 +22,7 @@ def _tables(title: str, cls: type, seen: set[type]) -> Iterator[str]:
     advanced = [entry for entry in entries if entry.key.advanced]
     yield from _table(f"### {title}", usual)
     if advanced:
-        yield from _table(f"### `{ADVANCED}` of {title}", advanced)
+        yield from _table(f"### `{ADVANCED}` of {title[0].lower()}{title[1:]}", advanced)
     for entry in entries:
         form = entry.key.form
         if isinstance(form, (keys.Map, keys.Maps)) and form.of not in seen and keys_of(form.of):

@@ -133,11 +133,11 @@ def diagnostics() -> Iterator[str]:
 
 
 _EFFECTS = {
-    Effect.BLAMELESS: "no sign against the request",
+    Effect.BLAMELESS: "the request is not blamed",
     Effect.FINAL: "this replica is not asked again",
     Effect.FAULT: "it counts against the service",
     Effect.OTHER_UPLINK: "another uplink may reach the replica",
-    Effect.GOALS_LOST: "goals of actions are given again",
+    Effect.GOALS_LOST: "action goals are sent again",
 }
 
 

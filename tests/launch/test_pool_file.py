@@ -106,7 +106,7 @@ def test_the_launch_file_is_laid_over_the_pool_file() -> None:
 
 @pytest.mark.parametrize(
     ("base", "name", "message"),
-    [({"run": "x"}, "a", "a `run` of its own"), ({}, "", "needs a name")],
+    [({"run": "x"}, "a", "its own `run`"), ({}, "", "needs a name")],
 )
 def test_what_makes_no_pool_is_refused(base: dict[str, str], name: str, message: str) -> None:
     with pytest.raises(FogftError, match=message):

@@ -132,12 +132,12 @@ MISTAKES = {
     "key that comes later": (
         pool("autoscale: true"),
         "pool.yaml:4: fogft.autoscale: is not supported yet",
-        "remove it: `fogft scale` or `schedule` say how many replicas there are",
+        "remove it: set the number of replicas with `fogft scale` or `schedule`",
     ),
     "key that comes later, in a service": (
         pool(services="[{name: a, autoscale: 2}]"),
         "pool.yaml:3: fogft.services[0].autoscale: is not supported yet",
-        "remove it: `fogft scale` or `schedule` say how many replicas there are",
+        "remove it: set the number of replicas with `fogft scale` or `schedule`",
     ),
     "SkyServe's section": (
         pool(top="service: {replicas: 2}"),
@@ -223,7 +223,7 @@ MISTAKES = {
     ),
     "truth value for a number": (
         pool("max_surge: yes"),
-        "pool.yaml:4: fogft.max_surge: must be a whole number, not the truth value `true`",
+        "pool.yaml:4: fogft.max_surge: must be a whole number, not the boolean `true`",
         "write a whole number from 0 to 4; the default is 1",
     ),
     "nothing for a number": (
@@ -389,7 +389,7 @@ MISTAKES = {
         pool(services="[{name: a, type: a/srv/A, hedging: adaptive}]"),
         "pool.yaml:3: fogft.services[0].hedging: must be `auto` or `all` or `failover`, "
         "not `adaptive`",
-        "is now called `auto`, and is the default; write that",
+        "is now called `auto`, which is the default",
     ),
     "key that is gone": (
         pool(services="[{name: a, type: a/srv/A, hedging_budget: 0.2}]"),
@@ -399,7 +399,7 @@ MISTAKES = {
     "key with another name now": (
         pool(services="[{name: a, type: a/srv/A, replicas: 4}]"),
         "pool.yaml:3: fogft.services[0].replicas: is not a key of a service",
-        "put this service into its own pool, with that many",
+        "put this service into its own pool, with that many replicas",
     ),
     "advanced key beside the others": (
         pool(services="[{name: a, type: a/srv/A, trace: true}]"),
@@ -442,7 +442,7 @@ MISTAKES = {
     "cancel service and concurrency": (
         pool(services="[{name: a, type: a/srv/A, cancel: stop, concurrency: 4}]"),
         "pool.yaml:3: fogft.services[0].concurrency: must be 1 with a `cancel` service, "
-        "which cannot name a request",
+        "which cannot tell requests apart",
         "remove one of the two",
     ),
     "cancel service that is the service": (
@@ -762,5 +762,5 @@ def test_names_that_no_probe_could_tell_are_refused_before_anything_starts():
         return f"run: x\nfogft: {json.dumps({'services': services})}\n"
 
     assert len(file.parse(named(120), file="pool.yaml").services) == 400
-    with pytest.raises(SpecError, match="have names of 80400 bytes together; 65536 are the most"):
+    with pytest.raises(SpecError, match="have names of 80400 bytes in total; the limit is 65536"):
         file.parse(named(200), file="pool.yaml")

@@ -117,7 +117,7 @@ def test_new_credentials_that_are_no_good_leave_the_old_link(
     theirs = Authority(tmp_path / "stranger").robot("ada", 2)
     _replace(files, CredentialPaths(files.ca, theirs.certificate, theirs.key))
     link.renew()
-    wait_for(lambda: "from another CA" in link.status().detail)
+    wait_for(lambda: "from a different CA" in link.status().detail)
     assert link.status().state is LinkState.UP
     assert link.offer(SERVICE, request_id(1), b"x", 20.0)
     wait_for(lambda: owner.of(1))

@@ -111,7 +111,7 @@ def test_text_fields_carry_text_and_a_refusal_its_message():
         (("std_srvs/srv/Trigger", "no_such"), (RESTORE_TYPE, FIELD), "`no_such`"),
         ((SNAPSHOT_TYPE, "map.no_such.data"), (RESTORE_TYPE, FIELD), "`map.no_such`"),
         ((SNAPSHOT_TYPE, "map"), (RESTORE_TYPE, FIELD), "`map`"),
-        (("std_srvs/srv/Trigger", "message"), (RESTORE_TYPE, FIELD), "one is text, one bytes"),
+        (("std_srvs/srv/Trigger", "message"), (RESTORE_TYPE, FIELD), "is text, the other bytes"),
         (("no_such_pkg/srv/A", "a"), (RESTORE_TYPE, FIELD), "no_such_pkg"),
     ],
 )

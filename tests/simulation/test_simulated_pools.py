@@ -322,7 +322,7 @@ def test_recorded_traces_shorter_than_asked_are_used_whole():
     assert report.scenario.days == pytest.approx(47 / 24)
     assert report.notes == (
         "the traces cover 2.0 days after the first hour: all are used",
-        "every seed replays the same days: intervals are of boot times alone",
+        "every seed replays the same days: intervals reflect only boot times",
     )
 
 

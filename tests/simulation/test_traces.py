@@ -88,7 +88,7 @@ def test_a_region_that_does_not_exist_is_told(tmp_path):
 def test_two_traces_of_one_zone_are_told(tmp_path):
     write(tmp_path, "us-west-2a_k80_1.json")
     write(tmp_path, "us-west-2a_v100_1.json")
-    with pytest.raises(FogftError, match=r"is of `local/us-west-2/a`, as .*k80"):
+    with pytest.raises(FogftError, match=r"is for `local/us-west-2/a`, like .*k80"):
         traces.located(traces.read(tmp_path), PLACES)
 
 

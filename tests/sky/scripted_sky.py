@@ -297,7 +297,7 @@ class ScriptedSky:
         if call != "launch-heard":
             self.calls.append((call, subject))
         if self.unreachable:
-            raise CloudUnreachable("SkyPilot gave no answer")
+            raise CloudUnreachable("SkyPilot did not answer")
         if self.errors.get(call):
             raise self.errors[call].pop(0)
 

@@ -512,7 +512,7 @@ def test_without_a_right_to_ask_the_provider_skypilots_word_has_to_do(scene: Sce
     scene.sky.forget_everything()
     scene.pass_s(20)
     assert not scene.machines()
-    assert "may not list" in scene.cloud.unverified("aws")
+    assert "no permission to list" in scene.cloud.unverified("aws")
     assert "gcp" in scene.cloud.unverified("gcp")
 
 
@@ -752,7 +752,7 @@ def test_what_a_machine_need_not_have_is_told(scene: Scene):
     assert "port 7448 of every VM (mutual TLS) and ssh's port (keys only) are open" in port
     assert scene.cloud.exposures(["gcp"], open_port=None) == [files], "of the clouds asked about"
     scene.sky.uploaded = None
-    assert "the API server elsewhere decides" in scene.cloud.exposures(["gcp"], open_port=None)[0]
+    assert "the remote API server decides" in scene.cloud.exposures(["gcp"], open_port=None)[0]
 
 
 # -- what a machine installs -------------------------------------------------------------------

@@ -239,7 +239,7 @@ def test_a_role_that_may_not_be_read_is_told_in_a_few_words():
 
     aws.clients["iam", "us-east-1"] = Iam()
     told = aws.warning()
-    assert told.startswith("what AWS's role `skypilot-v1`")
+    assert told.startswith("cannot read the permissions of AWS role `skypilot-v1`")
     assert told.endswith("not authorized to perform: iam:ListAttachedRolePolicies.")
 
 

@@ -101,7 +101,7 @@ def test_credentials_that_expire_take_nothing_away(pool: PoolOnSky):
     pool.until(pool.ready)
     before = (pool.ordered(), pool.store.published)
     expired = CloudUnreachable(
-        "SkyPilot gave no answer about the list of clusters: ExpiredToken",
+        "SkyPilot did not answer about the list of clusters: ExpiredToken",
         "renew the credentials of this cloud; `sky check` tests them",
     )
     pool.sky.fail_next("clusters", expired, times=1000)
@@ -133,7 +133,7 @@ def test_an_api_server_that_dies_in_mid_launch_costs_no_second_vm(by_hand: PoolO
     by_hand.sky.boot(FIRST)
     by_hand.sky.unreachable = True
     by_hand.tick(60)
-    assert "the cloud did not answer: SkyPilot gave no answer" in by_hand.notes
+    assert "the cloud did not answer: SkyPilot did not answer" in by_hand.notes
     by_hand.sky.finish(FIRST)
     by_hand.sky.unreachable = False
     by_hand.until(by_hand.ready)
@@ -255,8 +255,8 @@ def test_down_without_an_answer_says_what_may_still_run_and_how_to_look(pool: Po
     with pytest.raises(CloudUnreachable) as caught:
         end(pool, [], known=teardown.Known("perception", ("replica 0.1 (aws/us-east-1)",)))
     assert caught.value.message.splitlines() == [
-        "it is unknown what of `perception` still runs: SkyPilot gave no answer",
-        "  may still run: replica 0.1 (aws/us-east-1)",
+        "cannot tell what is left of `perception`: SkyPilot did not answer",
+        "  may still be running: replica 0.1 (aws/us-east-1)",
     ]
     pool.sky.unreachable = False
     pool.sky.fail_next("down", CloudUnreachable("AWS does not answer"), times=100)

@@ -168,7 +168,7 @@ def test_a_zone_that_cannot_be_asked_hides_no_machine(compute: tuple[Compute, Gc
 
 
 def test_no_network_is_cannot_tell(compute: tuple[Compute, Gcp]):
-    with pytest.raises(CloudUnreachable, match="GCP gave no answer"):
+    with pytest.raises(CloudUnreachable, match="GCP did not answer"):
         Gcp("http://127.0.0.1:9/compute/v1/projects").instances(None)
 
 

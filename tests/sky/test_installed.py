@@ -444,7 +444,7 @@ def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, An
     steady = sold(infra="aws/us-west-2", cpus="4", use_spot=False).offers
     assert {(o.placement.instance, o.placement.spot) for o in steady} == {("m6i.xlarge", False)}
     nothing = sold(infra="aws", cpus="1000+")
-    assert (nothing.offers, nothing.left_out) == ([], {"aws": "it sells nothing that fits"})
+    assert (nothing.offers, nothing.left_out) == ([], {"aws": "nothing there matches"})
     with pytest.raises(RefusedError, match="cpus"):
         sold(infra="aws", cpus="two")
 
@@ -457,8 +457,8 @@ def test_a_cloud_that_refuses_the_launch_is_left_out_with_the_reason(
     installed, _, _ = real
     asked = task.as_launched({"infra": "hyperbolic", "use_spot": True})
     assert installed.offers(asked).left_out == {
-        "hyperbolic": "a machine there cannot end itself; it opens no ports, which `fogft.dial_in` "
-        "does not need; it sells no spot machines"
+        "hyperbolic": "machines cannot terminate themselves; cannot open ports (not needed with "
+        "`fogft.dial_in`); no spot machines"
     }
 
 
@@ -558,7 +558,7 @@ def test_an_api_server_of_another_skypilot_is_named_and_ended_only_when_idle(
     )
     sdk.api_stop.assert_not_called()
     sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="SUCCEEDED")]
-    assert installed.renew_server().endswith("it was idle, and was restarted")
+    assert installed.renew_server().endswith("it was idle and has been restarted")
     sdk.api_stop.assert_called_once()
     local.return_value = False
     assert installed.renew_server().endswith("is installed here")

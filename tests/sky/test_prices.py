@@ -99,7 +99,7 @@ def test_resources_that_nobody_sells_or_that_are_not_valid_name_the_key(market: 
     with pytest.raises(SpecError, match=r"^resources: "):
         market.offers()
     market.sky.fail_next("offers", RefusedError("ValueError", ["Invalid resources YAML: x"]))
-    with pytest.raises(SpecError, match=r"^resources: SkyPilot refuses"):
+    with pytest.raises(SpecError, match=r"^resources: SkyPilot rejects"):
         market.offers()
 
 
@@ -133,11 +133,13 @@ def test_skypilot_is_asked_with_all_that_a_launch_adds(market: Market):
 
 
 def test_what_cannot_be_launched_is_left_out_with_the_reason(market: Market):
-    market.sky.left_out = {"yotta": "a machine there cannot end itself"}
+    market.sky.left_out = {"yotta": "machines cannot terminate themselves"}
     assert len(market.offers()) == 2
-    assert market.prices.left_out() == ["`yotta` is left out: a machine there cannot end itself"]
+    assert market.prices.left_out() == ["`yotta` is left out: machines cannot terminate themselves"]
     market.sky.sold = []
-    with pytest.raises(SpecError, match="`yotta` is left out: a machine there cannot end itself"):
+    with pytest.raises(
+        SpecError, match="`yotta` is left out: machines cannot terminate themselves"
+    ):
         market.prices.offers({"infra": "yotta"})
 
 
@@ -188,4 +190,4 @@ def test_quotas_that_may_not_be_read_are_told_and_forbid_nothing(market: Market)
     market.provider.allowed = False
     assert len(market.prices.offers({"infra": "aws"})) == 1
     (said,) = market.prices.left_out()
-    assert said.endswith("cannot be read: UnauthorizedOperation")
+    assert said.endswith("so offers above them are shown: UnauthorizedOperation")

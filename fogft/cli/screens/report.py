@@ -37,13 +37,14 @@ td:not(:last-child) { white-space: nowrap; }
 def report(
     pool: PoolArgument = None,
     into: Annotated[
-        Path | None, typer.Option("--into", metavar="FILE", help="File to write; POOL.html.")
+        Path | None,
+        typer.Option("--into", metavar="FILE", help="File to write; by default POOL.html."),
     ] = None,
     named: PoolOption = None,
 ) -> None:
     """Write an HTML page about a pool: availability, latency, cost.
 
-    From the manager's own history, which keeps old events only while a decision needs them.
+    Based on the manager's history, which keeps old events only while a decision needs them.
     """
     from fogft.simulation.plot import needs_matplotlib
 

@@ -25,9 +25,9 @@ _BARS = "▁▂▃▄▅▆▇█"
 
 
 def top(pool: PoolArgument = None, named: PoolOption = None) -> None:
-    """Watch a pool on a full screen: replicas, latencies, events and cost.
+    """Watch a pool full-screen: replicas, latencies, events and cost.
 
-    Updates every second; Ctrl-C ends it. Without a terminal, prints the screen once.
+    Updates every second; Ctrl-C quits. Without a terminal, prints the screen once.
     """
     from rich.console import Console
     from rich.live import Live

@@ -220,14 +220,14 @@ class SkyCloud:
             )
         if files is None:
             found.append(
-                "the API server elsewhere decides which of its credentials every VM gets: let it "
-                "have `remote_identity: NO_UPLOAD` for its clouds"
+                "the remote API server decides which of its credentials every VM gets: set "
+                "`remote_identity: NO_UPLOAD` for its clouds there"
             )
         elif files:
             listed = ", ".join(f"`{file}`" for file in files)
             found.append(
-                f"SkyPilot gives every VM these files of yours, and its own ssh key: {listed}. No "
-                "setting prevents that: move away what a replica must not have"
+                f"SkyPilot copies these files of yours, and its own ssh key, to every VM: {listed}."
+                " No setting prevents that: move away what replicas must not have"
             )
         held = GROUP[:1] if allow_from else ()
         world = ", ".join(f"`{one}`" for one in clouds if one not in held)
@@ -334,9 +334,9 @@ def _refusal(error: RefusedError, order: Launch) -> CloudError:
     if failure.cause is Cause.QUOTA:
         return QuotaExceeded(
             f"the account's quota is used up in {where}: {failure.words}",
-            "ask the cloud for a higher quota, or name other regions",
+            "request a higher quota, or name other regions",
         )
     hint = ""
     if not order.dials_out and error.kind == "NotSupportedError":
-        hint = "where a cloud cannot open ports, let replicas dial the robot: `fogft.dial_in`"
-    return CloudError(f"SkyPilot refuses to launch in {where}: {failure.words}", hint)
+        hint = "if a cloud cannot open ports, let replicas dial the robot: `fogft.dial_in`"
+    return CloudError(f"SkyPilot refused to launch in {where}: {failure.words}", hint)

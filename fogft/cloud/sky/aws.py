@@ -183,20 +183,20 @@ class Aws:
         try:
             names = self._ask(_HOME, policies, "iam")
         except NotAllowedError as error:
-            return f"what AWS's role `{ROLE}`, which every VM has, may do cannot be read: {error}"
+            return f"cannot read the permissions of AWS role `{ROLE}`, which every VM has: {error}"
         except CloudUnreachable:
             return ""
         if names is None:
             return (
                 f"AWS has no role `{ROLE}`: at the first launch SkyPilot creates one for every VM, "
-                "with full access to EC2 and S3. Create the one in docs/how-to/clouds.md before"
+                "with full access to EC2 and S3. Create the one in docs/how-to/clouds.md first"
             )
         mighty = [f"`{n}`" for n in names if n.endswith("FullAccess") or n in _MIGHTY]
         if not mighty:
             return ""
         return (
             f"AWS's role `{ROLE}`, which every VM has and your `run` can use, has "
-            f"{', '.join(mighty)}: give it what docs/how-to/clouds.md lists, and nothing else"
+            f"{', '.join(mighty)}: give it only what docs/how-to/clouds.md lists"
         )
 
     def _client(self, service: str, region: str) -> Any:
@@ -229,7 +229,7 @@ class Aws:
                     self._session = None
                     self.clients.clear()
                 hint = "renew the AWS credentials; `sky check aws` tests them"
-            raise CloudUnreachable(f"AWS gave no answer about `{region}`: {error}", hint) from error
+            raise CloudUnreachable(f"AWS did not answer about `{region}`: {error}", hint) from error
 
 
 def _moment(text: str) -> float:

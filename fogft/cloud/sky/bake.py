@@ -51,7 +51,7 @@ def write(
             raise SpecError.of_key(
                 key,
                 "an image cannot be baked with it",
-                "put what `setup` needs of it into your own image, and bake on that: `--from`",
+                "put what `setup` needs of it into your own image, and bake from that: `--from`",
             )
     task.refuse_what_cannot_be_honoured(asked)
     ours = folder / "fogft"

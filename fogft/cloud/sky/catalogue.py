@@ -28,12 +28,12 @@ _FAMILIES = {
     "gcp": r"[cn][2-4]d?-\w+-\d+",
 }
 _MISSING = {
-    "spot_instance": "it sells no spot machines",
-    "open_ports": "it opens no ports, which `fogft.dial_in` does not need",
-    "autodown": "a machine there cannot end itself",
-    "docker_image": "it runs no `docker:` images",
-    "custom_disk_tier": "it has no choice of `disk_tier`",
-    "image_id": "it takes no custom images",
+    "spot_instance": "no spot machines",
+    "open_ports": "cannot open ports (not needed with `fogft.dial_in`)",
+    "autodown": "machines cannot terminate themselves",
+    "docker_image": "cannot run `docker:` images",
+    "custom_disk_tier": "no choice of `disk_tier`",
+    "image_id": "no custom images",
 }
 
 
@@ -47,7 +47,7 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
         for cloud in enabled if one.cloud is None else [one.cloud]:
             name, wanted = str(cloud).lower(), one.copy(cloud=cloud)
             reason = missing(cloud, wanted)
-            left_out.setdefault(name, reason or "it sells nothing that fits")
+            left_out.setdefault(name, reason or "nothing there matches")
             for machine in [] if reason else _machines(cloud, wanted):
                 for place, price in _sold(name, machine):
                     prices[place] = min(prices.get(place, price), price)
@@ -73,7 +73,7 @@ def missing(cloud: Any, resources: Any) -> str:
         try:
             cloud.check_features_are_supported(resources, {feature})
         except no:
-            lacking.append(_MISSING.get(feature.value, f"it has no `{feature.value}`"))
+            lacking.append(_MISSING.get(feature.value, f"no `{feature.value}`"))
     return "; ".join(lacking)
 
 

@@ -61,7 +61,7 @@ class Census:
         try:
             self.providers[instance.placement.cloud].terminate([instance])
         except NotAllowedError as error:
-            raise CloudUnreachable(f"{instance.key} may not be ended: {error}") from error
+            raise CloudUnreachable(f"no permission to end {instance.key}: {error}") from error
 
     def vouches(self, cloud: str) -> bool:
         """Whether a cloud's own list is available, as far as known."""
@@ -100,7 +100,7 @@ class Census:
         provider = self.providers.get(cloud)
         if provider is None:
             return (
-                f"fogft cannot ask `{cloud}` itself and relies on SkyPilot's list of machines: a "
+                f"fogft cannot query `{cloud}` and relies on SkyPilot's list of machines: a "
                 "VM whose launch outlives this computer and SkyPilot's API server runs until "
                 "`fogft sweep`"
             )
@@ -131,7 +131,9 @@ class Census:
         except NotAllowedError as error:
             if provider.cloud not in self._refused:
                 log.warning("census_not_allowed cloud=%s reason=%r", provider.cloud, str(error))
-            self._refused[provider.cloud] = f"this account may not list machines: {error}"
+            self._refused[provider.cloud] = (
+                f"this account has no permission to list machines: {error}"
+            )
             return []
         self._refused.pop(provider.cloud, None)
         self._seen.update(instance.id for instance in found)

@@ -70,8 +70,8 @@ class Ending:
                 return
             trouble = CloudError(f"still there: {', '.join(left)}")
         raise CloudUnreachable(
-            f"`{name}` may still run: {trouble}",
-            f"look with `sky status --refresh {name}`, end it with `sky down {name}`, and check "
+            f"`{name}` may still be running: {trouble}",
+            f"check with `sky status --refresh {name}`, end it with `sky down {name}`, and search "
             f"the cloud's console for machines with the label `fogft-pool={id.pool_uid}`",
         ) from trouble
 

@@ -46,7 +46,7 @@ class Gcp(Provider):
             for scope, told in (answer.get("items") or {}).items():
                 code = (told.get("warning") or {}).get("code", "NO_RESULTS_ON_PAGE")
                 if code != "NO_RESULTS_ON_PAGE":
-                    raise CloudUnreachable(f"GCP gave no answer about `{scope}`: {code}")
+                    raise CloudUnreachable(f"GCP did not answer about `{scope}`: {code}")
                 found += [_instance(raw) for raw in told.get("instances") or ()]
             page = answer.get("nextPageToken") or ""
             if not page:
@@ -74,14 +74,14 @@ class Gcp(Provider):
             with self._lock:  # renewed credentials are read by a new session only
                 self._known = None
             hint = "renew the GCP credentials; `sky check gcp` tests them"
-            raise CloudUnreachable(f"GCP gave no answer: {error}", hint) from error
+            raise CloudUnreachable(f"GCP did not answer: {error}", hint) from error
         status = answer.status_code
         if status < 400 or (status == 404 and gone_is_done):
             return dict(told)
         words = f"{status}: {(told.get('error') or {}).get('message', '')}"
         if status in (403, 404):
             raise NotAllowedError(words)
-        raise CloudUnreachable(f"GCP gave no answer: {words}")
+        raise CloudUnreachable(f"GCP did not answer: {words}")
 
     def _session(self) -> tuple[Any, str]:
         with self._lock:

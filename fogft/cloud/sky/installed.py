@@ -225,13 +225,13 @@ class InstalledSky:
             raise
         if found == sky.__version__:
             return ""
-        both = f"SkyPilot's API server is {found}, and {sky.__version__} is installed here"
+        both = f"SkyPilot's API server is {found}, but {sky.__version__} is installed here"
         if not importlib.import_module("sky.server.common").is_api_server_local():
             return both
         if any(request_of(one).active for one in sdk.api_status()):
-            return f"{both}: it is busy; `sky api stop` once it is idle replaces it"
+            return f"{both}: it is busy; run `sky api stop` once it is idle"
         sdk.api_stop()
-        return f"{both}: it was idle, and was restarted"
+        return f"{both}: it was idle and has been restarted"
 
     @_limited(REFRESH_LIMIT_S, "the credentials that a VM would get")
     def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:

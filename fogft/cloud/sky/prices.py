@@ -123,7 +123,7 @@ class Prices:
         try:
             sale = self.sky.offers(as_launched(resources))
         except RefusedError as error:
-            what = f"SkyPilot refuses this section: {error.reason.words}"
+            what = f"SkyPilot rejects this section: {error.reason.words}"
             raise SpecError.of_key("resources", what) from error
         left_out = {f"`{name}` is left out: {why}": None for name, why in sale.left_out.items()}
         within = self._within_quotas(sale, left_out)
@@ -166,7 +166,7 @@ class Prices:
             where = f"{place.cloud}/{place.region}"
             left_out[
                 f"`{place.instance}` {kind} in `{where}` is left out: the quota {asked(offer)[2]} "
-                f"allows {limit:g} vCPUs, and it needs {sale.vcpus[place.instance]:g}; request an "
+                f"allows {limit:g} vCPUs, but it needs {sale.vcpus[place.instance]:g}; request an "
                 "increase"
             ] = None
         return kept
@@ -183,9 +183,7 @@ class Prices:
                 log.info("quota_unknown region=%s reason=%r", key[0], str(error))
                 value = None
             except NotAllowedError as error:
-                said = (
-                    f"offers above the quotas of `{cloud}` are not left out: those cannot be read"
-                )
+                said = f"the quotas of `{cloud}` cannot be read, so offers above them are shown"
                 self._unread[cloud], value = f"{said}: {error}", None
             self._quotas[key] = self.clock(), value
         return value

@@ -123,7 +123,7 @@ def translated(error: BaseException, subject: str) -> CloudError:
     kind = type(error).__name__
     if _is_unknown(error):
         words = plain(str(error)) or kind
-        return CloudUnreachable(f"SkyPilot gave no answer about {subject}: {words}", _hint(kind))
+        return CloudUnreachable(f"SkyPilot did not answer about {subject}: {words}", _hint(kind))
     return RefusedError(kind, _texts(error))
 
 
@@ -157,12 +157,12 @@ def _hint(kind: str) -> str:
     if kind in ("CloudUserIdentityError", "InvalidCloudCredentials", "NoCloudAccessError"):
         return (
             "renew the credentials of this cloud; `sky check` tests them. SkyPilot's API server "
-            "stays: `sky api stop` ends it"
+            "keeps running: `sky api stop` ends it"
         )
     if kind in ("ConnectionError", "ConnectTimeout", "MaxRetryError", "NameResolutionError"):
-        return "see that this machine reaches the internet; `sky check` tests each cloud"
+        return "check that this machine reaches the internet; `sky check` tests each cloud"
     if kind == "APIVersionMismatchError":
-        return "the API server has another version: `sky api stop` ends it once it is idle"
+        return "the API server has a different version: run `sky api stop` once it is idle"
     return "`sky api info` and `sky check` show what is wrong"
 
 

@@ -35,8 +35,8 @@ _REFUSED_TASK = {
 }
 _REFUSED_RESOURCES = {
     "ports": "only the link's port is opened; robots reach the services through it",
-    "autostop": "a replica runs as long as its pool wants it",
-    "job_recovery": "fogft replaces what is lost",
+    "autostop": "a replica runs as long as its pool needs it",
+    "job_recovery": "fogft replaces lost machines",
 }
 
 

@@ -120,11 +120,11 @@ class DialOut:
                     link.sendall(GO)
                     return True
                 if data != SIGN:
-                    raise EOFError("the door was shut")
+                    raise EOFError("the robot closed the connection")
                 heard_at = time.monotonic()
                 link.sendall(SIGN)
             elif time.monotonic() - heard_at > SILENCE_S:
-                raise TimeoutError("the door is silent")
+                raise TimeoutError("the robot is silent")
         return False
 
     def _join(self, link: socket.socket) -> None:

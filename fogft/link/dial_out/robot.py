@@ -195,7 +195,7 @@ class DialIn:
                 except (OSError, ValueError) as error:
                     return str(error)
             if self._closed:
-                return "the door is closed"
+                return "the port is closed"
             if time.monotonic() - heard_at > SILENCE_S:
                 return "it sends nothing"
 

@@ -25,11 +25,11 @@ from fogft.model.names import host_and_port
 # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
 _OUT_OF_TIME = (9, 10)
 _ALERTS = {
-    "unknown ca": "our certificate is from another CA than the replica's",
-    "decrypt error": "our certificate is from another CA than the replica's",
+    "unknown ca": "our certificate is from a different CA than the replica's",
+    "decrypt error": "our certificate is from a different CA than the replica's",
     "certificate expired": "our certificate has expired, by the replica's clock",
-    "certificate required": "the replica asks for a certificate and we have none",
-    "unsupported certificate": "our certificate is not one for robots",
+    "certificate required": "the replica requires a certificate and we have none",
+    "unsupported certificate": "our certificate is not a robot's",
     "bad certificate": "the replica does not accept our certificate",
     "certificate unknown": "the replica does not accept our certificate",
 }
@@ -158,8 +158,8 @@ def judged_here(validity: Validity, now: datetime.datetime) -> str:
     """Return why we refuse a replica's certificate: ``now`` is this machine's clock."""
     if now < validity.begins:
         return (
-            f"it is not yet valid: it begins at {_utc(validity.begins)}, and this machine's clock "
-            f"says {_utc(now)}. Set this machine's clock, or the manager's, which made it"
+            f"it is not valid before {_utc(validity.begins)}, and this machine's clock says "
+            f"{_utc(now)}. Set this machine's clock, or that of the manager, which issued it"
         )
     if now >= validity.ends:
         return (
@@ -172,14 +172,14 @@ def judged_here(validity: Validity, now: datetime.datetime) -> str:
 def judged_there(validity: Validity, now: datetime.datetime) -> str:
     """Return why a replica refuses our certificate for its time."""
     if now < validity.begins or now >= validity.ends:
-        which = "has not begun" if now < validity.begins else "has expired"
+        which = "is not yet valid" if now < validity.begins else "has expired"
         return (
-            f"our certificate {which} (good from {_utc(validity.begins)} to {_utc(validity.ends)}, "
-            f"this machine's clock says {_utc(now)})"
+            f"our certificate {which} (valid from {_utc(validity.begins)} to {_utc(validity.ends)}"
+            f", this machine's clock says {_utc(now)})"
         )
     return (
-        f"the replica's clock is wrong: it holds our certificate to be out of its time, which is "
-        f"good from {_utc(validity.begins)} to {_utc(validity.ends)}; this machine's clock says "
+        f"the replica's clock is wrong: it rejects our certificate as not valid now, but it is "
+        f"valid from {_utc(validity.begins)} to {_utc(validity.ends)}; this machine's clock says "
         f"{_utc(now)}"
     )
 

@@ -42,9 +42,9 @@ def paths_of(name: str | None = None) -> PoolPaths:
     known = pools()
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
-        raise PoolNotFound(f"there are {len(known)} pools: {listed}", "name the one you mean")
+        raise PoolNotFound(f"there are {len(known)} pools: {listed}", "name one of them")
     if name is not None and name not in known and not is_exported(name):
-        hint = f"there are: {listed}" if known else "start one with `fogft up FILE`"
+        hint = f"pools: {listed}" if known else "start one with `fogft up FILE`"
         raise PoolNotFound(f"there is no pool `{name}`", hint)
     if name is None and not known:
         raise PoolNotFound("no pools on this machine", "start one with `fogft up FILE`")
@@ -70,7 +70,7 @@ def make_cloud(name: str, base: Path) -> Cloud:
         known = ", ".join(f"`{cloud}`" for cloud in CLOUDS)
         raise CloudError(
             f"there is no cloud `{name}`",
-            f"there are: {known}; `sky` stands for all real clouds, which the pool file names",
+            f"clouds: {known}; `sky` stands for the real clouds that the pool file names",
         )
     if name == SKY:
         from fogft.cloud import sky

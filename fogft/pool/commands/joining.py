@@ -67,8 +67,8 @@ def issue(
     if role is Role.REPLICA and not _is_by_hand(name):
         raise CredentialError(
             f"`{name}` is not a slot for a replica that is started manually",
-            f"use {FIRST_BY_HAND} to {LAST_BY_HAND}: the manager launches those below, and "
-            "certifies them itself",
+            f"use {FIRST_BY_HAND} to {LAST_BY_HAND}: the manager launches and certifies the slots "
+            "below",
         )
     _check_found(spec, role, name)
     bundle.check_passphrase(passphrase)  # before a generation is used up
@@ -93,12 +93,12 @@ def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
     if role is Role.REPLICA and Found.of(spec) is Found.BY_CLOUD:
         raise CredentialError(
             f"replica `{name}` could not be found: the pool has no rendezvous",
-            f"{add}, or `fogft.dial_in`, where it dials the robot",
+            f"{add}, or set `fogft.dial_in` so that it dials the robot",
         )
     if role in (Role.ROBOT, Role.GATEWAY) and Found.of(spec) is Found.BY_DOOR:
         raise CredentialError(
-            f"{role.value} `{name}` would find no replica: they dial this machine's robot, and "
-            "only a rendezvous could tell them of others",
+            f"{role.value} `{name}` would find no replica: replicas dial this machine's robot, "
+            "and only a rendezvous can tell them about others",
             add,
         )
 
@@ -181,7 +181,7 @@ def used_once(root: Path, label: Label) -> Iterator[None]:
         if label.id in ids:
             raise CredentialError(
                 f"this bundle for `{label.holder.short}` was already used on this machine",
-                "a bundle can be used once: have a new one issued",
+                "a bundle can be used only once: request a new one",
             )
         yield
         disk.write_json(used, [*ids, label.id][-_USED_LIMIT:])
@@ -207,7 +207,7 @@ def read(file: Path) -> bytes:
     except OSError as error:
         raise CredentialError(
             f"the bundle `{file}` cannot be read: {error.strerror}",
-            "a bundle can be used once, and is deleted afterwards",
+            "a bundle can be used only once, and is then deleted",
         ) from None
 
 

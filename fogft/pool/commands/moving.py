@@ -94,7 +94,7 @@ def export(
         except OSError as error:
             raise FogftError(
                 f"`{unfinished}` cannot be renamed: {error.strerror}",
-                "the pool is exported into it: use it as it is",
+                "it contains the exported pool: use it as it is",
             ) from None
     return identity
 
@@ -138,7 +138,7 @@ def import_(
     if not place.is_file():
         raise FogftError(
             f"the pool file `{place}` is not on this machine",
-            "put it there with its `workdir`, or say where it is with `--pool-file`",
+            "put it there with its `workdir`, or give its path with `--pool-file`",
         )
     paths = PoolPaths.of(was.name, root)
     disk.make_folder(paths.folder)
@@ -153,7 +153,8 @@ def import_(
                 raise
         else:
             raise FogftError(
-                f"this machine has a pool `{was.name}`", f"end it with `fogft down {was.name}`"
+                f"this machine has a pool `{was.name}`",
+                f"shut it down with `fogft down {was.name}`",
             )
         shutil.rmtree(paths.credentials, ignore_errors=True)
         folders = {_POOL: paths.folder, _COSTS: paths.costs, _CLOUD: root / was.cloud}

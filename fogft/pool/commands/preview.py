@@ -112,7 +112,7 @@ def order(
                     allow_from=spec.allow_from,
                 )
             except CloudError as error:
-                notes.append(f"it is unknown now which files a VM gets: {error.message}")
+                notes.append(f"cannot tell now which files a VM gets: {error.message}")
         try:
             sold = offers.ask(concrete, spec)
             notes += concrete.left_out() if isinstance(concrete, Accounts) else ()

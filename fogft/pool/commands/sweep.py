@@ -80,7 +80,7 @@ def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
     try:
         found = [one.machine for one in swept(name, cloud).unowned if not one.known]
     except FogftError as error:
-        return [f"whether machines of an earlier `{pool}` run cannot be told now: {error.message}"]
+        return [f"cannot tell now whether machines of an earlier `{pool}` run: {error.message}"]
     left = [machine for machine in found if machine.pool.casefold() in ("", pool.casefold())]
     if not left:
         return []
@@ -88,8 +88,8 @@ def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
     ids = ", ".join(f"`{machine.id}`" for machine in left[:_NAMED])
     more = f" and {len(left) - _NAMED} more" if len(left) > _NAMED else ""
     return [
-        f"machines of an earlier pool run, and cost ${usd_per_hour:.3f}/h together: {ids}{more}. "
-        "Its folder is lost, and its keys with it: `fogft sweep` ends them"
+        f"machines of an earlier pool are running, at ${usd_per_hour:.3f}/h in total: {ids}{more}. "
+        "Its folder and keys are lost: `fogft sweep --end` ends them"
     ]
 
 
@@ -103,7 +103,7 @@ def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
     for one in found.unowned:
         id = one.machine.id
         if _pools().get(id.pool_uid, ("", False))[1]:
-            told(f"`{id}` is left alone: its pool has a manager again")
+            told(f"`{id}` was left alone: its pool has a manager again")
             continue
         try:
             cloud.terminate(id)

@@ -104,14 +104,14 @@ def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, dict[s
     except InvalidTag:
         raise CredentialError(
             "the passphrase is wrong, or the bundle was changed",
-            "it was shown by the command that made this file",
+            "the command that wrote this file showed the passphrase",
         ) from None
     except ValueError:
         raise CredentialError("the bundle's content is unreadable") from None
     if now >= label.open_until:
         raise CredentialError(
             f"this bundle for `{label.holder.short}` expired at {_utc(label.open_until)}",
-            f"by this machine's clock it is {_utc(now)}; if that is right, have a new one issued",
+            f"this machine's clock says {_utc(now)}; if that is right, request a new one",
         )
     if not isinstance(content, dict):
         raise CredentialError("the bundle's content is unreadable")

@@ -109,7 +109,7 @@ def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record
 def _used_elsewhere(holder: Holder) -> CredentialError:
     return CredentialError(
         f"this bundle for `{holder.short}` was used before, on another machine",
-        "a bundle can be used once: have a new one issued. If you do not know who used it, run "
+        "a bundle can be used only once: request a new one. If you do not know who used it, run "
         f"`fogft credentials revoke {holder.role.value} {holder.name}`",
     )
 
@@ -119,5 +119,5 @@ def _nobody_tells(client: RendezvousClient) -> CredentialError:
     return CredentialError(
         "no rendezvous of the pool could confirm that this bundle is unused"
         + (f": {said}" if said.strip("; ") else ""),
-        "join when one can be reached from here; the bundle stays valid",
+        "join once one can be reached from here; the bundle stays valid",
     )

@@ -173,7 +173,7 @@ class Manager:
         if tick.over and tick.observed.machines == ():
             self._attempt(self._leave)
             if not self._trouble:
-                ended = f"by itself, after {tick.spec.max_hours:g} hours (`max_hours`)"
+                ended = f"automatically, after {tick.spec.max_hours:g} hours (`max_hours`)"
                 self._attempt(lambda: self._write_status(tick, ended))
                 return not self._trouble
         self._attempt(lambda: self._write_status(tick))

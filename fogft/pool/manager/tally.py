@@ -99,7 +99,7 @@ class Tally:
             ("launches", "Machines ordered.", "market", self._launches),
             ("refused_launches", "Orders refused by a cloud, by cause.", "cause", self._refused),
             ("failed_launches", "Launches that failed, by cause.", "cause", self._failed),
-            ("lost_replicas", "Machines lost without an order to end them.", "kind", self._lost),
+            ("lost_replicas", "Machines lost without being ended by fogft.", "kind", self._lost),
         ):
             yield counter(
                 f"fogft_pool_{name}_total", help, [(n, {label: key}) for key, n in counts.items()]
@@ -123,10 +123,10 @@ def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
         return
     gauges = {
         "fogft_pool_target_replicas": ("Replicas to keep ready.", status.target),
-        "fogft_pool_ready_replicas": ("Replicas that answer and are to stay.", status.ready),
+        "fogft_pool_ready_replicas": ("Replicas that answer and are to be kept.", status.ready),
         "fogft_pool_usd_per_hour": ("Price of all machines together.", status.usd_per_hour),
         "fogft_pool_cloud_reachable": (
-            "Whether the cloud could say what exists.",
+            "Whether the cloud could list its machines.",
             status.cloud_reachable,
         ),
         "fogft_pool_proxy_alive": ("Whether the client proxy reports.", status.proxy_alive),
@@ -140,7 +140,7 @@ def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
             status.observed_at,
         ),
         "fogft_manager_epoch": (
-            "Number of the manager; later ones have higher ones.",
+            "Number of the manager, higher for each new one.",
             status.epoch,
         ),
     }
@@ -182,7 +182,7 @@ def of_rendezvous(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a rendezvous from its report."""
     help = "Members that are connected."
     yield gauge("fogft_rendezvous_callers", help, [(report["callers"], {})])
-    yield gauge("fogft_rendezvous_records", "Records it holds.", [(report["records"], {})])
+    yield gauge("fogft_rendezvous_records", "Records held.", [(report["records"], {})])
     yield by_event("fogft_rendezvous_port_events_total", "Events at its port.", report["port"])
     yield by_event("fogft_rendezvous_messages_total", "Messages by kind.", report["messages"])
     yield by_event(

@@ -99,8 +99,8 @@ def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -
     if not left:
         for name in sorted(known.clouds - audit.asked):
             warned(
-                f"`{name}` could not be asked itself: only SkyPilot says that nothing is left "
-                f"there; its console shows machines with the label `fogft-pool={uid}`"
+                f"`{name}` could not be queried: only SkyPilot says that nothing is left there; "
+                f"search its console for machines with the label `fogft-pool={uid}`"
             )
     return left
 
@@ -137,10 +137,10 @@ def _stubborn(refusals: dict[Machine, CloudError], known: Known) -> FogftError:
 
 
 def _unknown(error: CloudUnreachable, known: Known) -> CloudUnreachable:
-    lines = [f"it is unknown what of `{known.pool}` still runs: {error.message}"]
-    lines += [f"  may still run: {replica}" for replica in known.running]
+    lines = [f"cannot tell what is left of `{known.pool}`: {error.message}"]
+    lines += [f"  may still be running: {replica}" for replica in known.running]
     hints = [f"run `fogft down {known.pool}` again", *([error.hint] if error.hint else [])]
     if known.unmanaged_max_hours is not None:
         hours = f"{known.unmanaged_max_hours:g} hours"
-        hints.append(f"replicas that hear of no manager shut down after {hours}")
+        hints.append(f"replicas that hear from no manager shut down after {hours}")
     return CloudUnreachable("\n".join(lines), "; ".join(hints))

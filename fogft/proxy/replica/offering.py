@@ -99,8 +99,8 @@ class Offering:
             return "`run` offers no service yet"
         missing = sorted({service.name for service in self.services} - ready)
         if not missing:
-            what = f"{self._left_out} services of `run` are left out: the names and types of all"
-            limit = f"may have {NAMES_BYTES_LIMIT} bytes together"
+            what = f"{self._left_out} services of `run` are left out: names and types may have"
+            limit = f"{NAMES_BYTES_LIMIT} bytes in total"
             return f"{what} {limit}" if self._left_out and self._finds_out else ""
         listed = {service.name: service.type for service in self.services}
         for name, offered in self._mistyped().items():

@@ -86,9 +86,9 @@ class Diagnosis:
             message = "all replicas fell silent together: the robot's uplink is suspected"
             worst = Level.ERROR
         elif not links:
-            message, worst = "there is no replica", Level.ERROR
+            message, worst = "there are no replicas", Level.ERROR
         else:
-            message = f"{up} of {len(links)} replicas can be reached"
+            message = f"{up} of {len(links)} replicas are reachable"
             worst = max(worst, Level.OK if up == len(links) else Level.WARN)
         if left_s is not None:
             message += f"; no manager is running, and replicas shut down in {left_s / 3600:.1f} h"
@@ -139,7 +139,7 @@ class Diagnosis:
         self, name: str, report: Mapping[str, Any], links: list[Mapping[str, Any]]
     ) -> Status:
         passing = sum(PREFIX + name in link["ready"] for link in links)
-        message = str(report.get("trouble") or f"{passing} of {len(links)} replicas pass it")
+        message = str(report.get("trouble") or f"{passing} of {len(links)} replicas forward it")
         level = Level.ERROR if "trouble" in report or not passing else Level.OK
         if level is Level.OK and passing < len(links):
             level = Level.WARN
@@ -150,17 +150,17 @@ class Diagnosis:
         state, ready = link["state"], len(link["ready"])
         detail = link.get("detail") or ""
         if state == "suspect":
-            level, message = Level.ERROR, detail or "it does not answer"
+            level, message = Level.ERROR, detail or "not responding"
         elif state != "up" or ready < services:
             level, message = Level.WARN, detail or "not all services can answer"
         elif link.get("draining"):
-            level, message = Level.WARN, "its machine is about to be preempted"
+            level, message = Level.WARN, "machine about to be preempted"
         elif link.get("hanging"):
             level, message = Level.WARN, detail
         elif link.get("disagrees"):
-            level, message = Level.WARN, "its answers differ from the others'"
+            level, message = Level.WARN, "answers differ from the other replicas'"
         else:
-            level, message = Level.OK, "it answers"
+            level, message = Level.OK, "responding"
         values = {
             "link": state,
             "ready services": ready,

@@ -100,7 +100,7 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
         running.close()
         log.info("proxy_stopped pool=%s", config.pool)
     if renewed:
-        raise RosError("this process was stopped for long, and has handed over to its standby")
+        raise RosError("this process was stopped for too long, and has handed over to its standby")
 
 
 def make_dialer(config: ClientProxyConfig) -> UplinkDialer:

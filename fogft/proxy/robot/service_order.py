@@ -91,11 +91,11 @@ class ServiceOrder(Decide):
         """Why the service is unavailable; empty if it is available."""
         if self._term.held_by:
             return (
-                f"robot `{self._term.held_by}` orders this service, and a service with `state` "
-                "is for one robot; for several see docs/how-to/state.md"
+                f"robot `{self._term.held_by}` uses this service, and a service with `state` is "
+                "for one robot; for several, see docs/how-to/state.md"
             )
         if self._term.stranded:
-            return "no replica that can be reached has the state; see docs/design/state.md"
+            return "no reachable replica has the state; see docs/design/state.md"
         return ""
 
     # -- what a caller wants --------------------------------------------------------------

@@ -63,7 +63,7 @@ def test_a_robot_of_another_ca_is_refused(
         replica.endpoint,
         files=CredentialPaths(authority.robot().ca, theirs.certificate, theirs.key),
     )
-    _refused(link, "from another CA")
+    _refused(link, "from a different CA")
     assert _heard_nothing(replica)
 
 
@@ -116,7 +116,7 @@ def test_no_certificate_is_refused(
 
 
 @pytest.mark.parametrize(
-    ("begin", "end", "words"), [(1, 2, "not yet valid"), (-2, -1, "expired at")]
+    ("begin", "end", "words"), [(1, 2, "not valid before"), (-2, -1, "expired at")]
 )
 def test_a_replica_out_of_its_time_is_refused(
     authority: Authority,
@@ -140,7 +140,7 @@ def test_a_replica_out_of_its_time_is_refused(
 
 @pytest.mark.parametrize(
     ("begin", "end", "words"),
-    [(2, 3, "our certificate has not begun"), (-2, -1, "our certificate has expired")],
+    [(2, 3, "our certificate is not yet valid"), (-2, -1, "our certificate has expired")],
 )
 def test_a_robot_out_of_its_time_is_told_whose_clock_it_is(
     authority: Authority,

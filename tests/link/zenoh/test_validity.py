@@ -18,7 +18,7 @@ NOW = datetime.datetime(2026, 11, 21, 12, 0, tzinfo=datetime.timezone.utc)
 
 def test_a_certificate_of_tomorrow_names_both_clocks() -> None:
     said = judged_here(Validity(NOW + DAY, NOW + 9 * DAY), NOW)
-    assert "not yet valid: it begins at 2026-11-22 12:00 UTC" in said
+    assert "not valid before 2026-11-22 12:00 UTC" in said
     assert "this machine's clock says 2026-11-21 12:00 UTC" in said
 
 

@@ -180,7 +180,7 @@ def test_a_wrong_passphrase_opens_nothing_and_spoils_nothing(file: Path, tmp_pat
 def test_its_time_ends_and_cannot_be_prolonged(file: Path, tmp_path: Path) -> None:
     with pytest.raises(CredentialError, match="expired at") as caught:
         joining.join(file, PASSPHRASE, tmp_path / "home", NOW + 3600)
-    assert "by this machine's clock" in caught.value.hint
+    assert "this machine's clock says" in caught.value.hint
     raw = json.loads(file.read_text())
     raw["open_until"] += 1e6
     file.write_text(json.dumps(raw))

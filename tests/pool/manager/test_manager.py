@@ -143,7 +143,7 @@ def test_a_pool_ends_by_itself_when_its_hours_are_over(scene: Scene) -> None:
     assert scene.running() == []
     assert not disk.is_locked(scene.paths.proxy_lock)
     status = scene.status()
-    assert status["ended"] == "by itself, after 0.0001 hours (`max_hours`)"
+    assert status["ended"] == "automatically, after 0.0001 hours (`max_hours`)"
     assert (status["replicas"], status["proxy_alive"]) == ([], False)
     assert "`max_hours` has passed" in {e["detail"] for e in status["events"]}
     scene.write(replicas=2, max_hours=2)

@@ -87,7 +87,7 @@ def test_down_says_which_cloud_could_not_be_asked(scene: Scene) -> None:
     warned: list[str] = []
     scene.end(warned)
     [warning] = warned
-    assert warning.startswith("`folder` could not be asked itself")
+    assert warning.startswith("`folder` could not be queried")
     assert f"`fogft-pool={uid}`" in warning
 
 
@@ -100,13 +100,13 @@ def test_down_that_gets_no_answer_lists_what_may_still_run(scene: Scene) -> None
     with pytest.raises(CloudUnreachable) as caught:
         scene.end()
     lines = caught.value.message.splitlines()
-    assert lines[0] == "it is unknown what of `pool` still runs: told to be"
+    assert lines[0] == "cannot tell what is left of `pool`: told to be"
     assert [line.strip() for line in lines[1:]] == [
-        "may still run: replica 0.1 (folder/one/a)",
-        "may still run: replica 1.1 (folder/three/a)",
+        "may still be running: replica 0.1 (folder/one/a)",
+        "may still be running: replica 1.1 (folder/three/a)",
     ]
     assert caught.value.hint == (
-        "run `fogft down pool` again; replicas that hear of no manager shut down after 24 hours"
+        "run `fogft down pool` again; replicas that hear from no manager shut down after 24 hours"
     )
 
 

@@ -135,7 +135,7 @@ class ZenohListener:
         except zenoh.ZError as error:
             raise WireError(
                 f"cannot listen at `{self.endpoint}`: {str(error).split(' at /')[0]}",
-                "see that the port is free and that the certificate, its key and the CA exist",
+                "check that the port is free and that the certificate, its key and the CA exist",
             ) from error
         self._work_queue.start()
         self._reaper = ConnectionReaper(

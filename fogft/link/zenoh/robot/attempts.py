@@ -379,7 +379,7 @@ class Attempts:
     def _take_answer(self, answer: Answer, *, packed: bool) -> None:
         attempt = self._unanswered.answered(answer.request_id)
         if self._unanswered.owed < 0:
-            self._outlet.lose("it sends more answers than it was sent requests")
+            self._outlet.lose("it sends more answers than it received requests")
         if attempt is None:
             return  # it was answered before
         if answer.payload is not None:

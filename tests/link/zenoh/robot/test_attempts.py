@@ -238,5 +238,5 @@ def test_nothing_is_unpacked_that_was_not_asked_for(monkeypatch: pytest.MonkeyPa
     assert scene.late == [request_id(2)]
     assert not scene.outlet.lost
     scene.attempts.heard(b"once", [Answer(request_id(3), bomb)], packed=True)
-    assert scene.outlet.lost == ["it sends more answers than it was sent requests"]
+    assert scene.outlet.lost == ["it sends more answers than it received requests"]
     scene.close()
