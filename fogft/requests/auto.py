@@ -230,7 +230,7 @@ class Auto(Learning):
         self._wanting.pop(request, None)
         if self._spares.open.pop((request, replica), None) is not None:
             for other in open:
-                if not self.is_spare(request, other):
+                if other != replica and not self.is_spare(request, other):
                     self._beaten[request, other] = now
         losers = super().answered(request, open, replica, load, now)
         self._released(replica, now)
