@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -275,26 +273,6 @@ def test_a_link_that_was_opened_again_has_nothing_on_the_way():
     policy.forget(2)
     assert len(policy.first(B, (1, 2), 31.01)) == 2
     assert not policy.is_spare(A, 2)
-
-
-@given(st.lists(st.tuples(st.permutations([0, 1, 2]), st.booleans(), st.booleans()), min_size=1))
-def test_of_requests_that_have_ended_nothing_is_kept(ends):
-    """Whoever is first, and whether the others have worked on it, are refused, or expire."""
-    auto, now = Auto(), 0.0
-    ids = [bytes([0, number]) + b"request of a test" for number in range(len(ends))]
-    for id, (order, worked, expires) in zip(ids, ends, strict=True):
-        asked = dict.fromkeys(auto.first(id, (0, 1, 2), now), now)
-        first, *others = [replica for replica in order if replica in asked]
-        if expires:
-            auto.stopped(id, asked, now, expired=True)
-            others.append(first)
-        else:
-            assert set(auto.answered(id, asked, first, idle(0.01), now + 0.01)) == set(others)
-        for replica in others:
-            auto.late(id, replica, now + 0.02, answered=worked)
-        now += 1.0
-    kept = pickle.dumps(auto)
-    assert [id for id in ids if id in kept] == []
 
 
 def test_spares_at_a_replica_that_is_gone_are_not_blamed_for_ever():

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import pickle
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.requests.auto import Auto
 from fogft.requests.choose import All, Failover
-from fogft.requests.load import NEVER
+from fogft.requests.load import NEVER, Load
 
 A = b"a" * 16
 
@@ -96,3 +100,26 @@ def test_failover_asks_another_as_well_when_its_one_is_long_overdue():
     assert policy.more(A, {1: 20.0}, (2,), 20.3) == (2,)
     assert policy.first(b"b" * 16, (1, 2), 20.4) == (2,)
     assert policy.report() == {"switched": 1, "hedges": 1}
+
+
+@pytest.mark.parametrize("policy", [All, Auto, Failover])
+@given(st.lists(st.tuples(st.permutations([0, 1, 2]), st.booleans(), st.booleans()), min_size=1))
+def test_of_requests_that_have_ended_nothing_is_kept(policy, ends):
+    """Whoever is first, and whether the others have worked on it, are refused, or expire."""
+    choose, now = policy(), 0.0
+    ids = [bytes([0, number]) + b"request of a test" for number in range(len(ends))]
+    for id, (order, worked, expires) in zip(ids, ends, strict=True):
+        asked = dict.fromkeys(choose.first(id, (0, 1, 2), now), now)
+        first, *others = [replica for replica in order if replica in asked]
+        if expires:
+            choose.stopped(id, asked, now, expired=True)
+            others.append(first)
+        else:
+            assert set(
+                choose.answered(id, asked, first, Load(0, 0, 0, 0.01, 0.01), now + 0.01)
+            ) == set(others)
+        for replica in others:
+            choose.late(id, replica, now + 0.02, answered=worked)
+        now += 1.0
+    kept = pickle.dumps(choose)
+    assert [id for id in ids if id in kept] == []
