@@ -154,7 +154,7 @@ def test_what_cannot_be_carried_is_refused_when_loaded(key: str, value: Any) -> 
 
 def test_a_cloud_node_alone_is_refused() -> None:
     node = CloudNode(package="demo", executable="setter")
-    with pytest.raises(FogftError, match="in no fog pool"):
+    with pytest.raises(FogftError, match="outside any fog pool"):
         node.execute(launch.LaunchContext())
 
 
@@ -247,7 +247,7 @@ def test_the_real_launch_runs_a_pool_from_begin_to_end(tmp_path: Path) -> None:
     )  # fmt: skip
     said = shown.stdout + shown.stderr
     assert "ANSWER ahoy 7 sour /arm/setta" in said
-    assert "done: nothing of `lt` is left" in said
+    assert "done: `lt` is shut down; nothing is left" in said
     assert said.index(READY) < said.index("ANSWER")
     assert not (tmp_path / "home" / "pools" / "lt").exists()
 
