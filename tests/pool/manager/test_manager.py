@@ -225,14 +225,14 @@ def test_start_manager_starts_one_only_where_there_is_none(scene: Scene) -> None
 
 
 SLOW_TO_TELL = """\
-import json, os, pathlib, sys, time
+import os, pathlib, sys, time
 from fogft import disk
 lock, status = map(pathlib.Path, sys.argv[1:3])
 held = disk.Lock(lock)
 if not held.acquire(wait=False):
     sys.exit()
 time.sleep(float(sys.argv[4]))
-status.write_text(json.dumps({"manager_version": sys.argv[3], "manager_pid": os.getpid()}))
+disk.write_json(status, {"manager_version": sys.argv[3], "manager_pid": os.getpid()})
 time.sleep(100)
 """
 
