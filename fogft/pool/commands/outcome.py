@@ -13,6 +13,7 @@ from fogft.model.reason import Cause
 from fogft.model.replica import Phase
 from fogft.planning.rollout import UpdateState
 from fogft.pool.commands.status import Seen
+from fogft.pool.manager.status import ReplicaStatus
 
 HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
 
@@ -113,9 +114,14 @@ def is_given_up(seen: Seen) -> bool:
     return gave_up and not seen.status.replicas
 
 
+def staying(seen: Seen) -> list[ReplicaStatus]:
+    """Return the replicas that are not leaving: those of a file before this one leave."""
+    return [one for one in seen.status.replicas if one.phase != Phase.DRAINING.value]
+
+
 def keeps_ending(seen: Seen) -> bool:
     """Whether `run` has exited so often on every replica that waiting is pointless."""
-    replicas = seen.status.replicas
+    replicas = staying(seen)
     return bool(replicas) and not any(
         replica.phase == Phase.READY.value or replica.restarts < HOPELESS_RESTARTS
         for replica in replicas
@@ -123,6 +129,6 @@ def keeps_ending(seen: Seen) -> bool:
 
 
 def types_differ(seen: Seen) -> bool:
-    """Whether every replica has another definition of a service's type than this machine."""
-    replicas = seen.status.replicas
+    """Whether every replica has another type for a service than this machine."""
+    replicas = staying(seen)
     return bool(replicas) and all(replica.differs for replica in replicas)

@@ -19,6 +19,7 @@ LEAVING = replace(REPLICA, slot=1, phase="draining")
 SILENT = (replace(UP.services[0], ready_replicas=0),)
 STARTING = replace(REPLICA, phase="starting")
 HOPELESS = replace(STARTING, restarts=HOPELESS_RESTARTS)
+LEAVING = replace(HOPELESS, phase="draining", differs=True)
 UPDATE = Awaited(frozenset({"/plan"}), APPLIED_AT, digest="new")
 
 
@@ -46,6 +47,8 @@ def updated(state: UpdateState | None, *, applied: str = "new", fault: str = "",
         ),
         (replace(UP, services=SILENT, replicas=(HOPELESS,)), Outcome.RUN_KEEPS_ENDING),
         (replace(UP, services=SILENT, replicas=(HOPELESS, STARTING)), Outcome.PENDING),
+        (replace(UP, services=SILENT, replicas=(LEAVING,)), Outcome.PENDING),
+        (replace(UP, services=SILENT, replicas=(LEAVING, HOPELESS)), Outcome.RUN_KEEPS_ENDING),
         (
             replace(UP, services=SILENT, replicas=(replace(STARTING, differs=True),)),
             Outcome.TYPES_DIFFER,
