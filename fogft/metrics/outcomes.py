@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any
 
 from fogft.model.refusal import Effect, Refusal
+from fogft.model.replica import short
 
 _LATENCIES_KEPT = 2000
 # Upper bounds of the histogram's buckets, seconds: from a local call to a planner that thinks.
@@ -107,8 +108,8 @@ class Outcomes:
                     "outcome": outcome.value,
                     "replica": replica,
                     "took_s": round(took_s, 6),
-                    "asked": {_short(key): round(after_s, 6) for key, after_s in asked.items()},
-                    "refused": {_short(key): reason.value for key, reason in refused.items()},
+                    "asked": {short(key): round(after_s, 6) for key, after_s in asked.items()},
+                    "refused": {short(key): reason.value for key, reason in refused.items()},
                 }
             )
 
@@ -137,14 +138,10 @@ class Outcomes:
         return {
             **self.count,
             "refused": dict(self.refused),
-            "won": {_short(key): one.won for key, one in self.of.items() if one.won},
+            "won": {short(key): one.won for key, one in self.of.items() if one.won},
             "poisoned_at": self.poisoned_at,
             "p50_s": ordered[len(ordered) // 2] if ordered else None,
             "p99_s": ordered[int(len(ordered) * 0.99)] if ordered else None,
             "buckets": list(self._buckets),
             "took_s": self._took_s,
         }
-
-
-def _short(key: int) -> str:
-    return f"{key >> 32}.{key & 0xFFFFFFFF}"

@@ -42,6 +42,11 @@ class ReplicaId:
         return f"{self.slot}.{self.generation}"
 
     @property
+    def key(self) -> int:
+        """Slot and generation in one number, by which one pool's requests know it."""
+        return self.slot << 32 | self.generation
+
+    @property
     def certificate_name(self) -> str:
         """The common name of its certificate."""
         return Holder(Role.REPLICA, str(self.slot), self.generation, self.pool_uid).common_name
@@ -51,6 +56,11 @@ class ReplicaId:
 
     def __hash__(self) -> int:
         return self.slot << 32 ^ self.generation  # nearly all are of one pool
+
+
+def short(key: int) -> str:
+    """Return slot and generation of a `ReplicaId.key`, as shown to people."""
+    return f"{key >> 32}.{key & 0xFFFFFFFF}"
 
 
 @dataclass(frozen=True, order=True)

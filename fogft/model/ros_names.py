@@ -65,6 +65,11 @@ is_action_type = partial(_is_type, kind="action")
 _OF_ROS = frozenset(("rcl_interfaces", "type_description_interfaces", "lifecycle_msgs"))
 
 
+def is_application(node: str) -> bool:
+    """Whether a node is an application's: neither hidden, as ros2cli's daemon, nor a proxy."""
+    return not node.startswith(("_", "fogft_"))
+
+
 def is_of_application(name: str, type_name: str) -> bool:
     """Whether a service is an application's own: not one of ROS itself, hidden, or an action's."""
     if not is_service_type(type_name) or type_name.partition("/")[0] in _OF_ROS:

@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from fogft.model.replica import short
 from fogft.requests.choose import Learning
 from fogft.requests.load import Demand, Load
 
@@ -291,7 +292,7 @@ class Auto(Learning):
             "spare_share": self._spares.share,
             "tokens": self._budget.tokens,
             "replicas": {
-                f"{replica >> 32}.{replica & 0xFFFFFFFF}": {
+                short(replica): {
                     "service_s": known.service_s,
                     "delay_s": known.delay_s(),
                     "doubted": known.doubted,

@@ -15,6 +15,7 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
+from fogft.model.replica import short
 from fogft.requests.decide import Decide, Judgement, Means, Pending
 
 WINDOW = 20  # judged answers of a replica that count
@@ -122,4 +123,4 @@ class Quorum(Decide):
     def report(self) -> dict[str, Any]:
         """Return how often replicas disagreed, by ``slot.generation``."""
         disagreed = self.disagreed.items()
-        return {"disagreed": {f"{key >> 32}.{key & 0xFFFFFFFF}": n for key, n in disagreed}}
+        return {"disagreed": {short(key): n for key, n in disagreed}}

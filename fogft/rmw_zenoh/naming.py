@@ -155,9 +155,6 @@ def _deep(part: str) -> str:
     return part.replace("%", "/")
 
 
-_NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, and proxies
-
-
 class Graph:
     """The servers and clients of a domain, without those of our own session."""
 
@@ -222,6 +219,6 @@ class Graph:
             token.service: token.type
             for token in sorted(self._all(), key=str)
             if token.kind == SERVER
-            and not token.node.startswith(_NOT_APPLICATIONS)
+            and ros_names.is_application(token.node)
             and ros_names.is_of_application(token.service, token.type)
         }

@@ -37,7 +37,6 @@ Entity = Server | Client | Publisher | Subscription
 E = TypeVar("E", Server, Client, Publisher, Subscription)
 
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
-_NOT_APPLICATIONS = ("_", "fogft_")  # hidden nodes such as ros2cli's daemon, and proxies
 _NO_LIMIT = -1  # of rcl_wait: until something happens
 
 
@@ -194,7 +193,7 @@ class SerialisedNode:
         except Exception:  # rclpy's InvalidHandle: closed meanwhile
             return found
         for name, namespace in nodes:
-            if name.startswith(_NOT_APPLICATIONS):
+            if not ros_names.is_application(name):
                 continue
             for service, kinds in self._services_of(name, namespace):
                 if kinds and ros_names.is_of_application(service, kinds[0]):

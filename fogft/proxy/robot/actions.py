@@ -24,6 +24,7 @@ from typing import Any
 
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Effect, Refusal
+from fogft.model.replica import short
 from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.requests.decide import Decide, Judgement, Means, Pending, Reachable, Send
@@ -223,8 +224,8 @@ class _GoalPart(Decide):
                     id, goal = os.urandom(REQUEST_ID_BYTES), goals.goal_of(payload)
                     self._action.goals.gave(goal, id, replica, now + timeout_s)
                     found.append(Send(replica, id, payload, timeout_s))
-                    log.info("goal_sent_again service=%s replica=%d.%d goal=%s", self._name,
-                             replica >> 32, replica & 0xFFFFFFFF, goal.hex())  # fmt: skip
+                    log.info("goal_sent_again service=%s replica=%s goal=%s", self._name,
+                             short(replica), goal.hex())  # fmt: skip
         return found
 
     def declined(self, id: bytes, replica: int, now: float) -> None:

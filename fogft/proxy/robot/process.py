@@ -27,6 +27,7 @@ from fogft.metrics.spans import Spans, wanted
 from fogft.model import names
 from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig
+from fogft.model.replica import short
 from fogft.model.spec import Part, ServiceSpec
 from fogft.model.type_definition import RESPONSE
 from fogft.process import Watchdog, begin_start, end_start, notify, start_log, stop_on_signal
@@ -169,8 +170,7 @@ def make_dispatcher(
 
 
 def _replica_disagrees(service: str, replica: int, count: int) -> None:
-    log.error("replica_disagrees service=%s replica=%d.%d count=%d",
-              service, replica >> 32, replica & 0xFFFFFFFF, count)  # fmt: skip
+    log.error("replica_disagrees service=%s replica=%s count=%d", service, short(replica), count)
 
 
 class _Running:

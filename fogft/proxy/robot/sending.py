@@ -181,6 +181,5 @@ class Sender:
 
 
 def key_of(link: Link) -> int:
-    """Return a small number for the replica of a link: slot and generation."""
-    id = link.peer.id
-    return id.slot << 32 | id.generation
+    """Return the key of a link's replica."""
+    return link.peer.id.key
