@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from fogft.errors import RosError
 from fogft.model import ros_names
 from fogft.model.topic import Quality
-from fogft.ros import farewell, topic_ends, vendors
+from fogft.ros import cyclone, farewell, topic_ends, vendors
 from fogft.ros.entities import Client, Server
 from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
 from fogft.ros.pacing.client_probes import NodeProbes
@@ -205,15 +205,19 @@ class SerialisedNode:
 
         Args:
             service: Its absolute name.
-            client: The first 16 bytes of a request's handle: the reader of its responses.
+            client: The first 16 bytes of a request's handle: the reader of its responses, or
+                under CycloneDDS what stands for the writer of its requests.
         """
-        readers = self._endpoints(self._node.get_subscriptions_info_by_topic, f"rr{service}Reply")
-        nodes = {bytes(r.endpoint_gid)[:16]: (r.node_name, r.node_namespace) for r in readers}
+        if self._middleware == "rmw_cyclonedds_cpp":
+            client = cyclone.writer_of(client, self._context.get_domain_id())
+            find, topic = self._node.get_publishers_info_by_topic, f"rq{service}Request"
+        else:
+            find, topic = self._node.get_subscriptions_info_by_topic, f"rr{service}Reply"
+        ends = self._endpoints(find, topic)
+        nodes = {bytes(end.endpoint_gid)[:16]: (end.node_name, end.node_namespace) for end in ends}
         if client not in nodes:
             return None
-        processes = {
-            reader[: farewell.PREFIX_BYTES] for reader in nodes if nodes[reader] == nodes[client]
-        }
+        processes = {end[: farewell.PREFIX_BYTES] for end in nodes if nodes[end] == nodes[client]}
         return ClientNode(*nodes[client], unique=len(processes) == 1)
 
     def participant(self, service: str) -> bytes:

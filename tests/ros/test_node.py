@@ -16,6 +16,9 @@ from typing import Any
 import pytest
 
 from fogft.errors import RosError
+from fogft.ros import cyclone
+from fogft.ros.port import ClientNode
+from tests.needs import needs
 
 from .conftest import LIMIT_S, SET_BOOL, wait_for
 
@@ -35,6 +38,7 @@ def echo_pair(make_node: Callable[[int], Any], domain: int) -> tuple[Any, Any]:
     return server, client
 
 
+@needs("fastdds")
 def test_no_other_user_can_read_what_a_node_sends(
     make_node: Callable[[int], Any], ros_domain: int
 ) -> None:
@@ -44,6 +48,44 @@ def test_no_other_user_can_read_what_a_node_sends(
     segments = set(re.findall(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]{16}\b", maps))
     assert segments
     assert {Path(one).stat().st_mode & 0o777 for one in segments} == {0o600}
+
+
+def test_a_requests_handle_tells_whose_client_asked(ros_domain: int) -> None:
+    """Whatever the middleware's handles are made of; of two clients, each has its own node."""
+    from fogft.ros.node import SerialisedNode
+
+    handles: list[bytes] = []
+    with (
+        closing(SerialisedNode("offers", ros_domain)) as offers,
+        closing(SerialisedNode("one", ros_domain)) as one,
+        closing(SerialisedNode("two", ros_domain)) as two,
+    ):
+        offers.serve("/flag", SET_BOOL, lambda _, handle: handles.append(handle))
+        for n, node in enumerate((one, two)):
+            client = node.client("/flag", SET_BOOL)
+            wait_for(client.available, "discovery")
+            client.call(TRUE, lambda _: None)
+            wait_for(lambda n=n: len(handles) > n, "the request")
+        for name, handle in zip(("one", "two"), handles, strict=True):
+            expected = ClientNode(name, "/", unique=True)
+            wait_for(
+                lambda handle=handle, expected=expected: (
+                    offers.node_of("/flag", handle[:16]) == expected
+                ),
+                name,
+            )
+
+
+def test_no_writer_is_known_where_cyclone_dds_is_not_loaded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nor is it loaded: in a process with another DDS it would be a second one."""
+    monkeypatch.setattr(cyclone, "_LIBRARY", "libddsc.so.none")
+    cyclone._library.cache_clear()
+    try:
+        assert cyclone.writer_of(bytes(16), 0) == b""
+    finally:
+        cyclone._library.cache_clear()
 
 
 def test_a_node_never_takes_another_of_its_name_for_itself(ros_domain: int) -> None:

@@ -1,0 +1,68 @@
+"""Who sent a request that CycloneDDS received.
+
+Elsewhere a request's header names its client by an identifier that discovery knows. Here it holds
+two numbers: the client's own, and one by which this process alone knows the writer of its
+requests. Only CycloneDDS can tell whose it is.
+
+Owns: that question. Not here: which node a writer belongs to (`node`).
+"""
+
+from __future__ import annotations
+
+import os
+from ctypes import CDLL, c_int32, c_size_t, c_uint32, c_uint64, c_void_p, string_at
+from functools import lru_cache
+from typing import Any
+
+_LIBRARY = "libddsc.so.0"  # of CycloneDDS 0.x, which every ROS distribution up to Kilted has
+_IDENTIFIER_BYTES = 16
+_MOST = 1024  # children of one entity that are looked at
+_SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
+    "dds_lookup_participant": (c_int32, (c_uint32, c_void_p, c_size_t)),
+    "dds_get_children": (c_int32, (c_int32, c_void_p, c_size_t)),
+    "dds_get_matched_publication_data": (c_void_p, (c_int32, c_uint64)),
+    "dds_builtintopic_free_endpoint": (None, (c_void_p,)),
+}
+
+
+@lru_cache(maxsize=1)
+def _library() -> Any:
+    """Return the library that this process has loaded; None if it has none, or another one."""
+    try:
+        library = CDLL(_LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
+        for name, (result, arguments) in _SIGNATURES.items():
+            function = getattr(library, name)
+            function.restype, function.argtypes = result, arguments
+    except (OSError, AttributeError):
+        return None
+    return library
+
+
+def writer_of(client: bytes, domain_id: int) -> bytes:
+    """Return the identifier of the writer of a client's requests; empty if it is not known.
+
+    Args:
+        client: The first 16 bytes of a request's handle.
+        domain_id: The ROS domain that it came in.
+    """
+    library = _library()
+    if library is None:
+        return b""
+    number = int.from_bytes(client[8:16], "little")
+    for participant in _entities(library.dds_lookup_participant, domain_id):
+        for subscriber in _entities(library.dds_get_children, participant):
+            for reader in _entities(library.dds_get_children, subscriber):
+                # NULL for what is no reader, and for one of another topic.
+                found = library.dds_get_matched_publication_data(reader, number)
+                if found:
+                    try:
+                        return string_at(found, _IDENTIFIER_BYTES)
+                    finally:
+                        library.dds_builtintopic_free_endpoint(found)
+    return b""
+
+
+def _entities(find: Any, of: int) -> list[int]:
+    found = (c_int32 * _MOST)()
+    count: int = find(of, found, _MOST)
+    return list(found[: max(0, min(count, _MOST))])
