@@ -38,7 +38,7 @@ while True:
 """
 
 
-@needs("build")
+@needs("build", "fastdds")
 def test_a_standby_whose_clock_is_set_back_stays_known(
     ros_domain: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
