@@ -39,7 +39,8 @@ class Joined(NamedTuple):
     Over Zenoh there is none to see: `/diagnostics` and parameters need types.
 
     `participant` returns the id in DDS of who offers a service here, and `callers` counts who may
-    call it; nothing where that is not known.
+    call it; nothing where that is not known. `identity` returns what each process that received a
+    request knows it by, of its handle.
     """
 
     node: RosNode
@@ -47,6 +48,7 @@ class Joined(NamedTuple):
     make_visible: Callable[[str, Judge], VisibleNode | None] = lambda name, judge: None
     participant: Callable[[str], bytes] = lambda service: b""
     callers: Callable[[str], int] = lambda service: 0
+    identity: Callable[[Any], Any] = lambda handle: handle
 
 
 def prepare(speaks: Speaks) -> None:
@@ -114,7 +116,7 @@ def join(
 
         serialised = SerialisedNode(name, domain_id, early=early)
         seen = serialised.make_visible, serialised.participant, serialised.callers
-        return Joined(serialised, definition, *seen)
+        return Joined(serialised, definition, *seen, serialised.identity)
     from fogft.rmw_zenoh.node import RmwZenohNode
 
     def hash_of(type_name: str) -> str:

@@ -1,21 +1,24 @@
-"""Who sent a request that CycloneDDS received.
+"""Which request CycloneDDS received, and who sent it.
 
 Elsewhere a request's header names its client by an identifier that discovery knows. Here it holds
 two numbers: the client's own, and one by which this process alone knows the writer of its
 requests. Only CycloneDDS can tell whose it is.
 
-Owns: that question. Not here: which node a writer belongs to (`node`).
+Owns: what that header means. Not here: which node a writer belongs to (`node`).
 """
 
 from __future__ import annotations
 
 import os
+import sys
 from ctypes import CDLL, c_int32, c_size_t, c_uint32, c_uint64, c_void_p, string_at
 from functools import lru_cache
 from typing import Any
 
+MIDDLEWARE = "rmw_cyclonedds_cpp"
 _LIBRARY = "libddsc.so.0"  # of CycloneDDS 0.x, which every ROS distribution up to Kilted has
 _IDENTIFIER_BYTES = 16
+_OF_THIS_PROCESS = slice(8, 16)  # of a request's handle
 _MOST = 1024  # children of one entity that are looked at
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "dds_lookup_participant": (c_int32, (c_uint32, c_void_p, c_size_t)),
@@ -38,6 +41,11 @@ def _library() -> Any:
     return library
 
 
+def identity(handle: bytes) -> bytes:
+    """Return what of a request's handle is the same in each process that received it."""
+    return handle[: _OF_THIS_PROCESS.start] + handle[_OF_THIS_PROCESS.stop :]
+
+
 def writer_of(client: bytes, domain_id: int) -> bytes:
     """Return the identifier of the writer of a client's requests; empty if it is not known.
 
@@ -48,7 +56,7 @@ def writer_of(client: bytes, domain_id: int) -> bytes:
     library = _library()
     if library is None:
         return b""
-    number = int.from_bytes(client[8:16], "little")
+    number = int.from_bytes(client[_OF_THIS_PROCESS], sys.byteorder)
     for participant in _entities(library.dds_lookup_participant, domain_id):
         for subscriber in _entities(library.dds_get_children, participant):
             for reader in _entities(library.dds_get_children, subscriber):

@@ -208,7 +208,7 @@ class SerialisedNode:
             client: The first 16 bytes of a request's handle: the reader of its responses, or
                 under CycloneDDS what stands for the writer of its requests.
         """
-        if self._middleware == "rmw_cyclonedds_cpp":
+        if self._middleware == cyclone.MIDDLEWARE:
             client = cyclone.writer_of(client, self._context.get_domain_id())
             find, topic = self._node.get_publishers_info_by_topic, f"rq{service}Request"
         else:
@@ -219,6 +219,10 @@ class SerialisedNode:
             return None
         processes = {end[: farewell.PREFIX_BYTES] for end in nodes if nodes[end] == nodes[client]}
         return ClientNode(*nodes[client], unique=len(processes) == 1)
+
+    def identity(self, handle: bytes) -> bytes:
+        """Return what tells a request, of its handle, to each process that received it."""
+        return cyclone.identity(handle) if self._middleware == cyclone.MIDDLEWARE else handle
 
     def participant(self, service: str) -> bytes:
         """Return the first bytes of our DDS participant's id; empty before `service` is offered.

@@ -76,6 +76,46 @@ def test_a_requests_handle_tells_whose_client_asked(ros_domain: int) -> None:
             )
 
 
+TELLS = """
+import sys
+from fogft.ros.node import SerialisedNode
+node = SerialisedNode("standby", int(sys.argv[1]))
+node.serve("/flag", "std_srvs/srv/SetBool",
+           lambda _, handle: print(node.identity(handle).hex(), flush=True))
+sys.stdin.read()
+node.close()
+"""
+
+
+def test_two_processes_tell_a_request_by_the_same(ros_domain: int) -> None:
+    """As a client proxy and the one that takes over do, or each would have it run."""
+    from fogft.ros.node import SerialisedNode
+
+    told: list[str] = []
+    with (
+        subprocess.Popen(
+            [sys.executable, "-c", TELLS, str(ros_domain)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+        ) as standby,
+        closing(SerialisedNode("leaving", ros_domain)) as leaving,
+        closing(SerialisedNode("asks", ros_domain)) as asks,
+    ):  # fmt: skip
+        assert standby.stdin is not None
+        assert standby.stdout is not None
+        leaving.serve(
+            "/flag", SET_BOOL, lambda _, handle: told.append(leaving.identity(handle).hex())
+        )
+        client = asks.client("/flag", SET_BOOL)
+        wait_for(lambda: client.servers() == 2, "discovery")
+        for n in range(3):
+            client.call(TRUE, lambda _: None)
+            wait_for(lambda n=n: len(told) > n, "the request")
+        theirs = [standby.stdout.readline().strip() for _ in told]
+        standby.stdin.close()
+    assert theirs == told
+    assert len(set(told)) == 3
+
+
 def test_no_writer_is_known_where_cyclone_dds_is_not_loaded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -207,7 +207,7 @@ class _Running:
             pool_uid=config.pool_uid,
             actions=Actions(),
             speaks=config.rmw,
-            id_of=in_line.request_ids(config.credentials.key),
+            id_of=in_line.request_ids(config.credentials.key, joined.identity),
             held=lambda: self.held,
         )
         self.dialer, merge = make_dialer(config), merged_status

@@ -116,11 +116,15 @@ def _taken(lock: disk.Lock) -> threading.Event:
     return taken
 
 
-def request_ids(key: Path) -> Callable[[str, Any], bytes]:
+def request_ids(key: Path, identity: Callable[[Any], Any]) -> Callable[[str, Any], bytes]:
     """Return what gives requests their ids: both proxies of a robot give a request the same.
 
     Others cannot guess it: the robot's private key is part of it. A request without an id of ROS's
     own gets a random one.
+
+    Args:
+        key: The file of the robot's private key.
+        identity: Returns what both proxies know a request by, of its handle.
     """
     try:
         secret = hashlib.sha256(key.read_bytes()).digest()
@@ -130,7 +134,7 @@ def request_ids(key: Path) -> Callable[[str, Any], bytes]:
     def id_of(service: str, handle: Any) -> bytes:
         if not isinstance(handle, bytes):
             return os.urandom(REQUEST_ID_BYTES)
-        told = service.encode() + b"\0" + handle
+        told = service.encode() + b"\0" + identity(handle)
         return hashlib.blake2b(told, key=secret, digest_size=REQUEST_ID_BYTES).digest()
 
     return id_of
