@@ -117,7 +117,8 @@ def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     for pid in (manager, proxy):
         os.kill(pid, signal.SIGKILL)
     pool.fogft("down")
-    assert pool.left() == {}
+    # The proxy may have started a manager before it was killed too: that finds no pool and ends.
+    pool.wait(lambda: not pool.left())
     pool.fogft("down", ok=False)
 
 
