@@ -27,9 +27,12 @@ def tied(command: Sequence[str]) -> list[str]:
 
 def how_it_ended(status: int) -> str:
     """Return in words how a process ended, from its return code: negative for a signal."""
-    if status < 0:
+    if status >= 0:
+        return f"exited with status {status}"
+    try:
         return f"was killed by {signal.Signals(-status).name}"
-    return f"exited with status {status}"
+    except ValueError:  # a real-time signal
+        return f"was killed by signal {-status}"
 
 
 def detached(

@@ -232,8 +232,8 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.SLEPT: "this machine slept for {r.seconds:.0f} s",
     Cause.NO_PROXY_REPORT: "the client proxy has not reported yet",
     Cause.STALE_PROXY_REPORT: "the client proxy has not reported lately",
-    Cause.PROXY_KEEPS_ENDING: (
-        "the client proxy {r.words}, {r.count} times in a row; see its log, `{r.name}`"
+    Cause.PROXY_KEEPS_ENDING: lambda r: (
+        f"the client proxy {r.words or 'exited'}, {r.count} times in a row; see its log, `{r.name}`"
     ),
     Cause.NO_CERTIFICATE: (
         "gateway `{r.name}` has no certificate: `fogft credentials issue gateway {r.name}`"

@@ -78,6 +78,7 @@ class UplinksLink:
         self._attempts: dict[bytes, _Attempt] = {}
         self._again: list[bytes] = []  # on no uplink now
         self._answered: OrderedDict[bytes, None] = OrderedDict()
+        self._forgotten: OrderedDict[bytes, int] = OrderedDict()  # and how many uplinks may tell
         self._current: int | None = None
         self._closed = False
         self._links: list[Link] = []
@@ -167,6 +168,10 @@ class UplinksLink:
         with self._lock:
             attempt = self._attempts.pop(request_id, None)
             on = tuple(attempt.on) if attempt is not None else ()
+            if len(on) > 1:
+                self._forgotten[request_id] = len(on)
+                if len(self._forgotten) > _ANSWERED_KEPT:
+                    self._forgotten.popitem(last=False)
         for index in on:
             self._links[index].forget(request_id)
 
@@ -248,10 +253,18 @@ class UplinksLink:
         self._events.answered(self, answer)
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Report wasted work; a second copy of an answer is not one: the replica ran it once."""
+        """Report wasted work, once: a second copy of an answer is not one.
+
+        That it was dropped on one uplink says nothing while another may tell more.
+        """
+        id = answer.request_id
         with self._lock:
-            copy = answer.request_id in self._answered
-        if not copy:
+            may_tell = self._forgotten.get(id, 1)
+            waits = answer.refusal is Refusal.CANCELLED and may_tell > 1
+            if id in self._forgotten:
+                self._forgotten[id] = may_tell - 1 if waits else 0
+            told = id in self._answered or may_tell == 0
+        if not told and not waits:
             self._events.late(self, answer)
 
     def changed(self, link: Link) -> None:

@@ -21,7 +21,7 @@ from tests.estimates import percentile
 from tests.nightly import NIGHTLY, by_day
 from tests.rmw_zenoh import rmw_router
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
+pytestmark = [pytest.mark.ros, pytest.mark.timeout(1800 if NIGHTLY else 180)]
 
 COUNT, PER_S = by_day(50, at_night=2000), 40.0
 SLEEP_S = 0.01

@@ -88,6 +88,24 @@ def test_all_sends_on_each_and_takes_the_first_answer():
     assert scene.owner.too_late == []  # the replica ran it once: nothing was in vain
 
 
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_copy_that_was_dropped_on_one_uplink_ends_nothing_while_another_runs(order):
+    """Whatever comes first, the replica's work on a request is told of once."""
+    scene = Scene("all")
+    assert scene.offer()
+    scene.link.forget(ID)
+    told = [Answer(ID, refusal=Refusal.CANCELLED), Answer(ID, b"ran")]
+    for at in order:
+        one = scene.uplinks[at]
+        one.events.late(one, told[at])
+        assert scene.owner.too_late == ([] if at == 0 and order == (0, 1) else [ID])
+    scene.offer(b"j" * 16)
+    scene.link.forget(b"j" * 16)
+    for one in scene.uplinks:  # sent on neither
+        one.events.late(one, Answer(b"j" * 16, refusal=Refusal.CANCELLED))
+    assert scene.owner.too_late == [ID, b"j" * 16]
+
+
 def test_each_service_has_its_own_policy():
     """Over the same links at the same time."""
     scene = Scene("all")

@@ -7,6 +7,7 @@ Not here: reading and following them (`fogft.cli.status`).
 from __future__ import annotations
 
 import contextlib
+import sys
 from pathlib import Path
 
 from fogft.cloud.port import Cloud
@@ -24,7 +25,8 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
     Of one slot where it is given: then only those of its replicas.
     """
     uid = store.identity().uid
-    launched = {(e.slot, e.generation) for e in store.recent(EVENTS) if e.kind not in OF_NO_REPLICA}
+    events = [e for e in store.recent(sys.maxsize) if e.kind not in OF_NO_REPLICA]
+    launched = {(e.slot, e.generation) for e in events[-EVENTS:]}
     with contextlib.suppress(CloudError):
         launched |= {(m.id.slot, m.id.generation) for m in cloud.machines(uid)}
     found = []

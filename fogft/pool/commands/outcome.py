@@ -50,13 +50,14 @@ class Awaited:
             return Outcome.RUN_KEEPS_ENDING if hopeless else Outcome.PENDING
         if seen.status.update is not None and seen.status.update.fault:
             return Outcome.WITHDRAWN
+        if self.is_answering(seen):
+            return Outcome.ANSWERING
         if keeps_ending(seen):
             return Outcome.RUN_KEEPS_ENDING
         if types_differ(seen):
             return Outcome.TYPES_DIFFER
-        if is_given_up(seen) and seen.status.observed_at >= self.since:
-            return Outcome.NEVER_READY
-        return Outcome.ANSWERING if self.is_answering(seen) else Outcome.PENDING
+        given_up = is_given_up(seen) and seen.status.observed_at >= self.since
+        return Outcome.NEVER_READY if given_up else Outcome.PENDING
 
     def is_updating(self, seen: Seen) -> bool:
         """Whether the awaited update is still in progress."""

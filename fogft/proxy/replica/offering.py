@@ -69,18 +69,18 @@ class Offering:
         """Forget the services seen, because `run` has exited."""
         self._seen, self._seen_since = {}, self._clock()
 
-    @property
-    def told(self) -> dict[str, str]:
+    def told(self, ready: frozenset[str]) -> dict[str, str]:
         """Return name -> type of the services to tell, once stable; else nothing.
 
         All that were discovered, or those listed that `run` offers as another type.
         """
         if self._clock() < self._seen_since + SETTLED_S:
             return {}
-        return dict(self._seen) if self._finds_out else self._mistyped()
+        return dict(self._seen) if self._finds_out else self._mistyped(ready)
 
-    def _mistyped(self) -> dict[str, str]:
-        offered = ((one, self._seen.get(one.name, one.type)) for one in self.services)
+    def _mistyped(self, ready: frozenset[str]) -> dict[str, str]:
+        missing = (one for one in self.services if one.name not in ready)
+        offered = ((one, self._seen.get(one.name, one.type)) for one in missing)
         return {one.name: found for one, found in offered if found != one.type}
 
     def types(self) -> dict[str, Definition]:
@@ -103,7 +103,7 @@ class Offering:
             limit = f"{NAMES_BYTES_LIMIT} bytes in total"
             return f"{what} {limit}" if self._left_out and self._finds_out else ""
         listed = {service.name: service.type for service in self.services}
-        for name, offered in self._mistyped().items():
+        for name, offered in self._mistyped(ready).items():
             return f"`run` offers {name} as {offered}, not as {listed[name]}"
         others = [f"{n} ({t})" for n, t in sorted(self._seen.items()) if listed.get(n) != t]
         more = "; it offers " + ", ".join(others[:_TOLD]) if others else ""

@@ -391,7 +391,7 @@ class ServerProxy:
             + sum(ordered.in_flight for ordered in self._ordered.values()),
             detail=self._detail(),
             work=self._work(),
-            offered=self._offering.told,
+            offered=self._offering.told(self.ready),
             types=self._offering.types() if probe.describe else {},
             hanging=frozenset(self._hanging()),
             version=__version__,

@@ -147,7 +147,8 @@ class TypeCheck:
         found = {}
         for service in services:
             theirs = answer.types.get(service.type)
-            if (offered := answer.offered.get(service.name, service.type)) != service.type:
+            offered = answer.offered.get(service.name, service.type)
+            if offered != service.type and service.name not in answer.ready:
                 found[service.name] = (
                     f"`run` offers {service.name} as {offered}, not as {service.type}"
                 )

@@ -48,6 +48,7 @@ def updated(state: UpdateState | None, *, applied: str = "new", fault: str = "",
         (replace(UP, services=SILENT, replicas=(HOPELESS,)), Outcome.RUN_KEEPS_ENDING),
         (replace(UP, services=SILENT, replicas=(HOPELESS, STARTING)), Outcome.PENDING),
         (replace(UP, services=SILENT, replicas=(LEAVING,)), Outcome.PENDING),
+        (replace(UP, replicas=(LEAVING, HOPELESS)), Outcome.ANSWERING),  # one that leaves answers
         (replace(UP, services=SILENT, replicas=(LEAVING, HOPELESS)), Outcome.RUN_KEEPS_ENDING),
         (
             replace(UP, services=SILENT, replicas=(replace(STARTING, differs=True),)),

@@ -107,6 +107,8 @@ def test_a_replica_whose_type_is_another_names_both():
     assert scene.probe().offered == {}
     scene.clock.now += SETTLED_S
     assert scene.probe().offered == {"/s": "a_b/srv/C"}
+    scene.proxy.ready = frozenset({"/s"})  # of two that have the name, one has the type
+    assert scene.probe().offered == {}
     scene.node.clients["/s"].there = True  # it was mended there, without a restart of `run`
     scene.look()
     scene.look()

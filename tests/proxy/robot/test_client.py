@@ -303,14 +303,15 @@ def test_a_replica_that_offers_the_service_as_another_type_says_so():
     scene = Scene()
     scene.follow(member(0))
     [link] = scene.dialer.links
-    link.told = replace(told(0, "boolean"), types={}, offered={"/s": "a_b/srv/C", "/t": SET_BOOL})
+    offered = {"/s": "a_b/srv/C", "/t": SET_BOOL}
+    link.told = replace(told(0, "boolean"), types={}, ready=frozenset(), offered=offered)
     scene.ready(link)
     [report] = scene.proxy.report()["links"]
     assert (report["differing"], report["detail"]) == (
         ["/s"],
         f"`run` offers /s as a_b/srv/C, not as {SET_BOOL}",
     )
-    link.told = replace(link.told, offered={})
+    link.told = replace(link.told, ready=frozenset({"/s"}))  # `run` finds out what it offers
     scene.ready(link)
     assert not scene.proxy.report()["links"][0]["differs"]
 

@@ -306,7 +306,7 @@ class ZenohListener:
         return self._counters.snapshot()
 
     def refusals(self) -> Mapping[str, int]:
-        """Return how many requests and messages were refused, by the refusal's value."""
+        """Return how many requests and messages their receivers refused, by the refusal's value."""
         return self._queues.refusals.snapshot()
 
     def close(self) -> None:

@@ -320,11 +320,11 @@ class Attempts:
             self._skipped(attempt)
             return
         remaining_s = attempt.deadline - time.monotonic()
-        if remaining_s <= 0:
-            self._end(attempt, Refusal.LOST)
-            return
-        if not self._deadline.may_arrive(attempt, remaining_s, time.monotonic()):
-            self._end(attempt, Refusal.TOO_SLOW)
+        if remaining_s <= 0 or not self._deadline.may_arrive(
+            attempt, remaining_s, time.monotonic()
+        ):
+            self._end(attempt, Refusal.LOST if remaining_s <= 0 else Refusal.TOO_SLOW)
+            self._skipped(attempt)  # if it was forgotten just now
             return
         large = attempt.size >= LARGE_BYTES
         turn = self._gate.take() if large else None
