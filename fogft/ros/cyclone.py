@@ -16,7 +16,7 @@ from functools import lru_cache
 from typing import Any
 
 MIDDLEWARE = "rmw_cyclonedds_cpp"
-_LIBRARY = "libddsc.so.0"  # of CycloneDDS 0.x, which every ROS distribution up to Kilted has
+LIBRARY = "libddsc.so.0"  # of CycloneDDS 0.x, which every ROS distribution up to Kilted has
 _IDENTIFIER_BYTES = 16
 _OF_THIS_PROCESS = slice(8, 16)  # of a request's handle
 _MOST = 1024  # children of one entity that are looked at
@@ -29,10 +29,10 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 
 @lru_cache(maxsize=1)
-def _library() -> Any:
+def loaded_library() -> Any:
     """Return the library that this process has loaded; None if it has none, or another one."""
     try:
-        library = CDLL(_LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
+        library = CDLL(LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
         for name, (result, arguments) in _SIGNATURES.items():
             function = getattr(library, name)
             function.restype, function.argtypes = result, arguments
@@ -53,7 +53,7 @@ def writer_of(client: bytes, domain_id: int) -> bytes:
         client: The first 16 bytes of a request's handle.
         domain_id: The ROS domain that it came in.
     """
-    library = _library()
+    library = loaded_library()
     if library is None:
         return b""
     number = int.from_bytes(client[_OF_THIS_PROCESS], sys.byteorder)

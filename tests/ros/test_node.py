@@ -120,12 +120,12 @@ def test_no_writer_is_known_where_cyclone_dds_is_not_loaded(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Nor is it loaded: in a process with another DDS it would be a second one."""
-    monkeypatch.setattr(cyclone, "_LIBRARY", "libddsc.so.none")
-    cyclone._library.cache_clear()
+    monkeypatch.setattr(cyclone, "LIBRARY", "libddsc.so.none")
+    cyclone.loaded_library.cache_clear()
     try:
         assert cyclone.writer_of(bytes(16), 0) == b""
     finally:
-        cyclone._library.cache_clear()
+        cyclone.loaded_library.cache_clear()
 
 
 def test_a_node_never_takes_another_of_its_name_for_itself(ros_domain: int) -> None:
