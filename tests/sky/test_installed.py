@@ -554,7 +554,7 @@ def test_an_api_server_of_another_skypilot_is_named_and_ended_only_when_idle(
     sdk.api_info.return_value = SimpleNamespace(version="0.9.0")
     sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="RUNNING")]
     assert (
-        f"is 0.9.0, and {sky.__version__} is installed here: it is busy" in installed.renew_server()
+        f"is 0.9.0, but {sky.__version__} is installed here: it is busy" in installed.renew_server()
     )
     sdk.api_stop.assert_not_called()
     sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="SUCCEEDED")]
