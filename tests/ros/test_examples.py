@@ -53,7 +53,10 @@ def test_echo(ros_domain):
     folder = template_files.folder() / "echo"
     with service(folder, ros_domain, "echo_service.py") as (environment, _):
         done = call(folder, environment, "echo_client.py", "--count", "2")
-    assert (done.returncode, done.stdout) == (0, "heard True\nheard False\n")
+        if done.stderr.startswith("request 0: no answer"):
+            # Nothing of fogft is between them: DDS drops what it sends before it knows the reader.
+            done = call(folder, environment, "echo_client.py", "--count", "2")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "heard True\nheard False\n", "")
 
 
 def test_echo_without_a_service(ros_domain):
