@@ -155,10 +155,10 @@ class Reconciler:
         Raises:
             StateError: Something cannot be read or written; nothing was launched for it.
         """
+        if self._time.look():  # first: who waits for a change trusts what is dated after it
+            self._silent = Silent()
         identity, spec, intent = self._store.identity(), self._store.spec(), self._store.intent()
         history = self._store.history()
-        if self._time.look():
-            self._silent = Silent()
         self._settle_outcomes()
         observed, trouble = self._observe(identity, spec)
         asked, (spec, trial) = spec, self._updating.look(identity.uid, observed, history)
