@@ -96,11 +96,9 @@ def up(
             output.say("aborted: nothing was changed")
             raise typer.Exit(1)
     limit_s = timeout or (progress.REAL_LIMIT_S if order.costs_money else progress.LIMIT_S)
-    applied_at = time.time()
     if startup.start(order) and not order.is_new and not upgrades:
         output.say("the pool had no manager: started a new one")
-    if upgrades:
-        applied_at = time.time()  # what the old manager saw says nothing of the new one's work
+    applied_at = time.time()  # what was seen before, or by an old manager, says nothing of it
     name = order.spec.name
     replaces = order.replaces_replicas or order.rolled_back or under_way or upgrades
     awaited = Awaited(
