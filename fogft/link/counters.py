@@ -3,8 +3,6 @@
 Owns: numbers. Not here: what they are shown as (`fogft.proxy`, `fogft.pool`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import Counter

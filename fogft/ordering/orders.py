@@ -9,8 +9,6 @@ Not here: who sends which order (`sequencer`) and what becomes of it (`replica`)
 Protocol: docs/design/state.md.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from enum import IntEnum

@@ -7,8 +7,6 @@ does not take stops the reading, so backpressure is the kernel's own.
 Not here: who sets the faults (`chaos`).
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

@@ -10,8 +10,6 @@ closes a session is waited for at exit, though not for long: towards a frozen pe
 seconds.
 """
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import logging

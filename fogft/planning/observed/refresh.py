@@ -10,8 +10,6 @@ Owns: who is due.
 Not here: asking (`fogft.cloud`), on a thread of its own (`fogft.pool.manager.operations`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

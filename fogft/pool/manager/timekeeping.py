@@ -9,8 +9,6 @@ Not here: when to look at replicas (`reconciler`), where events are stored (`sto
 is (`planning.observed.clock_jumps`), and what moves (`planning.observed.history`, `updating`).
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable
