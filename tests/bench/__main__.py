@@ -64,6 +64,7 @@ def measurements() -> dict[str, Callable[..., Rows]]:
     found["images"] = images.images
     found["bursts"] = graph.bursts
     found["first"] = first.first
+    found["lone"] = first.lone
     found["uplink"] = uplink.uplink
     return found
 

@@ -1,81 +1,140 @@
-"""A client's first calls: two new clients of one node at once, and a node killed with calls open.
+"""A client's first calls, and what pacing costs one that asks for nothing more.
 
-`ours` is a serialised node, as proxies have, `direct` a plain rclpy one. A plain rclpy client is
-started anew, as a process, for each time, before the one and the other in turns.
+`ours` is a serialised node, as proxies have, `direct` a plain rclpy one, and of `unpaced` the
+second service sends each response at once. For its first calls a plain rclpy client is started
+anew, as a process, for each time, before the one and the other in turns.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
+import random
 import signal
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from tests.bench.caller import milliseconds
 from tests.bench.rig import free_domains
+from tests.estimates import estimate_of_rounds, median
 
-SERVICES = ("/bench_one", "/bench_two")
+SERVICES, TYPE = ("/bench_one", "/bench_two"), "std_srvs/srv/SetBool"
 _LIMIT_S, _OPEN = 10.0, 20
 
 
-def first(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+def first(_folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     """Measure the time until services are found, and until the first calls are answered."""
     times = 3 if quick else 20
     rows = []
-    with (folder / "log").open("wb") as log:
-        kinds = dict(zip(("ours", "direct"), free_domains(2), strict=True))
-        servers = [_start("serve", kind, domain, log) for kind, domain in kinds.items()]
-        try:
-            for server in servers:
-                assert server.stdout is not None
-                server.stdout.readline()
-            for what in ("two clients at once", "killed with 20 calls open"):
-                found: dict[str, list[list[float]]] = {kind: [] for kind in kinds}
-                for _ in range(times):
-                    for kind, domain in kinds.items():
-                        if what.startswith("killed"):
-                            _start("die", kind, domain, log).wait()
-                        text = _start("call", kind, domain, log).communicate()[0]
-                        found[kind].append([float(word) for word in text.split()])
-                for kind, runs in found.items():
-                    ready, answered = zip(*runs, strict=True)
-                    row = {"what": what, "server": kind, "times": times}
-                    row |= {"ready_s": sorted(ready)[times // 2], "longest_ready_s": max(ready)}
-                    in_time = [s for s in answered if s < _LIMIT_S]
-                    row |= {"longest_s": max(in_time, default=0.0), "lost": times - len(in_time)}
-                    rows.append(row)
-        finally:
-            for server in servers:
-                server.kill()
-                server.wait()
+    with _servers("ours", "direct") as domains:
+        for what in ("two clients at once", "killed with 20 calls open"):
+            found: dict[str, list[list[float]]] = {kind: [] for kind in domains}
+            for _ in range(times):
+                for kind, domain in domains.items():
+                    if what.startswith("killed"):
+                        _start("die", kind, domain).wait()
+                    text = _start("call", kind, domain).communicate()[0]
+                    found[kind].append([float(word) for word in text.split()])
+            for kind, runs in found.items():
+                ready, answered = zip(*runs, strict=True)
+                row = {"what": what, "server": kind, "times": times}
+                row |= {"ready_s": sorted(ready)[times // 2], "longest_ready_s": max(ready)}
+                row |= {"median_s": median(answered)}
+                in_time = [s for s in answered if s < _LIMIT_S]
+                row |= {"longest_s": max(in_time, default=0.0), "lost": times - len(in_time)}
+                rows.append(row)
     return rows
 
 
-def _start(role: str, kind: str, domain: int, log: Any) -> subprocess.Popen[bytes]:
+def lone(_folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Compare a lone caller's times with those of responses that are not paced, in turns."""
+    from fogft.ros.node import SerialisedNode
+
+    rounds = 20 if quick else 100
+    took: dict[str, list[float]] = {"ours": [], "unpaced": []}  # the median of each round
+    with _servers("unpaced") as domains:
+        node = SerialisedNode("bench_lone", domains["unpaced"])
+        calls = {k: _timed(node.client(s, TYPE)) for k, s in zip(took, SERVICES, strict=True)}
+        for number in range(1 + rounds):
+            for kind in sorted(calls, reverse=bool(number % 2)):
+                sample = milliseconds([calls[kind]() for _ in range(50)])
+                if number:  # the first one warms up
+                    took[kind].append(median(sample))
+        node.close()
+    ratio = estimate_of_rounds(
+        took, lambda s: median(s["ours"]) / median(s["unpaced"]), random.Random(0), resamples=500
+    )
+    row: dict[str, Any] = {"what": "a lone caller", "calls": 50 * rounds}
+    row |= {f"{kind}_ms": median(rounds_ms) for kind, rounds_ms in took.items()}
+    return [row | {"ratio": {"value": ratio.value, "low": ratio.low, "high": ratio.high}}]
+
+
+def _timed(client: Any) -> Callable[[], float]:
+    from rclpy.serialization import serialize_message
+    from std_srvs.srv import SetBool
+
+    request = bytes(serialize_message(SetBool.Request()))
+    while not client.available():
+        time.sleep(0.01)
+
+    def call() -> float:
+        answered = threading.Event()
+        began = time.perf_counter()
+        client.call(request, lambda _: answered.set())
+        if not answered.wait(_LIMIT_S):
+            raise TimeoutError(f"{SERVICES[0]} got no answer")
+        return time.perf_counter() - began
+
+    return call
+
+
+@contextlib.contextmanager
+def _servers(*kinds: str) -> Iterator[dict[str, int]]:
+    """Serve in a domain for each kind; yield the domains."""
+    domains = dict(zip(kinds, free_domains(len(kinds)), strict=True))
+    servers = [_start("serve", kind, domain) for kind, domain in domains.items()]
+    try:
+        for server in servers:
+            assert server.stdout is not None
+            server.stdout.readline()
+        yield domains
+    finally:
+        for server in servers:
+            server.kill()
+            server.wait()
+
+
+def _start(role: str, kind: str, domain: int) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "tests.bench.first", role, kind, str(domain)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log)
+    return subprocess.Popen(command, stdout=subprocess.PIPE)
 
 
 def _serve(kind: str, domain: int) -> None:
     import rclpy
     from std_srvs.srv import SetBool
 
-    if kind == "ours":
+    if kind != "direct":
         from rclpy.serialization import serialize_message
 
+        from fogft.ros import entities
         from fogft.ros.node import SerialisedNode
 
-        answer, ends = bytes(serialize_message(SetBool.Response(success=True))), {}
+        answer = bytes(serialize_message(SetBool.Response(success=True)))
+        ends: dict[str, Any] = {}
         node = SerialisedNode("bench_server", domain)
         for name in SERVICES:
-            ends[name] = node.serve(
-                name,
-                "std_srvs/srv/SetBool",
-                lambda _, handle, name=name: ends[name].respond(handle, answer),
-            )
+            if kind == "unpaced" and ends:
+                vars(entities)["Pacer"] = _Unpaced
+
+            def respond(_: bytes, handle: Any, name: str = name) -> None:
+                ends[name].respond(handle, answer)
+
+            ends[name] = node.serve(name, TYPE, respond)
         print("ready", flush=True)
         signal.pause()
     rclpy.init(domain_id=domain)
@@ -84,6 +143,19 @@ def _serve(kind: str, domain: int) -> None:
         plain.create_service(SetBool, name, lambda _, response: response)
     print("ready", flush=True)
     rclpy.spin(plain)
+
+
+class _Unpaced:
+    """In place of `fogft.ros.pacing.pacer.Pacer`: each response leaves at once."""
+
+    def __init__(self, send: Callable[[Any, bytes], None], *_: Any) -> None:
+        self.respond = send
+
+    def requested(self, handle: Any, *, together: bool = False) -> None:
+        """Note nothing."""
+
+    def close(self) -> None:
+        """Nothing waits."""
 
 
 def _call(role: str, domain: int) -> None:

@@ -62,5 +62,6 @@ def test_there_is_a_measurement_for_each_promise():
         "images",
         "bursts",
         "first",
+        "lone",
         "uplink",
     ]
