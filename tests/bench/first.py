@@ -8,6 +8,7 @@ anew, as a process, for each time, before the one and the other in turns.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import random
 import signal
@@ -19,8 +20,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from tests.bench.caller import milliseconds
-from tests.bench.rig import free_domains
+from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.rig import Rig, free_domains
+from tests.bench.service import FLAG
 from tests.estimates import estimate_of_rounds, median
 
 SERVICES, TYPE = ("/bench_one", "/bench_two"), "std_srvs/srv/SetBool"
@@ -51,27 +53,42 @@ def first(_folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     return rows
 
 
-def lone(_folder: Path, *, quick: bool) -> list[dict[str, Any]]:
-    """Compare a lone caller's times with those of responses that are not paced, in turns."""
+def lone(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
+    """Measure by how much pacing slows a lone caller of a node, and one of a replicated service.
+
+    Calls of a paced and of an unpaced service of one node, and through one replica, take turns.
+    """
     from fogft.ros.node import SerialisedNode
 
     rounds = 20 if quick else 100
-    took: dict[str, list[float]] = {"ours": [], "unpaced": []}  # the median of each round
-    with _servers("unpaced") as domains:
+    took: dict[str, list[float]] = {"ours": [], "unpaced": [], "proxied": []}  # medians of rounds
+    with _servers("unpaced") as domains, Rig(folder, 1) as rig:
         node = SerialisedNode("bench_lone", domains["unpaced"])
-        calls = {k: _timed(node.client(s, TYPE)) for k, s in zip(took, SERVICES, strict=True)}
+        caller = Caller(rig.robot_domain, "bench_proxied")
+        caller.wait()
+        request = payloads()[FLAG[0]]
+        calls = {k: _timed(node.client(s, TYPE)) for k, s in zip(took, SERVICES, strict=False)}
+        calls["proxied"] = functools.partial(caller.call, FLAG[0], request)
         for number in range(1 + rounds):
             for kind in sorted(calls, reverse=bool(number % 2)):
                 sample = milliseconds([calls[kind]() for _ in range(50)])
                 if number:  # the first one warms up
                     took[kind].append(median(sample))
         node.close()
-    ratio = estimate_of_rounds(
-        took, lambda s: median(s["ours"]) / median(s["unpaced"]), random.Random(0), resamples=500
-    )
+        caller.close()
+
+    def slower(of: str) -> dict[str, float]:
+        found = estimate_of_rounds(
+            took,
+            lambda s: 1 + (median(s["ours"]) - median(s["unpaced"])) / median(s[of]),
+            random.Random(0),
+            resamples=500,
+        )
+        return {"value": found.value, "low": found.low, "high": found.high}
+
     row: dict[str, Any] = {"what": "a lone caller", "calls": 50 * rounds}
     row |= {f"{kind}_ms": median(rounds_ms) for kind, rounds_ms in took.items()}
-    return [row | {"ratio": {"value": ratio.value, "low": ratio.low, "high": ratio.high}}]
+    return [row | {"node_ratio": slower("unpaced"), "proxied_ratio": slower("proxied")}]
 
 
 def _timed(client: Any) -> Callable[[], float]:

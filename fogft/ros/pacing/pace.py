@@ -170,17 +170,17 @@ class ClientPace:
 
     def refill(self, now: float) -> None:
         """Update the estimate from elapsed time."""
-        steps = int((now - self._refilled_at) / EVERY_S)
-        if steps > 0:
+        if now - self._refilled_at >= EVERY_S:
+            steps = int((now - self._refilled_at) / EVERY_S)
             self._refilled_at += steps * EVERY_S
             if not self.strict or not self.untaken:
                 self._took(self._taken + steps)
-        steps = int((now - self._grown_at) / EVERY_S)
-        if steps > 0:
+        if now - self._grown_at >= EVERY_S:
+            steps = int((now - self._grown_at) / EVERY_S)
             self._grown_at += steps * EVERY_S
             grown = self._usual + steps * (_USUAL_GROWS + self._open // 20)
             self._usual = max(self._usual, min(grown, self._open + self._open // 4))
-        if self.silent(now, _GIVEN_UP_S):
+        if self.probed_at is not None and self.silent(now, _GIVEN_UP_S):
             self.probing, self.probed_at, self.ask_again_at = Probing.NO, None, math.inf
             self._probes.clear()
 

@@ -65,7 +65,8 @@ class Pacer:
         self._pace = Pace()
         self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
         self._asked: dict[bytes, float] = {}  # those whose nodes may answer probes: until when
-        self._wake = threading.Condition()
+        self._lock = threading.Lock()
+        self._wake = threading.Condition(self._lock)
         self._thread: threading.Thread | None = None  # made when there is something to wait for
         self._closed = False
 
@@ -73,7 +74,7 @@ class Pacer:
         """Note a request as it is taken; `together` with the one before it."""
         now = self._clock()
         id = self._client_of(handle)
-        with self._wake:
+        with self._lock:
             client = self._pace.client(id, now)
             client.requested(now, together=together)
             if client.probing in (Probing.ASKED, Probing.NO) and now >= client.ask_again_at:
@@ -91,7 +92,7 @@ class Pacer:
         """
         now = self._clock()
         id = self._client_of(handle)
-        with self._wake:
+        with self._lock:
             client = self._pace.client(id, now)
             if client.waiting or client.finding_until or not self._pace.take(client, now):
                 if client.hold(handle, payload, now):
