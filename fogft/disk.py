@@ -4,6 +4,8 @@ A reader sees the old file or the new one, never a torn one; a full disk leaves 
 Locks are flocks: they end with the process that holds them, whatever ends it.
 """
 
+from __future__ import annotations
+
 import contextlib
 import json
 import os

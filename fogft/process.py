@@ -7,6 +7,8 @@ What a start makes lives as long as the process. To look through it for garbage 
 some 40 ms, and later, now and then, a pause of many milliseconds.
 """
 
+from __future__ import annotations
+
 import contextlib
 import gc
 import importlib

@@ -8,6 +8,8 @@ Every import that costs more than a few milliseconds is made inside the command 
 needs it, so that ``fogft --help`` and completion stay quick (tests/cli/test_laziness).
 """
 
+from __future__ import annotations
+
 import os
 import sys
 from collections.abc import Sequence

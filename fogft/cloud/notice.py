@@ -7,6 +7,8 @@ notice once. A metadata server that does not answer is no news: on most machines
 Not here: reading the answers (`notice_formats`) and what a replica does about it.
 """
 
+from __future__ import annotations
+
 import contextlib
 import http.client
 import logging

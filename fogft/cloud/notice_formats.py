@@ -10,6 +10,8 @@ Sources: the clouds' own pages on spot interruption notices, on the metadata val
 ``instance/preempted``, and on Scheduled Events.
 """
 
+from __future__ import annotations
+
 import json
 from dataclasses import dataclass
 from datetime import datetime, timezone

@@ -6,6 +6,8 @@ same moment leaves together. Like `frame`, a decoder returns a value or raises `
 Owns: the bytes. Not here: what is sent together (`window`, `reply_queue`).
 """
 
+from __future__ import annotations
+
 import struct
 from collections.abc import Sequence
 from typing import Any

@@ -12,6 +12,8 @@ decompresses, from its first payload to its last.
 Owns: when and how. Not here: rates (`socket_progress`), headers (`frame`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import logging
 import threading

@@ -3,6 +3,8 @@
 Owns: numbers. Not here: what they are shown as (`fogft.proxy`, `fogft.pool`).
 """
 
+from __future__ import annotations
+
 import logging
 import threading
 from collections import Counter

@@ -7,6 +7,8 @@ Owns: the bytes. Not here: sending them, what they mean, and other frames (`prob
 `batch_frames`, `fogft.records.frames`, `fogft.topics.frames`).
 """
 
+from __future__ import annotations
+
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

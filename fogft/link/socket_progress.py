@@ -14,6 +14,8 @@ Owns: the rate, what counts as progress, and that judgement. `now` is an argumen
 Not here: where the counts come from (`sockets`), the bounds by bytes and by count (`window`).
 """
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass

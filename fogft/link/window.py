@@ -17,6 +17,8 @@ Owns: which attempts are open, whether there is room, the order of sending, and 
 told. Not here: sending (`attempts`), deadlines.
 """
 
+from __future__ import annotations
+
 import heapq
 import threading
 from collections.abc import Collection

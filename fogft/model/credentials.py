@@ -6,6 +6,8 @@ name; this module says what follows from it. A revoked name is revoked for good:
 in again does so under the next generation.
 """
 
+from __future__ import annotations
+
 import re
 from dataclasses import dataclass
 from enum import Enum

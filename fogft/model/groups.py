@@ -9,6 +9,8 @@ that stand in for spot ones. From `FIRST_BY_HAND` on they are free for replicas 
 themselves.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -4,6 +4,8 @@ Each command is one operation that returns a new intent, so that it works whethe
 a manager lives: the command line writes the result, the manager reads it.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -7,6 +7,8 @@ SHA-256 of those parts with their lengths, so that no two lists of parts collide
 Source: FogROS2-SGC's construction of identifiers, extended to connections by FogROS2-FT.
 """
 
+from __future__ import annotations
+
 import hashlib
 import ipaddress
 import re

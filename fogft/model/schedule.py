@@ -8,6 +8,8 @@ zones are the standard library's data.
         └─► window that holds now + prelaunch ─► the more replicas, with its cap
 """
 
+from __future__ import annotations
+
 import datetime
 import zoneinfo
 from typing import NamedTuple

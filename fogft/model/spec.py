@@ -1,5 +1,7 @@
 """The contents of a pool file, as values. Each field made by `key` is a key of the file."""
 
+from __future__ import annotations
+
 import hashlib
 import json
 from collections.abc import Mapping

@@ -5,6 +5,8 @@ to the replicas. A gateway may go through others, so they form trees; a loop is 
 wherever a topology is read.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from graphlib import CycleError, TopologicalSorter

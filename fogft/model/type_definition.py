@@ -8,6 +8,8 @@ A distribution that has type hashes (Iron and later) tells sameness by them. Whe
 has none (Humble), or to say what differs, fields are compared one by one.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

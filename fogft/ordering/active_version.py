@@ -8,6 +8,8 @@ Not here: carrying the change out (`fogft.ordering.sequencer`).
 Rules: docs/design/rolling-update.md.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Iterable
 

@@ -7,6 +7,8 @@ Owns: one term's log and checkpoint, and what each replica is to be sent.
 Not here: what replicas answer, and who obeys (`sequencer`). Protocol: docs/design/state.md.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 from fogft.ordering import orders

@@ -4,6 +4,8 @@ Owns: entries from `start` + 1 to `last`, their bounds, and the checkpoint.
 Not here: who needs them (`sequencer`).
 """
 
+from __future__ import annotations
+
 from collections import deque
 from dataclasses import dataclass
 

@@ -9,6 +9,8 @@ Not here: who sends which order (`sequencer`) and what becomes of it (`replica`)
 Protocol: docs/design/state.md.
 """
 
+from __future__ import annotations
+
 import struct
 from dataclasses import dataclass
 from enum import IntEnum

@@ -7,6 +7,8 @@ that it lacks. So one that is far behind is given a snapshot instead, though not
 Owns: what is remembered of each replica. Not here: what follows from it (`sequencer`).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from enum import Enum
 

@@ -7,6 +7,8 @@ Owns: which market a launch is bought on, and what is said when it cannot be.
 Not here: the order among offers (`placement`) and what is needed (`needs`).
 """
 
+from __future__ import annotations
+
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence

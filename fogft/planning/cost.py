@@ -7,6 +7,8 @@ Owns: egress prices (dated) and sums.
 Not here: machines' prices (offers carry them).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

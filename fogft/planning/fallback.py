@@ -13,6 +13,8 @@ Owns: who stands in, and how many are missing.
 Not here: where they are bought (`buying`) and the two steps of an ending (`endings`).
 """
 
+from __future__ import annotations
+
 from bisect import bisect_right
 from collections.abc import Sequence
 

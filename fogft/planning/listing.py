@@ -14,6 +14,8 @@ Owns: which offers can be bought at all, and their order.
 Not here: choosing among them (`placement`).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

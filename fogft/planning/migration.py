@@ -17,6 +17,8 @@ Owns: who moves, and why.
 Not here: carrying it out, which is a replacement like any other (`needs`, `buying`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 

@@ -4,6 +4,8 @@ Owns: slots and reasons of launches.
 Not here: where they go and whether they can be paid (`buying`).
 """
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple

@@ -10,6 +10,8 @@ Not here: the order within a rank (`listing`), how long a location is avoided
 (`observed.backoff`) and how many are needed (`planner`).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple

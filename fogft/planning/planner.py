@@ -10,6 +10,8 @@ Not here: the steps: how many (`sizing`), who is ill (`health`), who is what
 (`migration`), who ends (`endings`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Sequence
 from functools import partial
 from typing import NamedTuple

@@ -7,6 +7,8 @@ Owns: how a plan changes what is observed and remembered.
 Not here: what is decided (`planner`) and what is really done (`fogft.pool.manager.reconciler`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 

@@ -9,6 +9,8 @@ Not here: launches and endings (`planner`), what is remembered (`fogft.pool.mana
 Rules: docs/design/rolling-update.md.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

@@ -1,5 +1,7 @@
 """Read a pool file from disk. The only place that knows it is YAML is `yaml_tree`."""
 
+from __future__ import annotations
+
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

@@ -4,6 +4,8 @@ A value is judged by the pool file's own reader, so a parameter can bring about 
 pool file could not.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias

@@ -4,6 +4,8 @@ The same table (`fogft.model.keys`) reads the pool file and the proxies' configu
 first mistake ends it, as one `SpecError` that begins with ``file:line: key:``.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 

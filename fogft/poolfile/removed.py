@@ -1,5 +1,7 @@
 """Hints for keys that were moved, renamed or removed. Pure."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 from fogft.model.choices import (

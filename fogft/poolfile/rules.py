@@ -3,6 +3,8 @@
 Each rule judges one map after its keys were read, and may return another value for it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

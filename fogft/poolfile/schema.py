@@ -3,6 +3,8 @@
 It comes from the same table as the reader. Rules between keys are the reader's alone.
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 from fogft.model import keys

@@ -3,6 +3,8 @@
 Not here: what stands in SkyPilot's own keys (SkyPilot judges that).
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 

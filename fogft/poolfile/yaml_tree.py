@@ -6,6 +6,8 @@ comes out can be written as JSON: dates stay the text that was written, and ther
 other tags. Nothing is ever executed.
 """
 
+from __future__ import annotations
+
 import yaml
 
 from fogft.errors import SpecError

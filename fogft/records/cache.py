@@ -6,6 +6,8 @@ signature, which is checked again. A damaged file is told and costs only itself.
 Owns: the file. Not here: when it is written, and what stands in a record.
 """
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

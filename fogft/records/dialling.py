@@ -7,6 +7,8 @@ link needs seconds. Overlapping attempts serve both.
 Owns: TCP, TLS and the greeting. Not here: what is exchanged then (`exchange`).
 """
 
+from __future__ import annotations
+
 import asyncio
 import os
 import socket

@@ -7,6 +7,8 @@ Owns: the record set, and the connections that it is exchanged over.
 Not here: making connections (`server`, `client`).
 """
 
+from __future__ import annotations
+
 import asyncio
 import logging
 from collections import Counter

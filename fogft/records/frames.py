@@ -6,6 +6,8 @@ cut, a reader gives messages or raises `RecordError`, and holds no more than one
 Owns: the bytes and the shape of messages. Not here: records (`fogft.records.record`), sockets.
 """
 
+from __future__ import annotations
+
 import json
 import struct
 from collections.abc import Iterator, Sequence

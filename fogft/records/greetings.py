@@ -4,6 +4,8 @@ One host cannot keep others out for longer than these take to greet: where the r
 oldest connection of the host that has most of them is ended.
 """
 
+from __future__ import annotations
+
 import ipaddress
 from collections import Counter
 from collections.abc import Mapping

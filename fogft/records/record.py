@@ -9,6 +9,8 @@ Owns: the bytes of records, and who may write which.
 Not here: merging (`record_set`), what contents mean (`roster`), cryptography (passed in).
 """
 
+from __future__ import annotations
+
 import base64
 import binascii
 import json

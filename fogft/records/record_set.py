@@ -8,6 +8,8 @@ Owns: which record stands for a key, what is refused, and how often.
 Not here: a record's bytes (`records`), its meaning (`roster`), how it travels (`fogft.link`).
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass

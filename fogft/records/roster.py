@@ -8,6 +8,8 @@ Owns: the contents of records, and the membership that follows from them.
 Not here: who may write them (`records`) and which one stands (`record_set`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any

@@ -8,6 +8,8 @@ Owns: the port, the greeting and its limits. Not here: records (`exchange`), the
 process (`fogft.pool.commands.rendezvous`).
 """
 
+from __future__ import annotations
+
 import asyncio
 import contextlib
 import hashlib

@@ -6,6 +6,8 @@ would run each of those alone.
 Owns: that judgement. Not here: what follows from a death (`pending`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 
 FALSE_ALARMS = 3

@@ -18,6 +18,8 @@ Owns: the choice, the budget, how many requests get spare copies.
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 

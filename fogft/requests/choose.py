@@ -9,6 +9,8 @@ Not here: `auto` (`fogft.requests.auto`), which answer wins (`fogft.requests.dec
 a service has (`fogft.proxy.robot.dispatcher`).
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

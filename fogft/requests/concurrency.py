@@ -14,6 +14,8 @@ more often is not limited: what waits in it is over before it matters.
 Owns: the limit of one service. Not here: who waits (`fair_queue`).
 """
 
+from __future__ import annotations
+
 QUICK_S = 0.003
 SOLO_S = 0.01  # below this, one at a time would leave the service idle between two
 _NEAR = 0.85

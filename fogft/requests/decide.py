@@ -11,6 +11,8 @@ Not here: votes (`fogft.requests.votes`), actions (`fogft.proxy.robot.actions`),
 (`fogft.proxy.robot.service_order`); which requests await an answer (`pending`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum

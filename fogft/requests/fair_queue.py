@@ -15,6 +15,8 @@ Owns: the order. Not here: how many may wait or run at once (`concurrency`,
 `proxy.replica.responder`).
 """
 
+from __future__ import annotations
+
 import heapq
 from dataclasses import dataclass, field
 from itertools import count

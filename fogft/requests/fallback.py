@@ -10,6 +10,8 @@ Law: a request is handed to the fallback at most once, and ends exactly once.
 Owns: which requests are due. Not here: calling (`proxy.robot.delivery`), the replicas' answers.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from typing import Generic, TypeVar
 

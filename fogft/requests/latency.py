@@ -8,6 +8,8 @@ that time: a quantile at or below the time after which attempts are stopped is n
 it, whereas leaving it out would make a slow replica look as fast as its fast answers.
 """
 
+from __future__ import annotations
+
 import math
 
 _FIRST_S = 1e-4

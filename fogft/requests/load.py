@@ -7,6 +7,8 @@ in the replica's words.
 Owns: what is known of one replica. Not here: who is asked (`auto`, `choose`).
 """
 
+from __future__ import annotations
+
 import math
 from enum import IntFlag
 from typing import NamedTuple

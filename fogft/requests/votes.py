@@ -9,6 +9,8 @@ Owns: ballots, final answers (for a while), each replica's record.
 Not here: what agreeing means (`fogft.ros.comparison`), requests and deadlines (`pending`).
 """
 
+from __future__ import annotations
+
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol

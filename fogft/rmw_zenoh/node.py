@@ -14,6 +14,8 @@ Owns: the session and its settings, the graph, what is offered and called. Not h
 never meet such a session.
 """
 
+from __future__ import annotations
+
 import functools
 import itertools
 import logging

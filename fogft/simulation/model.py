@@ -8,6 +8,8 @@ Every random number comes from the generator handed in.
 Not here: finding the numbers in traces (`fitting`).
 """
 
+from __future__ import annotations
+
 import math
 import random
 from bisect import bisect_right

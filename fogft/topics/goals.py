@@ -7,6 +7,8 @@ Owns: what the parts' bytes mean, which goals are under way and who has them, on
 several. Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.messages`).
 """
 
+from __future__ import annotations
+
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping

@@ -7,6 +7,8 @@ asked for again. On the robot an `Outbox` holds, for one replica, what that has 
 Owns: which messages are kept, and in what order they go. Not here: sending them.
 """
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Iterable
 

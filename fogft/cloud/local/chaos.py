@@ -4,6 +4,8 @@ Everything is written to files that the machines watch, or is a signal; nothing 
 live on for a fault to last or to end.
 """
 
+from __future__ import annotations
+
 import contextlib
 import signal
 import time

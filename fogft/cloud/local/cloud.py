@@ -3,6 +3,8 @@
 Not here: what a machine does (`machine`), how it ends (`ending`), what is sold (`catalogue`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import logging
 import os

@@ -5,6 +5,8 @@ has been removed; then its log stands in ``logs/``, which also marks its id as u
 Not here: who decides that one goes (`cloud`, `chaos`). `CloudUnreachable` says that it is not sure.
 """
 
+from __future__ import annotations
+
 import contextlib
 import logging
 import os

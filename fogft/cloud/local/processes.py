@@ -11,6 +11,8 @@ machine counts as alive until all of it is gone. If the guard is killed, the mac
 parent changed, and ends.
 """
 
+from __future__ import annotations
+
 import contextlib
 import ctypes
 import logging

@@ -7,6 +7,8 @@ does not take stops the reading, so backpressure is the kernel's own.
 Not here: who sets the faults (`chaos`).
 """
 
+from __future__ import annotations
+
 import asyncio
 import contextlib
 import math

@@ -1,5 +1,7 @@
 """How a machine runs a task's commands: environment, ROS domain, and taking turns."""
 
+from __future__ import annotations
+
 import hashlib
 import os
 import sys

@@ -5,6 +5,8 @@ question is not asked again, so that a slow server is not buried under repetitio
 answer is thrown away, since it may be older than what the next asker wants to know.
 """
 
+from __future__ import annotations
+
 import threading
 import time
 from collections.abc import Callable

@@ -6,6 +6,8 @@ of a cloud's general families are offered beside it: as many vCPUs, no less memo
 Owns: the reading of SkyPilot's catalogue. Not here: which of it is offered (`prices`).
 """
 
+from __future__ import annotations
+
 import importlib
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence

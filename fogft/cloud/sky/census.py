@@ -6,6 +6,8 @@ of another account than those that SkyPilot, or its API server elsewhere, launch
 Not here: the providers' interfaces (`provider`, `aws`).
 """
 
+from __future__ import annotations
+
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -7,6 +7,8 @@ forgotten is ended through the provider, by its labels.
 Not here: which replicas shall end (`fogft.planning.endings`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import logging
 from collections.abc import Callable

@@ -5,6 +5,8 @@ stand in their texts or, as AWS's do, in the log of the launch only. The codes d
 exception's class: no capacity, no quota and no permission come in the same class.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterable
 

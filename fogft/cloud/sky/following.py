@@ -8,6 +8,8 @@ failure would cost money until somebody looks.
 Not here: threads and waiting (`adapter`), taking down (`ending`).
 """
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass

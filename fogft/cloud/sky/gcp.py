@@ -4,6 +4,8 @@ Lists machines by our labels, and deletes those that were just listed; no more o
 Project and credentials come from the same places as SkyPilot's.
 """
 
+from __future__ import annotations
+
 import datetime
 import importlib
 import threading

@@ -10,6 +10,8 @@ cannot be read or written.
 Not here: what is true in the cloud (`adapter`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import shutil
 from collections.abc import Mapping

@@ -5,6 +5,8 @@ does not match is not ours, and nothing that is not ours is ever touched: every 
 reaches SkyPilot is made by `cluster_name`.
 """
 
+from __future__ import annotations
+
 import re
 from collections.abc import Mapping
 

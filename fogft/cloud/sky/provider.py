@@ -5,6 +5,8 @@ can be asked directly, every "it is gone" is checked there, and what SkyPilot ha
 is found and ended there.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol

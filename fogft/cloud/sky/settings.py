@@ -15,6 +15,8 @@ A pool that says who may connect has a security group named for its clusters, be
 Not here: which roles, ports and security groups a VM has (`aws`, `task`).
 """
 
+from __future__ import annotations
+
 import base64
 import importlib
 import json

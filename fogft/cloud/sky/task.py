@@ -6,6 +6,8 @@ itself; those are refused, since a field that is ignored is a promise broken in 
 Not here: the files on disk (`journal`) and what SkyPilot thinks of the result (`sdk`).
 """
 
+from __future__ import annotations
+
 import copy
 import os
 from collections.abc import Mapping, Sequence

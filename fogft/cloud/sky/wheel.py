@@ -9,6 +9,8 @@ fits every image. `up` makes it; a generation keeps the one of its first launch 
 Not here: installing (`templates/sky_task.yaml`).
 """
 
+from __future__ import annotations
+
 import base64
 import contextlib
 import hashlib

@@ -6,6 +6,8 @@ this replica's own listener, and another one takes its place.
 Owns: connections to doors. Not here: the door (`robot`), the listener (`listener`).
 """
 
+from __future__ import annotations
+
 import logging
 import select
 import socket

@@ -10,6 +10,8 @@ Owns: the door's port, the connections that wait, a loopback port for each repli
 Not here: the replica's side (`replica`), links (`link`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import logging
 import secrets

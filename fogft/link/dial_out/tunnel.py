@@ -5,6 +5,8 @@ The kernel moves the bytes (`splice`), so a tunnel costs a robot two sleeping th
 Not here: who is joined, and what a first message says (`robot`, `replica`, `records.frames`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import os
 import socket

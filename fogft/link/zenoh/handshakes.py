@@ -9,6 +9,8 @@ standard output went before.
 Owns: file descriptor 1 of such a process. Not here: other counters (`reply_queue`).
 """
 
+from __future__ import annotations
+
 import fcntl
 import logging
 import os

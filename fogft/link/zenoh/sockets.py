@@ -7,6 +7,8 @@ Owns: finding and reading sockets.
 Not here: what follows from it (`connection_reaper`, `socket_progress`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import ctypes
 import fcntl

@@ -10,6 +10,8 @@ closes a session is waited for at exit, though not for long: towards a frozen pe
 seconds.
 """
 
+from __future__ import annotations
+
 import atexit
 import ctypes
 import logging

@@ -4,6 +4,8 @@ Owns: what waits for it, and how much may. Not here: what there is to do (`contr
 `fogft.rmw_zenoh`).
 """
 
+from __future__ import annotations
+
 import logging
 import threading
 from collections import deque

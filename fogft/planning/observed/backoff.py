@@ -17,6 +17,8 @@ replica that could move, but need not, asks no location that refused within FORG
 none ready since. Events from the future, left by a clock that was set back, count for nothing.
 """
 
+from __future__ import annotations
+
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter

@@ -10,6 +10,8 @@ Owns: how far the clock was moved, and for how long the time of day is in doubt.
 Not here: reading clocks (`fogft.pool.manager.timekeeping`), moving what is remembered (`history`).
 """
 
+from __future__ import annotations
+
 from collections import deque
 from dataclasses import dataclass
 

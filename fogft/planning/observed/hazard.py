@@ -11,6 +11,8 @@ Owns: the rate and what it is worth in a score.
 Not here: refusals and the rest after them (`backoff`).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Mapping
 

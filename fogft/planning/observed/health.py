@@ -8,6 +8,8 @@ Owns: each replica's phase and verdict, and the suspicion against the robot's ow
 Not here: what to do about it (`planner`).
 """
 
+from __future__ import annotations
+
 import math
 from enum import Enum
 from typing import NamedTuple

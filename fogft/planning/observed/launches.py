@@ -10,6 +10,8 @@ Whatever else is wrong, no more than LAUNCHES_AN_HOUR machines a replica are had
 spot machines and those on demand are counted apart, so that what restores readiness is not held up.
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Sequence
 

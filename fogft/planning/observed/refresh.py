@@ -10,6 +10,8 @@ Owns: who is due.
 Not here: asking (`fogft.cloud`), on a thread of its own (`fogft.pool.manager.operations`).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from enum import Enum
 

@@ -3,6 +3,8 @@
 Not here: what the image is built of (`fogft.cloud.port.Baking`).
 """
 
+from __future__ import annotations
+
 import subprocess
 import tempfile
 from pathlib import Path

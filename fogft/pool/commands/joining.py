@@ -10,6 +10,8 @@ Owns: the content of bundles, and the folders of joined holders.
 Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`claiming`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import secrets
 import tempfile

@@ -8,6 +8,8 @@ file were imported on two machines, the manager of the earlier term hears of it 
 Owns: what is in the file, and the order of steps. Not here: sealing (`bundle`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import functools
 import os

@@ -4,6 +4,8 @@ It needs a port that robots and replicas can reach, a certificate, and nothing e
 memory on disk spares callers a moment after a restart; without it they bring everything.
 """
 
+from __future__ import annotations
+
 import asyncio
 import contextlib
 import logging

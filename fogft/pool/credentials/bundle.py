@@ -8,6 +8,8 @@ wrong raises `CredentialError`.
 Owns: sealing and opening. Not here: what is in it (`joining`), and that it is used once.
 """
 
+from __future__ import annotations
+
 import base64
 import binascii
 import hashlib

@@ -8,6 +8,8 @@ earlier one stands, whichever rendezvous each has reached.
 Owns: making a claim and finding another's. Not here: opening bundles (`joining`), records.
 """
 
+from __future__ import annotations
+
 import secrets
 import time
 from collections.abc import Callable, Sequence

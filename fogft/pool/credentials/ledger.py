@@ -9,6 +9,8 @@ Owns: ``issued.json`` beside the CA, written under its lock by the manager and b
 Not here: making certificates (`credentials`), telling others of a revocation (`manager`).
 """
 
+from __future__ import annotations
+
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace

@@ -4,6 +4,8 @@ Owns: the file, and which types can be offered on this machine.
 Not here: how it grows (`fogft.planning.observed.services`).
 """
 
+from __future__ import annotations
+
 from functools import partial
 from pathlib import Path
 

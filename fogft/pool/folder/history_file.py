@@ -5,6 +5,8 @@ A launch is written before the cloud is asked, so that its generation is never u
 Owns: `history.jsonl`. Not here: what follows from events (`fogft.planning.observed.history`).
 """
 
+from __future__ import annotations
+
 import json
 import os
 import threading

@@ -13,6 +13,8 @@ Owns: measuring, keeping, and the order above.
 Not here: what they are for (`fogft.planning.listing`).
 """
 
+from __future__ import annotations
+
 import csv
 import functools
 import math

@@ -8,6 +8,8 @@ Owns: which replicas have an operation under way, and how it ended.
 Not here: what to order (`reconciler`) and the threads (the `Submit` that comes in).
 """
 
+from __future__ import annotations
+
 import logging
 import threading
 from collections.abc import Callable, Mapping

@@ -7,6 +7,8 @@ Owns: the order of reading and writing within a tick.
 Not here: the decisions (`fogft.planning.planner`), the loop and the processes (`manager`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import functools
 import json

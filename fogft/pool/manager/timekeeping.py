@@ -9,6 +9,8 @@ Not here: when to look at replicas (`reconciler`), where events are stored (`sto
 is (`planning.observed.clock_jumps`), and what moves (`planning.observed.history`, `updating`).
 """
 
+from __future__ import annotations
+
 import logging
 import time
 from collections.abc import Callable

@@ -8,6 +8,8 @@ Owns: when the good file is kept, and when a version is given up.
 Not here: the judgement (`fogft.planning.rollout`), the files' place (`store`).
 """
 
+from __future__ import annotations
+
 import logging
 from dataclasses import replace
 

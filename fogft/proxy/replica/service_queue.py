@@ -13,6 +13,8 @@ Owns: a service's queue, its limit, the room that is taken, and the cancel calls
 Not here: request ids and copies (`responder`), the order itself (`requests.fair_queue`).
 """
 
+from __future__ import annotations
+
 import logging
 from collections import deque
 from collections.abc import Callable, Mapping

@@ -6,6 +6,8 @@ When the fallback is asked is `requests.fallback`'s to say; here it is called.
 Owns: calls of the fallback service. Not here: which answer is returned (`dispatcher`).
 """
 
+from __future__ import annotations
+
 import logging
 import time
 from collections.abc import Callable, Iterable

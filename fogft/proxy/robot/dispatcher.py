@@ -14,6 +14,8 @@ Owns: that life, and which policy a service has.
 Not here: sending (`sending`), links (`fogft.link`), ROS. Design: docs/design/dispatcher.md.
 """
 
+from __future__ import annotations
+
 import logging
 import os
 import time

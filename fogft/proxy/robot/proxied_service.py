@@ -7,6 +7,8 @@ request that may still be answered.
 Owns: offering and withdrawing it. Not here: its requests (`dispatcher`).
 """
 
+from __future__ import annotations
+
 import logging
 from collections.abc import Collection, Sequence
 

@@ -3,6 +3,8 @@
 Owns: the lock under which they are. Not here: what happens to them (`dispatcher`).
 """
 
+from __future__ import annotations
+
 import threading
 from collections import deque
 from collections.abc import Callable

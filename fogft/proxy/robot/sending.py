@@ -6,6 +6,8 @@ the one place where a request leaves for a replica.
 Owns: which links may be asked. Not here: links (`fogft.link`), answers (`dispatcher`).
 """
 
+from __future__ import annotations
+
 import threading
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType

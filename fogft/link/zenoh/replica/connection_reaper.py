@@ -13,6 +13,8 @@ Owns: ending connections, and how they drain. Not here: who has to go (`door`), 
 refused (`sessions`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import logging
 import os

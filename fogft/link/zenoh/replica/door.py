@@ -7,6 +7,8 @@ after wait for that. So few strangers are let in of each host, and they are ende
 Owns: the judgement. Not here: the sockets (`connection_reaper`, `listen_filter`).
 """
 
+from __future__ import annotations
+
 from collections import Counter
 from collections.abc import Collection, Mapping
 

@@ -10,6 +10,8 @@ Owns: the listening socket's filter and its queue. Not here: whose connections a
 (`connection_reaper`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import ctypes
 import ipaddress

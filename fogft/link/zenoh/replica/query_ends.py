@@ -9,6 +9,8 @@ process would stand still. So a query is ended when that thread has come to the 
 Owns: when a query may be ended. Not here: the thread that does it (`reply_queue`).
 """
 
+from __future__ import annotations
+
 import time
 
 import zenoh

@@ -14,6 +14,8 @@ Owns: that there is one answer; how replies become messages, their order and bou
 is replied (`fogft.proxy.replica`).
 """
 
+from __future__ import annotations
+
 import logging
 import threading
 from collections.abc import Callable, Sequence

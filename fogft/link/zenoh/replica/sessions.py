@@ -8,6 +8,8 @@ for the holder. A holder who is revoked is let in no more, whatever connections 
 Owns: which tokens are good, and whose. Not here: signatures (`signing`), TLS (`config`).
 """
 
+from __future__ import annotations
+
 import threading
 import time
 from collections import OrderedDict

@@ -4,6 +4,8 @@ Owns: the robot's credentials in use, what its replicas are to be told. Not here
 life (`link`).
 """
 
+from __future__ import annotations
+
 import contextlib
 import threading
 import time
