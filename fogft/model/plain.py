@@ -23,6 +23,7 @@ T = TypeVar("T")
 Read = Callable[[Any], Any]
 
 _READERS: dict[Any, Read] = {}
+LINE_LIMIT = 1000  # characters
 _MOST = 1e300  # further on there is no arithmetic
 
 
@@ -50,7 +51,8 @@ Generation = Annotated[int, within(1, 1 << 31)]
 
 
 def as_line(text: str) -> str:
-    """Return a text as one printable line, the only form that peers accept."""
+    """Return a text as one short printable line, the only form that peers accept."""
+    text = text[:LINE_LIMIT]
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
@@ -59,6 +61,8 @@ def as_line(text: str) -> str:
 def _check_line(text: str) -> None:
     if not text.isprintable():
         raise ValueError("it holds what cannot be printed")
+    if len(text) > LINE_LIMIT:
+        raise ValueError(f"it has {len(text)} characters, at most {LINE_LIMIT}")
 
 
 Line = Annotated[str, _check_line]  # it may reach a terminal: no escape, no second line

@@ -13,10 +13,13 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated
 
+from fogft.model.keys import only
 from fogft.model.plain import Line
 
 REQUEST, RESPONSE = "request", "response"
+_HASH = re.compile(r"\w*", re.ASCII)
 _NESTED = re.compile(r"(?:sequence<)?([A-Za-z]\w*/[A-Za-z]\w*)")
 
 Fields = tuple[tuple[Line, Line], ...]
@@ -38,7 +41,7 @@ class Definition:
     hash: Line = ""
     fields: Mapping[Line, Fields] = field(default_factory=dict)
     trouble: Line = ""
-    service_hash: Line = ""
+    service_hash: Annotated[str, only(_HASH.fullmatch)] = ""  # it becomes part of a key
 
     @property
     def known(self) -> bool:

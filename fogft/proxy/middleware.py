@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from fogft.ros.joining import EarlyJoin
     from fogft.ros.visible import VisibleNode
 
-Told = Callable[[], Mapping[str, Definition]]
+Told = Callable[[], Mapping[str, Sequence[Definition]]]
 
 
 Judge = Callable[[Mapping[str, Any]], str]
@@ -102,7 +102,7 @@ def join(
 
     Args:
         domain_id: The ROS domain; None for what the environment says.
-        told: Returns the definitions of types as replicas tell them.
+        told: Returns the definitions of types as each replica tells them.
         noticed: Called, from any thread, when a type may be known that was not.
         environ: Where the variables of ROS and Zenoh are, for Zenoh.
 
@@ -119,12 +119,13 @@ def join(
         return Joined(serialised, definition, *seen, serialised.identity)
     from fogft.rmw_zenoh.node import RmwZenohNode
 
-    def hash_of(type_name: str) -> str:
-        there = told().get(type_name)
-        return (there.service_hash if there else "") or definition(type_name).service_hash
+    def hashes_of(type_name: str) -> list[str]:
+        ours = definition(type_name)
+        known = [ours] if ours.service_hash else told().get(type_name, ())
+        return [one.service_hash for one in known if one.service_hash]
 
     node = RmwZenohNode(
-        name, domain_id, hash_of=hash_of, fault_of=fault_of, noticed=noticed, environ=environ
+        name, domain_id, hashes_of=hashes_of, fault_of=fault_of, noticed=noticed, environ=environ
     )
 
     def define(type_name: str) -> Definition:

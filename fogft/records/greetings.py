@@ -9,6 +9,7 @@ from __future__ import annotations
 import ipaddress
 from collections import Counter
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -16,15 +17,21 @@ T = TypeVar("T")
 
 def oldest_of_most(greeting: Mapping[T, str]) -> T:
     """Return who has to go of those (oldest first) that are greeting, each with its host."""
-    networks = {one: _network(host) for one, host in greeting.items()}
+    networks = {one: network_of(host) for one, host in greeting.items()}
     (most, _), *_ = Counter(networks.values()).most_common(1)
     return next(one for one, network in networks.items() if network == most)
 
 
-def _network(host: str) -> str:
-    """Return an IPv6 address's first 64 bits, for who has one has them all; else the host."""
+@lru_cache(maxsize=1024)
+def network_of(host: str) -> str:
+    """Return the network of an IPv6 address, 64 bits, for who has one has them all; else the host.
+
+    It is written as its first address.
+    """
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:
         return host
-    return host if address.version == 4 else str(int(address) >> 64)
+    if address.version == 4:
+        return host
+    return str(ipaddress.IPv6Address(int(address) >> 64 << 64))

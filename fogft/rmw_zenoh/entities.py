@@ -74,6 +74,14 @@ class Server:
         """Also offer it to clients whose type has this hash."""
         self._worker.add(partial(self._declare, hash))
 
+    def move(self, hash: str) -> bool:
+        """Offer it under another hash, unless that may be the same; return whether it is moved."""
+        if all(naming.may_be_same(hash, known) for known in list(self._faces)):
+            return False
+        self._worker.add(self._undeclare)
+        self._worker.add(partial(self._declare, hash))
+        return True
+
     def _declare(self, hash: str) -> None:
         if not self.is_open or hash in self._faces:
             return

@@ -21,7 +21,8 @@ import itertools
 import logging
 import os
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import zenoh
@@ -40,6 +41,7 @@ from fogft.ros.pacing.client_probes import NodeProbes
 log = logging.getLogger(__name__)
 
 _DOMAIN = "ROS_DOMAIN_ID"
+_LOOK_EVERY_S = 1.0
 
 FaultOf = Callable[[str, str], Callable[[bytes], str]]
 
@@ -49,8 +51,8 @@ class RmwZenohNode:
 
     Args:
         domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
-        hash_of: Returns the hash of a service type, as known from elsewhere; empty where it is
-            not. A client's own goes before it.
+        hashes_of: Returns the hashes of a service type that are told elsewhere, each as often as
+            somebody tells it. The one told most counts, of equal ones that which a client has.
         fault_of: Returns what says why bytes are no request, or response, of a service type; no
             others are passed on.
         noticed: Called, from Zenoh's thread, when a client has come. Must not block.
@@ -64,13 +66,14 @@ class RmwZenohNode:
         name: str,
         domain_id: int | None = None,
         *,
-        hash_of: Callable[[str], str] = lambda _: "",
+        hashes_of: Callable[[str], Sequence[str]] = lambda _: (),
         fault_of: FaultOf = lambda type_name, part: Shape("", {}).fault,
         noticed: Callable[[], None] = lambda: None,
         environ: Mapping[str, str] = os.environ,
     ) -> None:
         self._name = name
-        self._hash_of = hash_of
+        self._hashes_of = hashes_of
+        self._look_at = 0.0
         self._fault_of = fault_of
         self._noticed = noticed
         self._domain = _domain(environ) if domain_id is None else domain_id
@@ -132,8 +135,7 @@ class RmwZenohNode:
         Raises:
             RosError: The type's hash is not known yet, or the node is closed.
         """
-        clients = self.graph.hashes(CLIENT, name, type_name)
-        known = self._hash_of(type_name) or next(iter(clients), "")
+        known = self._hash(name, type_name)
         if not known:
             raise RosError(
                 f"the type hash of `{type_name}` is not known here yet",
@@ -147,9 +149,18 @@ class RmwZenohNode:
                 mismatch=lambda: vendors.of_others(name, self.graph.servers(name)),
             )
         )
-        for hash in self.graph.hashes(CLIENT, name, type_name):
-            server.clients_hash(hash)
+        self._tell_clients(server)
         return server
+
+    def _hash(self, name: str, type_name: str) -> str:
+        """Return the hash to offer a service under; empty where nobody has told any."""
+        clients = self.graph.hashes(CLIENT, name, type_name)
+        told = self._hashes_of(type_name) or clients
+        return max(told, key=lambda one: (told.count(one), one in clients), default="")
+
+    def _tell_clients(self, server: Server) -> None:
+        for hash in self.graph.hashes(CLIENT, server.name, server.type):
+            server.clients_hash(hash)
 
     def client(self, name: str, type_name: str) -> Client:
         """Create a client of a service. Raises RosError: the node is closed."""
@@ -161,7 +172,16 @@ class RmwZenohNode:
         return made
 
     def look(self) -> None:
-        """Nothing: Zenoh's timers do not depend on the system clock."""
+        """Offer services under the hash that most tell by now: who was first may have lied."""
+        now = time.monotonic()
+        if now < self._look_at:
+            return
+        self._look_at = now + _LOOK_EVERY_S
+        for made in list(self._made):
+            if isinstance(made, Server) and made.is_open:
+                hash = self._hash(made.name, made.type)
+                if hash and made.move(hash):
+                    self._tell_clients(made)
 
     def _tokens(self, kind: str, name: str, type_name: str) -> Callable[[str], Token]:
         id = str(next(self._numbers))

@@ -40,16 +40,14 @@ class Publisher:
         self._withdraw = withdraw
         self._open = True
 
-    def publish(self, payload: bytes) -> None:
-        """Publish a serialised message. Nothing happens once it is withdrawn.
-
-        Raises:
-            Unreadable: The bytes are no message of this type.
-            RosError: ROS refused it.
-        """
+    def check(self, payload: bytes) -> None:
+        """Raise Unreadable where bytes are no message of this type: ROS must not be given them."""
         fault = self._shape.fault(payload)
         if fault:
             raise Unreadable(f"{len(payload)} bytes are no message of its type: {fault}")
+
+    def publish(self, payload: bytes) -> None:
+        """Publish a checked message. Nothing happens once it is withdrawn. Raises RosError."""
         try:
             if self._open:
                 self._publisher.publish(payload)

@@ -65,6 +65,8 @@ def decode_batch(frame: bytes) -> Batch:
         raise FrameError(f"a batch of {len(frame)} bytes")
     session, after, count = _BATCH.unpack_from(frame)
     _check(after)
+    if session == NO_SESSION:
+        raise FrameError("a batch of no session")
     if count > BATCH_LIMIT:
         raise FrameError(f"a batch of {count} messages")
     at, messages = _BATCH.size, []

@@ -62,6 +62,11 @@ def cancel_request(goal: bytes) -> bytes:
     return _CDR_HEADER + goal + _NO_TIME
 
 
+def names_one(cancel: bytes) -> bool:
+    """Whether a request to cancel means one goal, not all, or all until a moment."""
+    return any(goal_of(cancel)) and not any(cancel[20:28])
+
+
 class Had(Enum):
     """A replica's last answer about a goal."""
 

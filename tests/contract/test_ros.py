@@ -75,7 +75,7 @@ def _zenoh(router: Router) -> World:
     hashes = {SET_BOOL: "RIHS01_" + "ab" * 32}
     return World(
         lambda: RmwZenohNode(
-            "contract", 7, hash_of=lambda t: hashes.get(t, ""), environ=router.environ
+            "contract", 7, hashes_of=lambda t: [hashes[t]] * (t in hashes), environ=router.environ
         ),
         lambda: time.sleep(0.005),
         loads_types=False,

@@ -338,7 +338,7 @@ def targets() -> dict[str, Target]:
         "batch": Target(
             topic_frames.decode_batch,
             framed,
-            (topic_frames.encode_batch(TOKEN, 9, [(8, b"one"), (9, b"")]),),
+            (topic_frames.encode_batch(b"sessions", 9, [(8, b"one"), (9, b"")]),),
         ),
         "bundle": Target(bundle.read_label, (CredentialError,), (_bundle(),)),
         "bundle's files": Target(

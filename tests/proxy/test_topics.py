@@ -7,14 +7,18 @@ from typing import Any
 
 import pytest
 
+from fogft.errors import Unreadable
 from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
-from fogft.model.topic import Origin, TopicSpec
+from fogft.model.topic import Origin, Select, TopicSpec
 from fogft.proxy.replica.topics import HOLD_S, TopicsOnReplica
 from fogft.proxy.robot.topics import TopicsOnRobot
 from fogft.requests.load import Handling
+from fogft.topics.frames import encode_batch
 from tests.nightly import by_day
 from tests.proxy.fakes import Clock, FakeLink
+
+JUNK = b"junk"
 
 
 class FakeTopics:
@@ -29,6 +33,10 @@ class FakeTopics:
         node, said = self, self.published.setdefault(name, [])
 
         class Publisher:
+            def check(self, payload):
+                if payload == JUNK:
+                    raise Unreadable("junk")
+
             def publish(self, payload):
                 said.append(payload)
 
@@ -237,6 +245,20 @@ def test_a_pull_is_held_until_there_is_something_and_not_for_ever():
     assert len(world.links[0].offered) == out + 1
 
 
+def test_a_robot_that_pulls_without_end_has_only_its_own_pulls_answered_early():
+    world = World(BACK)
+    for _ in range(2):
+        world.carry()
+    for number in range(200):
+        offered = (BACK.key_name, b"%016d" % number, world.links[0].offered[-1][2], 10.0)
+        greedy = Carried(world, 0, world.links[0], offered)
+        greedy.robot = "eve"
+        world.replicas[0].request(greedy)
+    ours = world.links[0].offered[-1][1]
+    assert len(world.answers) > 100
+    assert ours not in {answer.request_id for _, answer in world.answers}
+
+
 def test_who_comes_later_gets_what_is_latched_and_nothing_else():
     for latched, wanted in ((True, [b"two", b"three"]), (False, [])):
         world = World(TopicSpec("/to", "p/msg/T", Origin.ROBOT, depth=2, latched=latched))
@@ -270,6 +292,7 @@ def test_a_replica_that_starts_anew_begins_a_new_session():
     for out in list(world.links[0].offered[-1:]):
         world.robot.answered(1, Answer(out[1], refusal=Refusal.LOST, service=out[0]))
     world.carry()  # is told where to begin
+    world.clock.now += 1
     world.carry()
     world.nodes[0].heard["/back"](b"after")
     world.carry()
@@ -293,6 +316,40 @@ def test_noise_from_a_peer_harms_nobody():
     back.clock.now += 1
     back.robot.tick()
     assert len(back.links[0].offered) == 2
+
+
+@pytest.mark.parametrize("select", list(Select))
+def test_what_is_no_message_neither_leads_nor_passes_and_is_held_against_its_replica(select):
+    """The others' messages pass as if it were not there."""
+    topic = TopicSpec("/back", "p/msg/T", Origin.REPLICAS, select=select, depth=100)
+    world = World(topic, replicas=2)
+    world.robot = TopicsOnRobot(lambda: None, lambda said: b"+".join(said.values()), world.clock)
+    world.robot.serve([topic], world.robot_node)
+    world.route()
+    for _ in range(2):
+        world.carry()
+    said = [b"head%016d" % number for number in range(10**8, 10**9, 10**8)]
+    for slot, messages in enumerate(([JUNK] * 4, said)):
+        for message in messages:
+            world.clock.now += 0.3
+            world.nodes[slot].heard["/back"](message)
+            world.carry()
+    assert world.robot_node.published["/back"] == said
+    assert [world.robot.misreads(key) for key in (1, 2)] == [True, False]
+    assert world.robot.report()["/back"]["refused"] == 4
+
+
+def test_a_replica_that_answers_at_once_with_nothing_is_not_asked_again_at_once():
+    """It would keep the client proxy busy for nothing."""
+    world = World(BACK)
+    link = world.links[0]
+    for turn in range(100):
+        world.robot.tick()
+        id, session = link.offered[-1][1], bytes([turn % 2] * 8)
+        nothing = encode_batch(session, 0, ())
+        world.robot.answered(1, Answer(id, payload=nothing, service=BACK.key_name))
+        world.clock.now += 0.01
+    assert len(link.offered) < 10
 
 
 def test_a_publisher_that_is_not_heard_is_told_of(caplog):

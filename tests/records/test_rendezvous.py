@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 
 from fogft.model.credentials import CredentialPaths
+from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import Membership
 from fogft.pool.credentials.authority import Role
+from fogft.proxy.robot.following import Following
 from fogft.records import cache as record_cache
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
 from fogft.records.roster import admission_content
@@ -21,6 +23,7 @@ from fogft.records.signing import Signer
 from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.ports import free_port
+from tests.proxy.fakes import Clock
 from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
 
 
@@ -71,6 +74,40 @@ def test_everybody_learns_who_is_where(authority, rendezvous, party):
     assert robot.endpoint(0) == ""  # the launch that is admitted says nothing any more
     manager.admit(2, (0, 2), (1, 1))
     wait_for(lambda: robot.endpoint(0) == "10.9.9.9:1")
+
+
+def test_a_replica_that_moves_without_end_is_dialled_once_a_second(
+    authority, rendezvous, party, tmp_path
+):
+    """Each new address costs a new connection, and the others' requests wait for that."""
+    place, clock = rendezvous(), Clock()
+    party(manager_files(authority), place).admit(1, (0, 1))
+    config = ClientProxyConfig(
+        pool="p", pool_uid=POOL_UID, credentials=authority.robot("ada"), services=(), robot="ada",
+        membership=tmp_path / "a", status=tmp_path / "b", lock=tmp_path / "c",
+        rendezvous=(place.endpoint,),
+    )  # fmt: skip
+    following, witness = Following(config, clock), party(authority.robot("bob"), place)
+    wait_for(lambda: following.look() is not None)
+    liar, found = party(authority.replica(0), place), set[str]()
+
+    def moves(port: int) -> None:
+        liar.announce(0, 1, f"10.0.0.1:{port}")
+        wait_for(lambda: witness.endpoint(0) == f"10.0.0.1:{port}")
+        if (seen := following.look()) is not None:
+            found.update(member.endpoint for member in seen.members)
+
+    for port in range(1, 20):
+        moves(port)
+    assert len(found) <= 5
+
+    def arrives() -> bool:
+        clock.now += 1.0
+        seen = following.look()
+        return seen is not None and seen.members[0].endpoint == "10.0.0.1:19"
+
+    wait_for(arrives)
+    following.close()
 
 
 @pytest.mark.parametrize("forgets", [False, True])

@@ -56,7 +56,9 @@ def make(rmw_router: Router) -> Iterator[Callable[..., RmwZenohNode]]:
     made: list[RmwZenohNode] = []
 
     def new(name: str = "fogft_p", known: str = HASH) -> RmwZenohNode:
-        node = RmwZenohNode(name, 7, hash_of=lambda _: known, environ=rmw_router.environ)
+        node = RmwZenohNode(
+            name, 7, hashes_of=lambda _: [known] * bool(known), environ=rmw_router.environ
+        )
         made.append(node)
         return node
 
@@ -124,7 +126,7 @@ def test_bytes_of_another_shape_go_to_nobody(
     """They come from elsewhere, and may end the process of a node that reads them."""
     faults = {REQUEST: "no request", RESPONSE: "no response"}
     node = RmwZenohNode(
-        "fogft_q", 7, hash_of=lambda _: HASH, environ=rmw_router.environ,
+        "fogft_q", 7, hashes_of=lambda _: [HASH], environ=rmw_router.environ,
         fault_of=lambda type_name, part: lambda payload: faults[part] if payload == BODY else "",
     )  # fmt: skip
     with contextlib.closing(node):
@@ -261,6 +263,26 @@ def test_a_client_with_another_definition_is_told_in_the_log_and_not_answered(
     held = client_token(peer, OTHER)
     wait_for(lambda: "type_differs" in caplog.text, "the message")
     assert not any(OTHER in token for token in tokens(peer) if "/SS/" in token)
+    held.undeclare()
+
+
+def test_one_who_tells_another_hash_moves_the_service_only_until_others_tell(
+    peer: zenoh.Session, rmw_router: Router
+) -> None:
+    """Who is heard first may lie; of equally many, they count whom a client agrees with."""
+    said, held = [OTHER], client_token(peer, HASH)
+    node = RmwZenohNode("fogft_q", 7, hashes_of=lambda _: said, environ=rmw_router.environ)
+    with contextlib.closing(node):
+        echo(node)
+        said.append(HASH)
+        attachment = request_attachment(1, 1, GID)
+
+        def asked() -> list[Any]:
+            node.look()
+            return ask(peer, KEY, payload=BODY, attachment=attachment)
+
+        wait_for(asked, "an answer")
+        assert not any(OTHER in token for token in tokens(peer))
     held.undeclare()
 
 

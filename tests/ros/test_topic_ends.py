@@ -26,11 +26,11 @@ def test_bytes_go_out_and_come_in(make_node, ros_domain):
     assert publisher.subscribers() == 1
 
 
-def test_what_is_no_message_is_published_nowhere(make_node, ros_domain):
+def test_what_is_no_message_is_found_before_it_is_published(make_node, ros_domain):
     publisher = make_node(ros_domain).publisher("/said", STRING, Quality())
     for noise in (b"", b"\0\1", b"\0\1\0\0\xff\xff\xff\xffx"):
         with pytest.raises(Unreadable):
-            publisher.publish(noise)
+            publisher.check(noise)
 
 
 def test_a_publisher_that_offers_less_is_told_of_with_the_remedy(make_node, ros_domain):

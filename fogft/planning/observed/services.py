@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from fogft.model.plain import Line
+from fogft.model.plain import Count, Line
 from fogft.model.replica import LinkReport, LinkState, Machine, MachinePhase
 from fogft.model.ros_names import is_below
 from fogft.model.spec import ServiceSpec
@@ -28,10 +28,12 @@ class Discovered:
     Attributes:
         spec_hash: Of the replicas that told it.
         services: Name -> type.
+        voters: How many replicas had told when most of them confirmed all of it; 0 if not known.
     """
 
     spec_hash: Line = ""
     services: Mapping[Line, Line] = field(default_factory=dict)
+    voters: Count = 0
 
     def specs(self, namespace: str = "") -> tuple[ServiceSpec, ...]:
         """Return the services below a namespace, with default policies."""
@@ -49,10 +51,12 @@ class Claims:
     Attributes:
         count: How many offer a service: its name and type.
         voters: Of how many.
+        heard: How many have told.
     """
 
     count: Mapping[tuple[str, str], int]
     voters: int
+    heard: int = 0
 
     def agreed(self) -> dict[str, str]:
         """Return name -> type of the services that more than half of the replicas offer."""
@@ -61,6 +65,20 @@ class Claims:
     def outvoted(self) -> list[str]:
         """Return the names of the other services, sorted."""
         return sorted({name for name, _ in self.count} - self.agreed().keys())
+
+    def doubtful(self, known: Discovered) -> frozenset[str]:
+        """Return known names that most do not offer, where more have told than when it was known.
+
+        Whoever was alone at first may have lied, and nobody else would ever be ready.
+        """
+        if self.heard <= known.voters:
+            return frozenset()
+        said = {
+            (name, kind): self.count.get((name, kind), 0) for name, kind in known.services.items()
+        }
+        return frozenset(
+            name for (name, _), n in said.items() if 2 * (self.heard - n) > self.voters
+        )
 
 
 def claims(
@@ -82,12 +100,16 @@ def claims(
     }
     heard = [link for link in links if link.id in ours and link.state is LinkState.UP]
     count = Counter(pair for link in heard for pair in link.offered)
-    return Claims(count, max(len(ours), wanted if known.services else 0))
+    told = sum(bool(link.offered) for link in heard)
+    return Claims(count, max(len(ours), wanted if known.services else 0), told)
 
 
-def grown(known: Discovered, spec_hash: str, now: Mapping[str, str]) -> Discovered:
+def grown(known: Discovered, spec_hash: str, now: Mapping[str, str], heard: int = 0) -> Discovered:
     """Return the discovered services extended by what replicas of a hash agree on."""
     if not now:
         return known
-    before = known.services if known.spec_hash == spec_hash else {}
-    return Discovered(spec_hash, {**now, **before})
+    if known.spec_hash != spec_hash:
+        return Discovered(spec_hash, dict(now), heard)
+    confirmed = known.services.keys() <= now.keys()
+    voters = max(known.voters, heard) if confirmed else known.voters
+    return Discovered(spec_hash, {**now, **known.services}, voters)

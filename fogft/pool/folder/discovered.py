@@ -6,6 +6,7 @@ Not here: how it grows (`fogft.planning.observed.services`).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from fogft.model.plain import as_line, to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
-from fogft.planning.observed.services import Discovered, claims, grown
+from fogft.planning.observed.services import Claims, Discovered, claims, grown
 
 _NOTED = 5  # of what is not offered
 
@@ -26,8 +27,9 @@ class Discovery:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._known = disk.read_or(path, Discovered())
+        self.known = disk.read_or(path, Discovered())
         self._refused: dict[tuple[str, str], str] = {}
+        self._doubted: dict[str, float] = {}  # known names, and since when most do not offer them
         self.notes: list[Reason] = []
 
     def look(self, spec: PoolSpec, observed: Observed, wanted: int) -> bool:
@@ -36,22 +38,35 @@ class Discovery:
         if spec.services:
             return False
         told = claims(
-            self._known, spec.replica_hash, observed.machines or (), observed.links or (), wanted
+            self.known, spec.replica_hash, observed.machines or (), observed.links or (), wanted
         )
         agreed = told.agreed()
         usable = {
             name: kind for name, kind in agreed.items() if not self._refusal(spec, name, kind)
         }
-        more = grown(self._known, spec.replica_hash, usable)
+        more = self._without_doubtful(spec, told, observed.now)
+        more = grown(more, spec.replica_hash, usable, told.heard)
         new = [name for name in told.outvoted() if name not in more.services]
         self.notes += [
             Reason(Cause.OUTVOTED, name=as_line(name), of=told.voters) for name in new[:_NOTED]
         ]
-        if more == self._known:
+        if more == self.known:
             return False
         disk.write_json(self._path, to_plain(more))
-        self._known = more
+        self.known = more
         return True
+
+    def _without_doubtful(self, spec: PoolSpec, told: Claims, now: float) -> Discovered:
+        """Return what is known without names that most have not offered for long."""
+        known = self.known
+        doubtful = told.doubtful(known) if known.spec_hash == spec.replica_hash else ()
+        self._doubted = {name: self._doubted.get(name, now) for name in doubtful}
+        limit_s = spec.health.start_limit_s / 2
+        over = {name for name, since in self._doubted.items() if now - since > limit_s}
+        if not over:
+            return known
+        left = {name: kind for name, kind in known.services.items() if name not in over}
+        return replace(known, services=left, voters=told.heard)
 
     def _refusal(self, spec: PoolSpec, name: str, kind: str) -> str:
         """Return why a service cannot be offered here; it is left out then, and noted."""

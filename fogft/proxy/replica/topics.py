@@ -15,6 +15,7 @@ import logging
 import os
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 from typing import TYPE_CHECKING
@@ -34,7 +35,7 @@ log = logging.getLogger(__name__)
 
 HOLD_S = 2.0
 LOOK_EVERY_S = 2.0  # whether publishers are heard
-_HELD_LIMIT = 64  # pulls of one topic; beyond it the oldest is answered with nothing
+_HELD_LIMIT = 64  # pulls of one topic; beyond it one of whom has most is answered with nothing
 _BATCH_BYTES = 8 << 20
 
 
@@ -73,12 +74,21 @@ class _Outgoing:
             if self._ring.last <= after:
                 hold_s = min(HOLD_S, incoming.remaining_s / 2)
                 self._held.append(_Pull(incoming, after, self._clock() + hold_s))
-                excess = self._held.pop(0) if len(self._held) > _HELD_LIMIT else None
+                excess = self._excess()
                 incoming = None  # type: ignore[assignment]
         if incoming is not None:
             self._answer(incoming, after)
         if excess is not None:
             self._answer(excess.incoming, excess.after)
+
+    def _excess(self) -> _Pull | None:
+        """Return a pull that is held no longer: the oldest of the robot that has most."""
+        if len(self._held) <= _HELD_LIMIT:
+            return None
+        [(most, _)] = Counter(pull.incoming.robot for pull in self._held).most_common(1)
+        excess = next(pull for pull in self._held if pull.incoming.robot == most)
+        self._held.remove(excess)
+        return excess
 
     def tick(self, now: float) -> None:
         """Answer those with nothing that have waited long enough."""
@@ -204,6 +214,7 @@ class TopicsOnReplica:
         if publisher is None:
             incoming.refuse(Refusal.NOT_READY)
             return
+        publisher.check(message)
         if self._seen[incoming.service].is_new(session, number):
             publisher.publish(message)
         incoming.reply(b"")

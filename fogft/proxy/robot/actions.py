@@ -100,11 +100,14 @@ class _CancelPart(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
     ) -> Judgement:
-        """Note what a replica has cancelled."""
+        """Note what a replica has cancelled, of what it was told to: it may name others' goals."""
         if reading:
+            asked, _ = self._sent.get(id, (b"", 0.0))
+            several = pending is not None and not goals.names_one(pending.item.payload)
             with self._action.lock:
                 for goal in goals.cancelled(payload):
-                    self._action.goals.cancelled(goal)
+                    if several or goal == asked:
+                        self._action.goals.cancelled(goal)
         return super().judge(id, replica, payload, reading, pending)
 
     def refused(

@@ -292,7 +292,12 @@ class ClientProxy:
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
         dispatchers = [service.dispatcher for service in self._services.values()]
-        return self.links.reports(dispatchers, self._differences)
+        return self.links.reports(dispatchers, self._differences, self._misreads)
+
+    def _misreads(self, replica: int) -> bool:
+        services = self._services.values()
+        by_services = any(service.dispatcher.misreads(replica) for service in services)
+        return by_services or self._topics.misreads(replica)
 
     def behind(self) -> tuple[GatewayView, ...]:
         """Return the state of each replica, as a gateway reports it to its robots."""

@@ -390,8 +390,8 @@ class Dispatcher:
             self._decide.close()
 
     def disagrees(self, replica: int) -> bool:
-        """Whether a replica's answers have differed, or were malformed, repeatedly."""
-        return replica in self._decide.flagged or self.misreads(replica)
+        """Whether a replica's answers have differed from those of others, repeatedly."""
+        return replica in self._decide.flagged
 
     def misreads(self, replica: int) -> bool:
         """Whether a replica's answers were malformed, repeatedly."""

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -31,11 +32,19 @@ from fogft.records.signing import LazyVerifier, Signer, Verifier
 
 log = logging.getLogger(__name__)
 
+# Changed records are looked at once a second, but for so many times in a row: a replica whose
+# record says each moment that it has moved would be dialled each moment.
+_LOOKS = 5.0
+
 
 class Following:
     """A client proxy's view of the pool's membership. Raises WireError, CredentialError."""
 
-    def __init__(self, config: ClientProxyConfig) -> None:
+    def __init__(
+        self, config: ClientProxyConfig, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._clock = clock
+        self._looks, self._looked_at = _LOOKS, clock()
         self._config = config
         self._file = Watched(config.membership)
         self._from_file: Membership | None = None
@@ -102,8 +111,13 @@ class Following:
 
     def look(self) -> Membership | None:
         """Return the membership if it may have changed. Raises StateError: a damaged file."""
-        changed = self._changed.is_set()
-        self._changed.clear()
+        now = self._clock()
+        self._looks = min(_LOOKS, self._looks + now - self._looked_at)
+        self._looked_at = now
+        changed = self._changed.is_set() and self._looks >= 1.0
+        if changed:
+            self._changed.clear()
+            self._looks -= 1.0
         if self._file.changed():
             changed = True
             self._read()

@@ -34,7 +34,12 @@ _ORDER = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 
 
 def link_report(
-    link: Link, dispatchers: Collection[Dispatcher], differ: Mapping[str, str], *, draining: bool
+    link: Link,
+    dispatchers: Collection[Dispatcher],
+    differ: Mapping[str, str],
+    *,
+    draining: bool,
+    misread: bool,
 ) -> dict[str, Any]:
     """Return the report of a link; `differ`: services it cannot answer, with reasons."""
     status, id = link.status(), link.peer.id
@@ -53,9 +58,9 @@ def link_report(
         "leaving": link.draining,
         "draining": draining,
         "at_risk": bool(answer and answer.at_risk),
-        "disagrees": status.ignores or any(dispatcher.disagrees(key) for dispatcher in dispatchers),
+        "disagrees": status.ignores or misread or any(one.disagrees(key) for one in dispatchers),
         "ignores": status.ignores,
-        "misread": any(dispatcher.misreads(key) for dispatcher in dispatchers),
+        "misread": misread,
         "heard_age_s": status.heard_age_s,
         "silent_for_s": status.silent_for_s,
         "rtt_s": status.rtt_s,
@@ -257,26 +262,35 @@ class Links:
         answers = {link.peer.id: link.status().probe_answer for link in self}
         return {id: answer.hanging for id, answer in answers.items() if answer is not None}
 
-    def types(self) -> dict[str, Definition]:
-        """Return the type definitions reported by most replicas."""
+    def told(self) -> dict[str, list[Definition]]:
+        """Return the type definitions as each replica reports them."""
         told: dict[str, list[Definition]] = {}
         for link in self:
             answer = link.status().probe_answer
             for name, definition in (answer.types if answer is not None else {}).items():
                 told.setdefault(name, []).append(definition)
-        return {name: max(all_of, key=all_of.count) for name, all_of in told.items()}
+        return told
+
+    def types(self) -> dict[str, Definition]:
+        """Return the type definitions reported by most replicas."""
+        return {name: max(all_of, key=all_of.count) for name, all_of in self.told().items()}
 
     def reports(
         self,
         dispatchers: Collection[Dispatcher],
         differences: Callable[[Link], Mapping[str, str]],
+        misreads: Callable[[int], bool],
     ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
         replicas, gateways, behind = [], [], []
         for id, link in sorted(self._links.items()):
             member = self._members.get(id)
             draining = self.draining(link)
-            report = link_report(link, dispatchers, differences(link), draining=draining)
+            report = link_report(
+                *(link, dispatchers, differences(link)),
+                draining=draining,
+                misread=misreads(key_of(link)),
+            )
             if member is None or not member.gateway:
                 replicas.append(report)
                 continue

@@ -198,7 +198,7 @@ class _Running:
             _node_name("fogft_proxy", config.pool),
             config.domain_id,
             early=early,
-            told=lambda: made[0].links.types() if made else {},
+            told=lambda: made[0].links.told() if made else {},
             noticed=lambda: made[0].look_again() if made else None,
         )
         make = functools.partial(

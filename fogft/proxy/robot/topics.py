@@ -10,15 +10,18 @@ import logging
 import os
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fogft.errors import FrameError, RosError
+from fogft.errors import FrameError, RosError, Unreadable
 from fogft.link.port import Answer, Link
+from fogft.log_limits import worth_logging
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
+from fogft.model.replica import short
 from fogft.model.topic import Origin, Select, TopicSpec
+from fogft.proxy.robot.dispatcher import MALFORMED_LIMIT
 from fogft.topics import frames
 from fogft.topics.queues import Numbered, Outbox
 from fogft.topics.select import Selection
@@ -32,6 +35,7 @@ log = logging.getLogger(__name__)
 _MESSAGE_S = 10.0  # a message that is not confirmed in this time goes again
 _PULL_S = 10.0
 _AGAIN_S = 0.2  # after a refusal
+_AT_ONCE_S = 0.1  # a pull that is answered sooner with nothing was not held
 _LOOK_EVERY_S = 2.0  # whether publishers are heard, and how often they publish
 _UNCONFIRMED_LIMIT = 4096
 
@@ -46,7 +50,7 @@ class _Way:
     def __init__(self, topic: TopicSpec) -> None:
         self.outbox = Outbox(topic.depth)
         self.session, self.after = frames.NO_SESSION, 0
-        self.rest_until = 0.0
+        self.rest_until = self.pulled_at = 0.0
         self.out: dict[bytes, int] = {}  # request id -> a message's number; 0 for a pull
 
 
@@ -74,6 +78,7 @@ class RobotTopic:
         self._looked_at = clock()
         self.trouble = ""
         self._unconfirmed: dict[int, None] = {}
+        self.malformed: Counter[int] = Counter()
         self._rate_hz, self._counted = 0.0, (clock(), 0)
         self.count = dict.fromkeys(("messages", "passed", "dropped", "refused"), 0)
 
@@ -158,6 +163,7 @@ class RobotTopic:
             elif not (self.topic.latched or self._selection.wants(key, now)):
                 way.session = frames.NO_SESSION  # later, it begins with what comes then
             elif not way.out:
+                way.pulled_at = now
                 pull = frames.encode_pull(way.session, way.after)
                 self._offer(way, link, 0, pull, _PULL_S)
 
@@ -211,18 +217,35 @@ class RobotTopic:
         try:
             session, after, messages = frames.decode_batch(frame)
         except FrameError as error:
-            log.warning("batch_malformed topic=%s reason=%r", self.topic.name, str(error))
+            self._misread(key, str(error))
             way.rest_until = self._clock() + _AGAIN_S
             return
         first = way.after if session == way.session else after
+        now, begins = self._clock(), way.session == frames.NO_SESSION
         way.session, way.after = session, after
-        now = self._clock()
-        for number, message in messages:
-            if number > first:
-                self.count["messages"] += 1
-                self._pass(key, message, now)
+        new = [message for number, message in messages if number > first]
+        if not (new or begins) and now - way.pulled_at < _AT_ONCE_S:
+            way.rest_until = now + _AGAIN_S
+        for message in new:
+            self.count["messages"] += 1
+            self._pass(key, message, now)
+
+    def _misread(self, key: int, fault: str) -> None:
+        """Hold it against a replica that it sent what is no message."""
+        self.malformed[key] += 1
+        self.count["refused"] += 1
+        if worth_logging(self.malformed[key]):
+            log.error("message_malformed topic=%s replica=%s count=%d reason=%r",
+                      self.topic.name, short(key), self.malformed[key], fault)  # fmt: skip
 
     def _pass(self, key: int, message: bytes, now: float) -> None:
+        if self._publisher is None:
+            return
+        try:
+            self._publisher.check(message)  # first: what is no message does not lead
+        except Unreadable as error:
+            self._misread(key, error.message)
+            return
         if self.topic.select is Select.STATUS:
             self._said[key] = message
             merged = self._merge(self._said)
@@ -231,8 +254,6 @@ class RobotTopic:
             self._told = message = merged
         elif not self._selection.passes(key, message, now):
             self.count["dropped"] += 1
-            return
-        if self._publisher is None:
             return
         try:
             self._publisher.publish(message)
@@ -301,6 +322,10 @@ class TopicsOnRobot:
     def answered(self, key: int, answer: Answer) -> None:
         """Pass the end of an attempt to its topic."""
         self._topics[answer.service].answered(key, answer)
+
+    def misreads(self, key: int) -> bool:
+        """Whether a replica's messages were malformed, repeatedly."""
+        return any(one.malformed[key] >= MALFORMED_LIMIT for one in self._topics.values())
 
     def __len__(self) -> int:
         """Return how many pass."""

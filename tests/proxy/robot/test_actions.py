@@ -319,6 +319,25 @@ def test_a_goal_that_was_cancelled_is_begun_on_nobody_else():
     assert scene.answers[-1] == ("result", CANCELED)
 
 
+def test_a_replica_cancels_no_goal_but_the_one_that_it_is_told_to():
+    """It keeps the order that ended a goal, and answers it with the next one, which others take."""
+    scene, new = Scene(2), b"n" * 16
+    scene.accept()
+    scene.say(1, SUCCEEDED, "result")
+    scene.tick()
+    assert scene.given(scene.links[0], "cancel") == [cancel_request(ID)]
+    scene.ask("goal", HEADER + new + b"5")
+    scene.say(0, cancelling(ID, new), "cancel")
+    scene.say(1, ACCEPTED, "goal")
+    scene.ask("result", HEADER + new)
+    scene.tick()
+    assert cancel_request(new) not in scene.given(scene.links[1], "cancel")
+    late = FakeLink(7)
+    scene.links.append(late)
+    scene.route(*scene.links)
+    assert scene.given(late, "goal") == [HEADER + new + b"5"]
+
+
 def test_who_takes_a_goal_that_was_cancelled_or_is_over_is_told_to_cancel_it():
     for over in (False, True):
         scene = Scene(2)

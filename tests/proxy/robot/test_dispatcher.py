@@ -466,10 +466,10 @@ def test_a_replica_whose_responses_are_malformed_is_to_be_replaced() -> None:
     scene = Scene(2, fault_of=SET_BOOL.fault)
     liar, honest = (key_of(link) for link in scene.links)
     for count in range(1, MALFORMED_LIMIT + 1):
-        assert not scene.dispatcher.disagrees(liar)
+        assert not scene.dispatcher.misreads(liar)
         scene.dispatcher.submit(b"q", count)
         scene.answer(0, b"junk")
         scene.answer(1, RIGHT)
-    assert scene.dispatcher.disagrees(liar)
-    assert not scene.dispatcher.disagrees(honest)
+    assert scene.dispatcher.misreads(liar)
+    assert not scene.dispatcher.misreads(honest)
     assert [handle for handle, _ in scene.responses] == list(range(1, MALFORMED_LIMIT + 1))

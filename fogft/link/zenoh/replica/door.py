@@ -4,6 +4,8 @@ A stranger is who has connected and not said who he is: a robot in the midst of 
 nobody that is wanted. Zenoh rests for 0.1 s after each handshake that fails, and all that come
 after wait for that. So few strangers are let in of each host, and they are ended one by one.
 
+A host is an IPv4 address, or a network of IPv6.
+
 Owns: the judgement. Not here: the sockets (`connection_reaper`, `listen_filter`).
 """
 
@@ -13,6 +15,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 
 from fogft.link.zenoh.sockets import Address
+from fogft.records.greetings import network_of
 
 # Longer than Zenoh takes to accept or give up a peer that talks.
 PATIENCE_S = 5.0
@@ -42,7 +45,7 @@ class Door:
     ) -> Address | None:
         """Take the current connections; return the unauthenticated ones to close now."""
         self._first_seen = {peer: self._first_seen.get(peer, now) for peer in strangers}
-        known = {host for host, _ in linked}
+        known = {network_of(host) for host, _ in linked}
         self._until = {
             host: until for host, until in self._until.items() if now < until and host not in known
         }
@@ -56,13 +59,13 @@ class Door:
     @property
     def kept_out(self) -> frozenset[str] | None:
         """Hosts from which nothing more is accepted; None for all hosts."""
-        others = [host for host, _ in self._first_seen if host not in self._until]
+        others = [host for host, _ in self._first_seen if network_of(host) not in self._until]
         return None if len(others) >= SHUT_LIMIT else frozenset(self._until)
 
 
 def full(strangers: Collection[Address]) -> set[str]:
     """Return the hosts with too many unauthenticated connections."""
-    of_host = Counter(host for host, _ in strangers)
+    of_host = Counter(network_of(host) for host, _ in strangers)
     return {host for host, count in of_host.items() if count >= HOST_LIMIT}
 
 
@@ -71,7 +74,7 @@ def condemned(strangers: Mapping[Address, float], now: float) -> list[Address]:
     by_age = sorted(strangers, key=lambda peer: strangers[peer])
     surplus = set(by_age[: max(0, len(by_age) - STRANGERS_LIMIT)])
     for host in full(strangers):  # who shares its address is to have a turn
-        of_host = [peer for peer in by_age if peer[0] == host]
+        of_host = [peer for peer in by_age if network_of(peer[0]) == host]
         surplus.update(of_host[: len(of_host) - HOST_LIMIT // 2])
     return [
         peer

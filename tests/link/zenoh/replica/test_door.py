@@ -68,6 +68,17 @@ def test_who_shares_a_full_hosts_address_has_a_turn_soon() -> None:
     assert door.look(strangers, (), 0.6) in strangers
 
 
+def test_a_host_of_ipv6_is_its_network() -> None:
+    """Who has one address of 64 bits has them all, and would else shut the door for everybody."""
+    door = Door()
+    strangers = {(f"2001:db8::{n:x}", 1) for n in range(SHUT_LIMIT)}
+    door.look(strangers | {("2001:db8:1::1", 1)}, (), 0.0)
+    assert door.kept_out == {"2001:db8::"}
+    assert door.look(strangers, (), 0.6) in strangers
+    door.look((), {("2001:db8::ffff", 2)}, 0.7)
+    assert door.kept_out == frozenset()
+
+
 @contextlib.contextmanager
 def listening(address: str) -> Iterator[tuple[str, int]]:
     family = socket.AF_INET6 if ":" in address else socket.AF_INET
