@@ -87,10 +87,11 @@ def _no_room(spec: PoolSpec) -> str:
 def _show_launches(preview: Preview) -> None:
     from fogft.cli.plan_text import price_source
     from fogft.cli.table import table
+    from fogft.model.groups import GATEWAY_SLOT
 
     rows = [
         (
-            f"  {launch.slot}",
+            f"  {'gateway' if launch.slot == GATEWAY_SLOT else launch.slot}",
             launch.offer.placement.location,
             launch.offer.placement.instance,
             f"${launch.offer.usd_per_hour:.3f}/h",

@@ -37,6 +37,8 @@ class Launch:
     link_port: int = LINK_PORT
     # A machine of another type in the same place may cost so much at most; None for no limit.
     limit_usd_per_hour: float | None = None
+    # Others that are opened beside it.
+    more_ports: tuple[int, ...] = ()
     # The replica dials its robots: nobody reaches it, so no port need be open.
     dials_out: bool = False
     # The networks that may connect to it, where the cloud can hold that; none for all.

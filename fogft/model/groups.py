@@ -23,6 +23,7 @@ MAX_GROUPS = 8
 STAND_INS = BLOCK // 2
 # The manager launches all slots below; replicas that people start by hand stay out of its way.
 FIRST_BY_HAND = 2000
+GATEWAY_SLOT = FIRST_BY_HAND - 1  # the machine of the gateway that a pool launches for itself
 LAST_BY_HAND = 999_999
 
 

@@ -266,6 +266,7 @@ class Observed:
         ending: Machines that were already asked to end, and may still be listed.
         rtt_s: ``cloud/region`` -> round trip from the robot in seconds, where it is known.
         doubt_s: By so much the clock was set just now: the time of day goes without it.
+        gateway: The machine of a launched gateway; more than one while it is replaced.
     """
 
     now: float
@@ -275,6 +276,13 @@ class Observed:
     ending: frozenset[ReplicaId] = frozenset()
     rtt_s: Mapping[str, float] = field(default_factory=dict)
     doubt_s: float = 0.0
+    gateway: tuple[Machine, ...] = ()
+
+    def below(self, cap: float | None) -> float | None:
+        """Return what a cap leaves for replicas."""
+        if cap is None:
+            return None
+        return max(0.0, cap - sum(machine.usd_per_hour for machine in self.gateway))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
 from typing import Any
@@ -48,7 +48,7 @@ from fogft.model.names import LINK_PORT, endpoint, network
 from fogft.model.ros_names import field_path, is_field_name, service_name, service_type
 from fogft.model.state import StateSpec
 from fogft.model.topic import ActionSpec, TopicSpec
-from fogft.model.topology import Topology
+from fogft.model.topology import LAUNCHED, Gateway, LaunchedGateway, Topology
 
 CONCURRENCY_LIMIT = 512  # a replica holds no more requests
 MAX_HOURS = 8000  # the certificates last 365 days
@@ -398,6 +398,11 @@ class PoolSpec:
         "Gateways, and which robots use them. Needs a `rendezvous`.",
         default_factory=Topology,
     )
+    gateway: LaunchedGateway = key(
+        Map(LaunchedGateway, "write `gateway: {launch: true}`"),
+        "A gateway that the pool launches for itself.",
+        default_factory=LaunchedGateway,
+    )
     uplinks: tuple[str, ...] = key(
         Listed(
             Text(
@@ -465,6 +470,17 @@ class PoolSpec:
     def proxied(self) -> tuple[ServiceSpec, ...]:
         """The services offered on robots: the file's, or the discovered ones."""
         return self.services or self.discovered
+
+    @property
+    def dials_out(self) -> bool:
+        """Whether nobody has to reach a replica: it dials a robot or a gateway."""
+        return bool(self.dial_in) or self.gateway.launch
+
+    def behind(self, host: str) -> PoolSpec:
+        """Return this spec once its launched gateway is at `host`: all talk through it."""
+        gateway, rendezvous, door = self.gateway.endpoints(host)
+        topology = Topology((Gateway(LAUNCHED, gateway),), through=(LAUNCHED,))
+        return replace(self, topology=topology, rendezvous=(rendezvous,), dial_in=door)
 
     @cached_property
     def proxied_names(self) -> frozenset[str]:

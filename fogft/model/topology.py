@@ -10,14 +10,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from graphlib import CycleError, TopologicalSorter
+from typing import Any
 
 from fogft.model.credentials import NAME_PATTERN, Holder, Role
-from fogft.model.keys import Listed, Maps, Text, key, only
+from fogft.model.keys import Flag, Free, Listed, Maps, Text, Whole, key, only
 from fogft.model.names import endpoint as named_endpoint
 from fogft.model.plain import Generation
 
 GATEWAYS_LIMIT = 64
 ROBOTS_LIMIT = 512
+LAUNCHED = "gateway"  # the name of the one that a pool launches for itself
 
 _NAME = Text("a name", "use letters, digits and dashes, 28 at most", only(NAME_PATTERN.fullmatch))
 _NAMES = Listed(_NAME, GATEWAYS_LIMIT, least=0)
@@ -44,6 +46,33 @@ class Gateway:
         usual="the replicas",
     )
     generations: tuple[Generation, ...] = ()
+
+
+@dataclass(frozen=True)
+class LaunchedGateway:
+    """The gateway that a pool launches for itself, for robots and replicas that both dial it."""
+
+    launch: bool = key(
+        Flag(),
+        "Launch a gateway on an on-demand VM. Robots and replicas both dial it, so neither needs a "
+        "public address. Instead of `topology`, `rendezvous` and `dial_in`.",
+        default=False,
+    )
+    resources: Mapping[str, Any] = key(
+        Free("write resources as at the top level"),
+        "The gateway's VM: where replicas may be, with `cpus: 2+`, unless overridden here.",
+        default_factory=dict,
+    )
+    port: int = key(
+        Whole(1024, 65533),
+        "Port that robots dial; the next two are the rendezvous's and the replicas'.",
+        default=7470,
+    )
+
+    def endpoints(self, host: str) -> tuple[str, str, str]:
+        """Return where robots, whoever looks for others, and replicas dial it."""
+        gateway, rendezvous, door = (f"{host}:{self.port + n}" for n in range(3))
+        return gateway, rendezvous, door
 
 
 @dataclass(frozen=True)

@@ -69,15 +69,16 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
     now = usual if spec.schedule is None else wish(spec.schedule, clock, usual)
     if now.ahead:
         notes.append(Reason(Cause.SCHEDULED_AHEAD))
+    cap = observed.below(now.max_usd_per_hour)
     total = now.replicas
     if intent.stopping:
         total = 0
     elif intent.is_scaled(spec):
         total = intent.wanted(spec)
     elif spec.availability and now.replicas == spec.replicas:
-        total, unmet = _for_target(spec, intent, observed, now.max_usd_per_hour, running)
+        total, unmet = _for_target(spec, intent, observed, cap, running)
         notes += because(unmet)
-    return Size(groups, shares(groups, total), now.max_usd_per_hour, tuple(notes))
+    return Size(groups, shares(groups, total), cap, tuple(notes))
 
 
 def spot_sold(spec: PoolSpec, intent: Intent, observed: Observed) -> list[Placement]:

@@ -168,24 +168,33 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
 
 
 def _check_topology(ours: Section, services: tuple[ServiceSpec, ...], spec: PoolSpec) -> None:
-    if not spec.topology:
+    launched = spec.gateway.launch
+    if not spec.topology and not launched:
         return
+    where = "gateway" if launched else "topology"
     for service in services:
         key = "state" if service.state is not None else "quorum" if service.quorum > 1 else ""
         if key:
             raise ours.error(
-                "topology",
+                where,
                 f"cannot be combined with service `{service.name}`, which has `{key}`",
                 "put that service into its own pool: the robot must ask each replica itself",
             )
-    if not spec.rendezvous:
+    for key in ("topology", "rendezvous", "dial_in") if launched else ():
+        if ours.has(key):
+            what = "cannot be combined with `gateway: {launch: true}`, which sets it"
+            raise ours.error(key, what, "remove one of the two")
+    if launched and not services:
+        what = "needs `services`: it cannot find out what replicas offer"
+        raise ours.error(where, what, "list the services")
+    if not launched and not spec.rendezvous:
         raise ours.error(
             "topology",
             "needs a `rendezvous`, through which gateways find replicas",
             "add one, such as `rendezvous: [meet.example.org:7450]`",
         )
     if spec.topics:
-        what = "cannot be combined with `topology`: gateways support only services"
+        what = f"cannot be combined with `{where}`: gateways support only services"
         raise ours.error(_topics_key(ours), what, "remove one of the two")
 
 

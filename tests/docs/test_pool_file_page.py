@@ -14,7 +14,7 @@ from fogft.poolfile.task import REFUSED_TASK_KEYS, TASK_KEYS
 from tests.docs.documents import ROOT
 
 PAGE = (ROOT / "docs" / "reference" / "pool-file.md").read_text()
-EXAMPLES = [part.split("```")[0] for part in PAGE.split("```yaml\n")[1:5]]
+EXAMPLES = [part.split("```")[0] for part in PAGE.split("```yaml\n")[1:6]]
 
 
 def section(title):
@@ -37,7 +37,7 @@ def test_every_task_key_has_its_row():
 
 
 @pytest.mark.parametrize(
-    ("number", "name"), enumerate(["perception", "picking", "watching", "arm"])
+    ("number", "name"), enumerate(["perception", "picking", "watching", "arm", "natted"])
 )
 def test_the_examples_are_right(number, name):
     assert file.parse(EXAMPLES[number], file="pool.yaml").name == name

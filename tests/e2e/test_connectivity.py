@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -122,4 +124,22 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
         assert (" up" in line) == (name == other)
     assert machines[other].report()["door"]["tunnels"] >= 3
     pool.fogft("down")
+    assert pool.left() == {}
+
+
+def test_a_pool_launches_its_own_gateway_and_another_when_that_is_lost(pool):
+    """`up` needs no more than `gateway: {launch: true}`; its machine is the pool's, and ends."""
+    port = free_port()  # the next two are taken, too
+    pool.write(replicas=1, more=f"  gateway: {{launch: true, port: {port}}}\n")
+    pool.up()
+    client = pool.client(3, 25)
+    assert f"── gateway gateway  127.0.0.1:{port}  up" in drawn(pool)
+    (machine,) = (pool.folder / "home/local/machines").glob("*-1999.1")
+    assert client.result()["failed"] == 0
+    os.kill(json.loads((machine / "state.json").read_text())["pids"]["machine"], signal.SIGKILL)
+    pool.wait(lambda: not up_of(report(pool), "gateways"))
+    pool.wait(lambda: up_of(report(pool), "gateways") and ready(report(pool)) == {0})
+    result = pool.client(3, 25).result()
+    assert result["answered"] == result["requests"] > 50
+    assert "replica 1999.2" in pool.fogft("down", ok=False)
     assert pool.left() == {}

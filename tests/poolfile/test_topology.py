@@ -72,3 +72,28 @@ def test_what_does_not_go_with_gateways_is_refused():
         parse("{" + ONE + "}", ", state: {snapshot: /a, restore: /b}")
     with pytest.raises(SpecError, match="needs a `rendezvous`"):
         parse("{" + ONE + "}", drop="  rendezvous: [meet:7450]\n")
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("dial_in: h:1", "dial_in: cannot be combined with `gateway"),
+        ("topology: {" + ONE + "}", "topology: cannot be combined with `gateway"),
+        ("max_hours: 1", "rendezvous: cannot be combined with `gateway"),
+    ],
+)
+def test_a_launched_gateway_sets_all_that_is_about_it(more, words):
+    text = FILE.replace("topology: %s", "gateway: {launch: true}\n  " + more).replace("%s", "")
+    dropped = text if "rendezvous" in words else text.replace("  rendezvous: [meet:7450]\n", "")
+    with pytest.raises(SpecError, match=words):
+        file.parse(dropped, file="p.yaml")
+
+
+def test_a_launched_gateway_is_what_all_talk_through_once_its_address_is_known():
+    text = FILE.replace("topology: %s", "gateway: {launch: true, port: 9000}").replace("%s", "")
+    spec = file.parse(text.replace("  rendezvous: [meet:7450]\n", ""), file="p.yaml")
+    assert (spec.dials_out, spec.topology, spec.dial_in) == (True, Topology(), "")
+    there = spec.behind("h")
+    assert there.topology == Topology((Gateway("gateway", "h:9000"),), through=("gateway",))
+    assert (there.rendezvous, there.dial_in) == (("h:9001",), "h:9002")
+    assert there.replica_hash != there.behind("elsewhere").replica_hash

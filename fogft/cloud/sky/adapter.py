@@ -290,7 +290,8 @@ class SkyCloud:
         provider = self._providers.get(place.cloud)
         if provider is None or not order.allow_from:
             return ""
-        ports = (SSH_PORT,) if order.dials_out else (SSH_PORT, order.link_port)
+        links = () if order.dials_out else (order.link_port, *order.more_ports)
+        ports = (SSH_PORT, *links)
         try:
             return provider.firewall(place.region, ports, order.allow_from)
         except NotAllowedError as error:

@@ -111,6 +111,8 @@ def build(
     ours = _filled(template, marks)
     if order.dials_out:
         del ours["resources"]["ports"]
+    else:
+        ours["resources"]["ports"] += map(str, order.more_ports)
     task = copy.deepcopy({k: v for k, v in order.task.items() if k != "num_nodes"})
     task["name"] = order.pool
     task["setup"], task["run"] = setup_of(order.task, template), ours["run"]

@@ -20,7 +20,7 @@ from fogft.planning.explain import Explanation, explain
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
 from fogft.pool.folder.paths import latency_file
-from fogft.pool.manager import offers, proxy_report
+from fogft.pool.manager import launched_gateway, offers, proxy_report
 from fogft.pool.manager.distances import Distance, Latencies, regions_of
 from fogft.pool.manager.offers import Seller
 from fogft.poolfile import named_clouds
@@ -77,6 +77,7 @@ def plan_file(
     try:
         sold = offers.ask(seller, spec)
         on_demand = _on_demand(seller, spec)
+        beside = launched_gateway.planned(seller, spec)
     except SpecError as error:
         raise named_clouds.located(error, source, file) from None
     if not sold:
@@ -86,6 +87,11 @@ def plan_file(
         )
     distances, notes = far(spec, sold, offline=offline, told=told)
     notes += seller.left_out() if isinstance(seller, Accounts) else ()
+    notes += [
+        f"the gateway's VM costs ${one.offer.usd_per_hour:.3f}/h more: "
+        f"`{one.offer.placement.instance}` on demand in `{one.offer.placement.location}`"
+        for one in beside
+    ]
     try:
         store = make_store(spec.name)
         events = store.recent(1 << 30)

@@ -26,7 +26,7 @@ from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, m
 from fogft.pool.commands.plan import far
 from fogft.pool.commands.sweep import left_of
 from fogft.pool.folder.store import Identity, PoolStore, digest
-from fogft.pool.manager import offers
+from fogft.pool.manager import launched_gateway, offers
 from fogft.poolfile import file as pool_file
 from fogft.poolfile.changes import changes, replaces_replicas
 from fogft.poolfile.file import parse, read_text
@@ -94,6 +94,7 @@ def order(
     notes: list[str] = []
     accounts: Mapping[str, str] = {}
     sold: tuple[Offer, ...] = ()
+    beside: tuple[PlannedLaunch, ...] = ()
     try:
         if isinstance(concrete, Accounts):
             told("asking SkyPilot for usable clouds and prices")
@@ -108,13 +109,14 @@ def order(
                 )
                 notes += concrete.exposures(
                     usable,
-                    open_port=None if spec.dial_in else spec.link_port,
+                    open_port=None if spec.dials_out else spec.link_port,
                     allow_from=spec.allow_from,
                 )
             except CloudError as error:
                 notes.append(f"cannot tell now which files a VM gets: {error.message}")
         try:
             sold = offers.ask(concrete, spec)
+            beside = launched_gateway.planned(concrete, spec)
             notes += concrete.left_out() if isinstance(concrete, Accounts) else ()
         except CloudError as error:
             notes.append(f"prices are not available now: {error.message}")
@@ -127,7 +129,10 @@ def order(
     now = time.time()
     observed = Observed(now, (), None, sold, rtt_s=rtt_s)
     planned = plan("0" * 16, spec, Intent(), observed, History())
-    replaces = before is not None and not rolled_back and replaces_replicas(before, spec)
+    after = spec
+    if before is not None and before.gateway.launch and before.dial_in and spec.gateway.launch:
+        after = spec.behind(before.dial_in.rpartition(":")[0])
+    replaces = before is not None and not rolled_back and replaces_replicas(before, after)
     usd_per_hour = sum(launch.offer.usd_per_hour for launch in planned.launches)
     cheapest = min((offer.usd_per_hour for offer in sold), default=0.0)
     return Preview(
@@ -137,9 +142,9 @@ def order(
         file,
         is_new=before is None,
         wanted=planned.wanted,
-        launches=tuple(planned.launches),
+        launches=(*planned.launches, *beside),
         observed_at=now,
-        changes=() if before is None or rolled_back else tuple(changes(before, spec)),
+        changes=() if before is None or rolled_back else tuple(changes(before, after)),
         replaces_replicas=replaces,
         new_before_old=has_room(spec, usd_per_hour, cheapest),
         rolled_back=rolled_back,

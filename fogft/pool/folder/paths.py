@@ -77,6 +77,8 @@ class PoolPaths:
     """The membership that the client proxy follows, and its cache."""
     discovered = _File("discovered.json")
     """Services that replicas told of, where the pool file lists none."""
+    gateway = _File("gateway.json")
+    """Where the gateway is that the pool has launched."""
     records = _File("records.json")
     """Records that the client proxy learned from a rendezvous."""
     manager_records = _File("manager-records.json")

@@ -43,6 +43,13 @@ class Identity:
     first_epoch: Count = 0
 
 
+@dataclass(frozen=True)
+class GatewayPlace:
+    """Where the launched gateway is; empty until that is known."""
+
+    host: str = ""
+
+
 class Store(Protocol):
     """The state that the reconciler reads and writes."""
 
@@ -139,6 +146,10 @@ class PoolStore:
             if (services, found.spec_hash) != (spec.discovered, spec.discovered_by):
                 known = replace(spec, discovered=services, discovered_by=found.spec_hash)
                 return raw, known
+        if spec.gateway.launch:
+            host = disk.read_or(self.paths.gateway, GatewayPlace()).host
+            if host and spec.dial_in != spec.gateway.endpoints(host)[2]:
+                return raw, spec.behind(host)
         return read
 
     def _read(self, raw: bytes) -> PoolSpec:
@@ -209,6 +220,10 @@ class PoolStore:
     def recent(self, count: int = 20) -> list[Event]:
         """Return the last events, oldest first."""
         return self._events.recent(count)
+
+    def place_gateway(self, host: str) -> None:
+        """Store where the launched gateway is: from now on `spec` is behind it."""
+        disk.write_json(self.paths.gateway, to_plain(GatewayPlace(host)))
 
     def membership(self) -> Membership | None:
         """Return the last written membership; None if it is missing or damaged."""

@@ -17,15 +17,18 @@ from typing import Any
 from fogft import disk, template_files
 from fogft.cloud.port import Launch
 from fogft.model.credentials import NAME_LIMIT, CredentialPaths, Holder, Role, holder_of
-from fogft.model.groups import FIRST_BY_HAND
+from fogft.model.groups import FIRST_BY_HAND, GATEWAY_SLOT
 from fogft.model.proxy_config import ClientProxyConfig, RendezvousConfig, ServerProxyConfig
-from fogft.model.replica import ReplicaId
+from fogft.model.replica import Offer, ReplicaId
 from fogft.model.spec import PoolSpec
+from fogft.model.topology import LAUNCHED
+from fogft.planning.gateway import resources, version
 from fogft.planning.planner import PlannedLaunch
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
+from fogft.pool.manager.launched_gateway import ports
 from fogft.pool.manager.reconciler import bare_order
 from fogft.poolfile import config_file
 
@@ -39,6 +42,11 @@ _RENDEZVOUS_HEADING = (
     "A rendezvous, for `fogft rendezvous --config`. It needs a port that robots and replicas can\n"
     "reach, and carries no requests. Paths are relative to this file's folder."
 )
+# Either one ends: `fogft serve` starts both again.
+_RUN_GATEWAY = """\
+python3 -m fogft rendezvous --config "$FOGFT_FILES/rendezvous.yaml" &
+python3 -m fogft gateway --config "$FOGFT_FILES/gateway.yaml" &
+wait -n"""
 _REPLICA_HEADING = (
     "The server proxy of one replica. Options of `fogft serve` override it. Paths are relative to\n"
     "this file's folder; keys not set here have their defaults."
@@ -98,9 +106,8 @@ def proxy_config(
             topics=spec.topics,
         )
     if not name:  # what belongs to this machine
-        config = replace(
-            config, dial_in=spec.dial_in, uplinks=spec.uplinks, metrics=spec.metrics.proxy
-        )
+        door = "" if spec.gateway.launch else spec.dial_in
+        config = replace(config, dial_in=door, uplinks=spec.uplinks, metrics=spec.metrics.proxy)
     return config_file.document(config, _CLIENT_HEADING)
 
 
@@ -152,6 +159,92 @@ def build_order(
     )
 
 
+def gateway_order(
+    paths: PoolPaths,
+    identity: Identity,
+    spec: PoolSpec,
+    offer: Offer,
+    generation: int,
+    *,
+    announcements: bytes = b"",
+) -> Launch:
+    """Return the order of the machine of the pool's own gateway, which also has a rendezvous.
+
+    To a cloud it is a replica, which ends with its lease. It serves nothing: its `run` is the two.
+    The gateways before it are revoked.
+    """
+    id = ReplicaId(identity.uid, GATEWAY_SLOT, generation)
+    ledger, days = Ledger(paths.credentials), certificate_days(spec)
+    mine = Holder(Role.GATEWAY, LAUNCHED, generation, identity.uid)
+    ledger.revoke(
+        e.holder
+        for e in ledger.entries()
+        if (e.holder.role, e.holder.name) == (Role.GATEWAY, LAUNCHED) and e.holder != mine
+    )
+    files: dict[str, bytes] = {}
+    for stem, holder in (
+        ("replica", holder_of(id.certificate_name)),
+        ("gateway", mine),
+        ("rendezvous", replace(mine, role=Role.RENDEZVOUS)),
+    ):
+        issued = ledger.issue(holder, days=days)
+        files["ca.crt"] = issued.authority_pem
+        files |= {f"{stem}.crt": issued.certificate_pem, f"{stem}.key": issued.key_pem}
+    listens, rendezvous, door = spec.gateway.endpoints("0.0.0.0")
+    near = spec.gateway.endpoints("127.0.0.1")[1]
+    gateway = ClientProxyConfig(
+        pool=identity.name,
+        pool_uid=identity.uid,
+        robot=LAUNCHED,
+        membership=Path("membership.json"),
+        status=Path("gateway-status.json"),
+        lock=Path("gateway.lock"),
+        credentials=_beside("gateway"),
+        services=spec.proxied,
+        suspect_after_s=spec.health.suspect_after_s,
+        rendezvous=(near,),
+        records=Path("gateway-records.json"),
+        dial_in_listen=door,
+        listen=listens,
+    )
+    meeting = RendezvousConfig(
+        identity.uid, _beside("rendezvous"), rendezvous, Path("rendezvous-records.json")
+    )
+    replica = ServerProxyConfig(
+        pool=identity.name,
+        pool_uid=identity.uid,
+        slot=id.slot,
+        generation=generation,
+        services=(),
+        run=_RUN_GATEWAY,
+        credentials=_beside("replica"),
+        rendezvous=(near,),
+        records=Path("records.json"),
+        announcements=Path(paths.announcements.name) if announcements else None,
+        rmw=spec.rmw.replica,
+    )
+    files["replica.yaml"] = config_file.document(replica, _REPLICA_HEADING).encode()
+    files["gateway.yaml"] = config_file.document(gateway, _CLIENT_HEADING).encode()
+    files["rendezvous.yaml"] = config_file.document(meeting, _RENDEZVOUS_HEADING).encode()
+    if announcements:
+        files[paths.announcements.name] = announcements
+    return Launch(
+        id=id,
+        pool=identity.name,
+        placement=offer.placement,
+        usd_per_hour=offer.usd_per_hour,
+        spec_hash=version(spec),
+        task={"resources": resources(spec)},
+        files=files,
+        link_port=spec.link_port,
+        more_ports=ports(spec),
+    )
+
+
+def _beside(stem: str) -> CredentialPaths:
+    return CredentialPaths(Path("ca.crt"), Path(f"{stem}.crt"), Path(f"{stem}.key"))
+
+
 def replica_config(
     identity: Identity, spec: PoolSpec, id: ReplicaId, *, announcements: bool = False
 ) -> str:
@@ -168,7 +261,7 @@ def replica_config(
         services=spec.services,
         run=str(spec.task.get("run") or ""),
         spare=spec.spare,
-        credentials=CredentialPaths(Path("ca.crt"), Path("replica.crt"), Path("replica.key")),
+        credentials=_beside("replica"),
         envs={str(k): "" if v is None else str(v) for k, v in envs.items()},
         rendezvous=spec.rendezvous,
         records=Path("records.json"),
@@ -184,8 +277,7 @@ def replica_config(
 
 def rendezvous_config(identity: Identity) -> str:
     """Return a rendezvous's configuration."""
-    paths = (Path(name) for name in ("ca.crt", "rendezvous.crt", "rendezvous.key"))
-    config = RendezvousConfig(identity.uid, CredentialPaths(*paths), status=Path("status.json"))
+    config = RendezvousConfig(identity.uid, _beside("rendezvous"), status=Path("status.json"))
     return config_file.document(config, _RENDEZVOUS_HEADING)
 
 

@@ -24,8 +24,9 @@ from fogft.cloud.port import Accounts, Cloud, Launch
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.metrics.scrape import Scrape
 from fogft.model.reason import Cause, Reason, because
-from fogft.model.replica import LinkReport
+from fogft.model.replica import LinkReport, LinkState, Offer
 from fogft.model.spec import PoolSpec
+from fogft.model.topology import LAUNCHED
 from fogft.planning import lifetime
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.planner import PlannedLaunch
@@ -46,6 +47,7 @@ from fogft.pool.manager import (
 )
 from fogft.pool.manager.announcing import ManagerRecords
 from fogft.pool.manager.distances import Distances, Latencies
+from fogft.pool.manager.launched_gateway import LaunchedGateway
 from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 from fogft.pool.manager.reconciler import Reconciler, Tick
@@ -127,6 +129,9 @@ class Manager:
             revoked=self._ledger.revoked,
             by_hand=self._ledger.by_hand,
             gateways=self._ledger.gateways,
+            gateway=LaunchedGateway(
+                cloud, self._gateway_up, self._gateway_order, store.place_gateway
+            ),
             on_done=self._wake.set,
             distances=Distances(Latencies(latency_file()), on_thread),
         )
@@ -199,6 +204,20 @@ class Manager:
         signed = self._records.announcements(self._serving_lease(spec))
         return configuration.build_order(self._paths, identity, spec, planned, announcements=signed)
 
+    def _gateway_order(self, spec: PoolSpec, offer: Offer, generation: int) -> Launch:
+        signed = self._records.announcements(self._serving_lease(spec))
+        return configuration.gateway_order(
+            self._paths, self._identity, spec, offer, generation, announcements=signed
+        )
+
+    def _gateway_up(self, now: float) -> bool:
+        report = self._fresh_report(now)
+        good = max(self._ledger.gateways().get(LAUNCHED, ()), default=0)
+        return report is not None and any(
+            (one.name, one.generation, one.state) == (LAUNCHED, good, LinkState.UP)
+            for one in report.gateways
+        )
+
     def _announce(self, tick: Tick) -> None:
         lease = self._serving_lease(tick.spec)
         self._records.look(tick.spec.rendezvous, tick.membership, lease)
@@ -220,7 +239,8 @@ class Manager:
         seen = tick.observed
         if seen.machines is not None:
             alone_s = tick.spec.unmanaged_max_hours * lifetime.HOUR_S + RUN_ENDED_S
-            self._costs.look(seen.now, seen.machines, seen.offers, alone_s)
+            machines = (*seen.machines, *seen.gateway)
+            self._costs.look(seen.now, machines, seen.offers, alone_s)
 
     def _leave(self) -> None:
         """See to it that nothing of a pool that ends by itself is left but its folder."""

@@ -30,7 +30,7 @@ def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
     places = {group.name: f"fogft.groups[{n}]." for n, group in enumerate(spec.groups)}
     for name, resources in sales(spec):
         try:
-            sold = cloud.offers({**resources, "ports": []} if spec.dial_in else resources)
+            sold = cloud.offers({**resources, "ports": []} if spec.dials_out else resources)
         except SpecError as error:
             key = places.get(name, "") + error.key
             raise SpecError.of_key(key, error.what, error.hint) from error

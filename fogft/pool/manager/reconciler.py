@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 from fogft import logfile
 from fogft.cloud.port import Cloud, Launch, Refreshing
 from fogft.errors import CloudError, FogftError, NoCapacity, QuotaExceeded, told
-from fogft.model.groups import replica_hash, sales, task_at
+from fogft.model.groups import GATEWAY_SLOT, replica_hash, sales, task_at
 from fogft.model.intent import Intent
 from fogft.model.membership import Found, members_of, successor, with_by_hand
 from fogft.model.reason import Cause, Reason
@@ -47,6 +47,7 @@ from fogft.planning.planner import Plan, PlannedLaunch, plan
 from fogft.planning.rollout import Update
 from fogft.pool.folder.store import Identity, Store
 from fogft.pool.manager import offers
+from fogft.pool.manager.launched_gateway import LaunchedGateway
 from fogft.pool.manager.operations import Operations, Submit
 from fogft.pool.manager.timekeeping import Remembering, Timekeeping
 from fogft.pool.manager.updating import Updating
@@ -93,7 +94,7 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
         spec_hash=replica_hash(spec, planned.slot),
         task=task_at(spec, planned.slot),
         link_port=spec.link_port,
-        dials_out=bool(spec.dial_in),
+        dials_out=spec.dials_out,
         allow_from=spec.allow_from,
     )
 
@@ -106,6 +107,7 @@ class Reconciler:
             `planning.observed.clock_jumps`.
         by_hand: Replicas that people start themselves, and that are still let in.
         gateways: Name -> generations of its certificates that are good.
+        gateway: The gateway that the pool may launch; None where it cannot.
         distances: Says how far regions are from the robot, of what is sold and what runs.
     """
 
@@ -123,6 +125,7 @@ class Reconciler:
         revoked: Callable[[], frozenset[str]] = frozenset,
         by_hand: Callable[[], frozenset[ReplicaId]] = frozenset,
         gateways: Callable[[], Mapping[str, tuple[int, ...]]] = dict,
+        gateway: LaunchedGateway | None = None,
         on_done: Callable[[], None] = lambda: None,
         distances: Distances = lambda spec, *_: spec.placement.rtt_s,
     ) -> None:
@@ -136,6 +139,7 @@ class Reconciler:
         self._revoked = revoked
         self._by_hand = by_hand
         self._gateways = gateways
+        self._gateway = gateway
         # A planned launch is what a launch is about; None stands for a termination.
         self.operations: Operations[Machine | None] = Operations(submit, on_done)
         self._refreshes: Operations[None] = Operations(submit, on_done)
@@ -192,6 +196,9 @@ class Reconciler:
         if trouble:
             decided = decided._replace(notes=(*decided.notes, *trouble))
         if observed.machines is not None:
+            awaited = self._tend_gateway(spec, intent, observed, history)
+            if awaited is not None:
+                decided = decided._replace(launches=(), notes=(awaited, *decided.notes))
             self._apply(identity, spec, observed, decided, history)
         return Tick(
             identity, spec, intent, observed, decided, self._membership, over, update, trial.file
@@ -236,7 +243,12 @@ class Reconciler:
         ending = frozenset(id for id, order in busy.items() if order is None)
         links = self._links(identity.uid, now)
         rtt_s = self._distances(spec, sold, machines or (), links or ())
-        return Observed(now, machines, links, sold, ending, rtt_s, self._time.doubt_s), trouble
+        gateway = tuple(m for m in machines or () if m.id.slot == GATEWAY_SLOT)
+        if gateway and machines is not None:
+            machines = tuple(m for m in machines if m.id.slot != GATEWAY_SLOT)
+        doubt_s = self._time.doubt_s
+        seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway)
+        return seen, trouble
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:
         """Have the cloud asked about replicas that fell silent, where its list is from memory."""
@@ -268,6 +280,29 @@ class Reconciler:
                 if known is None or known[0] != key:
                     return ()
         return self._offers
+
+    # -- the launched gateway ---------------------------------------------------------------
+
+    def _tend_gateway(
+        self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
+    ) -> Reason | None:
+        """See to the gateway that the pool launches; return why no replica is launched before."""
+        if self._gateway is None or not (spec.gateway.launch or observed.gateway):
+            return None
+        step = self._gateway.look(spec, intent, observed, history)
+        for machine in observed.gateway if self._gateway.just_seen(observed.now) else ():
+            record = history.record(machine.id.slot, machine.id.generation)
+            if record is not None and record.first_ready_at is None:
+                self._remember.add(EventKind.READY, machine.id)
+        for id, reason in step.ends:
+            if id in step.failed:
+                self._remember.add(EventKind.FAILED, id, reason=reason)
+            self._terminate(id, reason, history)
+        if step.launch is not None:
+            generation = history.generation(GATEWAY_SLOT) + 1
+            order = self._gateway.order(spec, step.launch, generation)
+            self._order(order, Reason(Cause.NEW_SLOT))
+        return None if spec.dial_in else step.note
 
     # -- apply ------------------------------------------------------------------------------
 
@@ -335,16 +370,19 @@ class Reconciler:
         order = self._build_order(identity, spec, planned)
         if slack is not None:
             order = replace(order, limit_usd_per_hour=order.usd_per_hour + slack)
+        self._order(order, planned.reason)
+
+    def _order(self, order: Launch, reason: Reason) -> None:
         location = order.placement.location
         self._remember.add(
             EventKind.LAUNCH,
             order.id,
             location=location,
-            reason=planned.reason,
+            reason=reason,
             on_demand=not order.placement.spot,
             version=order.spec_hash,
         )
-        why = words(planned.reason)
+        why = words(reason)
         log.info("launch_ordered replica=%s zone=%s reason=%r", order.id.short, location, why)
         expected = Machine(
             id=order.id,
@@ -386,11 +424,12 @@ def _slack(spec: PoolSpec, observed: Observed, plan: Plan) -> float | None:
     """Return by how much each launch may cost more than planned; None where there is no cap."""
     usual = Wish(spec.replicas, spec.max_usd_per_hour)
     now = wish(spec.schedule, observed.now, usual) if spec.schedule is not None else usual
-    if now.max_usd_per_hour is None or not plan.launches:
+    cap = observed.below(now.max_usd_per_hour)
+    if cap is None or not plan.launches:
         return None
     spent = sum(machine.usd_per_hour for machine in observed.machines or ())
     spent += sum(planned.offer.usd_per_hour for planned in plan.launches)
-    return max(0.0, now.max_usd_per_hour - spent) / len(plan.launches)
+    return max(0.0, cap - spent) / len(plan.launches)
 
 
 def _refusal(error: Exception) -> Cause | None:

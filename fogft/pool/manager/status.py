@@ -379,7 +379,10 @@ def of_tick(
         target=plan.wanted,
         ready=sum(replica.phase == Phase.READY.value for replica in replicas),
         uplink_suspected=bool(health and health.uplink_suspected),
-        usd_per_hour=sum(one.machine.usd_per_hour for one in judged),
+        usd_per_hour=sum(
+            machine.usd_per_hour
+            for machine in (*(one.machine for one in judged), *observed.gateway)
+        ),
         usd_to_date=usd_to_date,
         credentials_end_at=credentials_end_at,
         excluded=sorted(tick.intent.excluded),

@@ -57,7 +57,7 @@ class Remembering:
         not take the loss for something of the future, and go to the same place again.
         """
         uid = self._store.identity().uid
-        ids = [m.id for m in observed.machines or ()]
+        ids = [m.id for m in (*(observed.machines or ()), *observed.gateway)]
         listed = {(id.slot, id.generation) for id in ids if id.pool_uid == uid}
         for record in self._store.history().open():
             if (record.slot, record.generation) not in listed:

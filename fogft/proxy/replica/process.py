@@ -193,6 +193,7 @@ def run_environment(config: ServerProxyConfig) -> dict[str, str]:
     if sys.prefix != sys.base_prefix:
         environ["VIRTUAL_ENV"] = sys.prefix
         environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
+    environ["FOGFT_FILES"] = str(config.credentials.ca.parent)
     environ.update(config.envs)
     return environ
 

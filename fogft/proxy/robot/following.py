@@ -75,7 +75,7 @@ class Following:
 
     def _open_door(self) -> None:
         config = self._config
-        if config.dial_in:
+        if config.dial_in or config.dial_in_listen:
             self.door = DialIn(
                 config.dial_in_listen or "0.0.0.0:" + config.dial_in.rpartition(":")[2],
                 config.pool_uid,

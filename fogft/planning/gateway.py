@@ -1,0 +1,156 @@
+"""What becomes of the machine of a gateway that a pool launches for itself. Pure.
+
+There is one, on demand. It is replaced when it fails, when its robot no longer reaches it, or when
+the file asks for another; not before it is gone, since its ports may be those of its successor.
+
+Not here: the gateway's order (`fogft.pool.manager.configuration`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from fogft import __version__
+from fogft.model.groups import GATEWAY_SLOT
+from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
+from fogft.model.replica import Machine, MachinePhase, Observed, Offer, ReplicaId
+from fogft.model.spec import PoolSpec
+from fogft.planning.observed.history import History
+from fogft.planning.observed.launches import given_up
+
+LOST_S = 60.0
+"""Replaced when the robot's link to it was down for so long. Seconds."""
+PAUSE_S, LONGEST_PAUSE_S = 10.0, 600.0
+_WHEREABOUTS = ("infra", "cloud", "region", "zone")
+
+
+class GatewayPlan(NamedTuple):
+    """What to do about the gateway's machine.
+
+    Attributes:
+        host: Where it is; empty while nobody knows.
+        ends: Machines to end, with the reason.
+        failed: Those of `ends` whose launch has failed.
+        launch: What to buy; None for nothing.
+        note: Why no replica is launched before it is there.
+    """
+
+    host: str = ""
+    ends: tuple[tuple[ReplicaId, Reason], ...] = ()
+    failed: frozenset[ReplicaId] = frozenset()
+    launch: Offer | None = None
+    note: Reason | None = None
+
+
+def version(spec: PoolSpec) -> str:
+    """Return 16 hexadecimal digits that change when a running gateway must be replaced."""
+    asked = __version__, spec.gateway, resources(spec), sorted(map(str, spec.proxied))
+    return hashlib.sha256(repr(asked).encode()).hexdigest()[:16]
+
+
+def resources(spec: PoolSpec) -> dict[str, Any]:
+    """Return the `resources` of the gateway's machine: where the replicas may be, and small."""
+    shared = spec.task.get("resources") or {}
+
+    def where(section: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: section[key] for key in _WHEREABOUTS if key in section}
+
+    out = {**where(shared), "cpus": "2+"}
+    for key in ("any_of", "ordered"):
+        if shared.get(key):
+            out[key] = [where(one) for one in shared[key]]
+    return {**out, **spec.gateway.resources, "use_spot": False}
+
+
+def plan_gateway(
+    spec: PoolSpec,
+    intent: Intent,
+    observed: Observed,
+    history: History,
+    offers: Sequence[Offer],
+    *,
+    up_at: float | None,
+) -> GatewayPlan:
+    """Return the next step.
+
+    Args:
+        spec: The pool file.
+        intent: The user's wishes.
+        observed: The world now; the cloud must have answered.
+        history: Of all launches.
+        offers: On-demand machines that would do, the cheapest first.
+        up_at: When the robot's link to a gateway of the pool's own was last seen up.
+    """
+    here = [m for m in observed.gateway if m.id not in observed.ending]
+    newest = max((m.id for m in here), default=None)
+    ends, failed, host = [], set(), ""
+    for machine in here:
+        wanted = spec.gateway.launch and not intent.stopping and machine.id == newest
+        fault = _fault(machine, spec, observed.now, history, up_at) if wanted else None
+        if not wanted:
+            ends.append((machine.id, Reason(Cause.DOWN if intent.stopping else Cause.NOT_WANTED)))
+        elif machine.spec_hash != version(spec):
+            ends.append((machine.id, Reason(Cause.OUTDATED)))
+        elif fault is not None:
+            failed.add(machine.id)
+            ends.append((machine.id, fault))
+        elif machine.phase is MachinePhase.RUNNING and machine.endpoint:
+            host = machine.endpoint.rpartition(":")[0]
+    awaited = Reason(Cause.TROUBLE, words="replicas are launched once the gateway's VM runs")
+    step = GatewayPlan(host, tuple(ends), frozenset(failed), note=awaited)
+    if observed.gateway or not spec.gateway.launch or intent.stopping:
+        return step
+    offer, note = _chosen(spec, intent, observed.now, history, offers)
+    return step._replace(launch=offer, note=note or awaited)
+
+
+def _fault(
+    machine: Machine, spec: PoolSpec, now: float, history: History, up_at: float | None
+) -> Reason | None:
+    if machine.phase is MachinePhase.FAILED:
+        return machine.failure or Reason(Cause.ERROR)
+    record = history.record(machine.id.slot, machine.id.generation)
+    was_up = record is not None and record.first_ready_at is not None
+    runs_since = machine.set_up_at or machine.running_at
+    if machine.phase is not MachinePhase.RUNNING or machine.setting_up or not runs_since:
+        return None  # the cloud gives up a launch that hangs
+    limit_s = LOST_S if was_up else spec.health.start_limit_s
+    silent_s = now - max(runs_since, up_at or 0.0)
+    if silent_s <= limit_s:
+        return None
+    if was_up:
+        return Reason(Cause.SILENT, seconds=silent_s)
+    awaited = Reason(Cause.NOT_READY, seconds=limit_s)
+    return Reason(Cause.TIMEOUT, because=(awaited,))
+
+
+def _chosen(
+    spec: PoolSpec, intent: Intent, now: float, history: History, offers: Sequence[Offer]
+) -> tuple[Offer | None, Reason | None]:
+    """Return what to buy, or why nothing is bought now."""
+    hopeless = given_up(history, version(spec), history.by_clock(intent.retried_at))
+    if hopeless is not None:
+        return None, hopeless
+    good = [o for o in offers if not intent.is_excluded(o.placement.location)]
+    if not good:
+        return None, Reason(Cause.NOTHING_OFFERED)
+    last = history.generation(GATEWAY_SLOT)
+    in_vain = 0
+    while record := history.record(GATEWAY_SLOT, last - in_vain):
+        if record.first_ready_at is not None:
+            break
+        in_vain += 1
+    ended = history.record(GATEWAY_SLOT, last)
+    pause_s = min(LONGEST_PAUSE_S, PAUSE_S * 2**in_vain) if in_vain else 0.0
+    if ended is not None and 0 <= now - ended.closed_at < pause_s:
+        return None, None
+    offer = good[in_vain % len(good)]
+    cap = spec.max_usd_per_hour
+    if cap is not None and offer.usd_per_hour > cap:
+        return None, Reason(
+            Cause.OVER_BUDGET, usd_per_hour=offer.usd_per_hour, limit_usd_per_hour=cap
+        )
+    return offer, None

@@ -1,0 +1,76 @@
+"""What the manager knows of the gateway that a pool launches for itself, and its next step.
+
+Not here: the decision (`planning.gateway`), and carrying it out (`reconciler`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from fogft.cloud.port import Cloud, Launch
+from fogft.errors import FogftError, told
+from fogft.model.groups import GATEWAY_SLOT
+from fogft.model.intent import Intent
+from fogft.model.reason import Cause, Reason
+from fogft.model.replica import Observed, Offer
+from fogft.model.spec import PoolSpec
+from fogft.planning.buying import PlannedLaunch
+from fogft.planning.gateway import GatewayPlan, plan_gateway, resources
+from fogft.planning.observed.history import History
+from fogft.pool.manager.offers import Seller
+
+
+@dataclass
+class LaunchedGateway:
+    """The gateway of one pool, for its reconciler.
+
+    Attributes:
+        is_up: Whether the robot reaches it at a time.
+        order: Makes the order of its machine, with a generation.
+        place: Stores the host that it is at.
+    """
+
+    cloud: Cloud
+    is_up: Callable[[float], bool]
+    order: Callable[[PoolSpec, Offer, int], Launch]
+    place: Callable[[str], object]
+    _up_at: float | None = field(default=None, init=False)
+
+    def look(
+        self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
+    ) -> GatewayPlan:
+        """Return the next step. The cloud must have answered."""
+        if self.is_up(observed.now):
+            self._up_at = observed.now
+        wanted = spec.gateway.launch and not observed.gateway and not intent.stopping
+        try:
+            sold = offered(self.cloud, spec) if wanted else ()
+        except FogftError as error:
+            return GatewayPlan(note=Reason(Cause.NO_PRICES, words=told(error)))
+        step = plan_gateway(spec, intent, observed, history, sold, up_at=self._up_at)
+        if step.host and spec.dial_in != spec.gateway.endpoints(step.host)[2]:
+            self.place(step.host)
+        return step
+
+    def just_seen(self, now: float) -> bool:
+        """Whether the robot reached it at this look."""
+        return self._up_at == now
+
+
+def planned(cloud: Seller, spec: PoolSpec) -> tuple[PlannedLaunch, ...]:
+    """Return the launch of a pool's first gateway; none where it launches none."""
+    sold = offered(cloud, spec)[:1] if spec.gateway.launch else ()
+    return tuple(PlannedLaunch(GATEWAY_SLOT, 1, offer, Reason(Cause.NEW_SLOT)) for offer in sold)
+
+
+def ports(spec: PoolSpec) -> tuple[int, ...]:
+    """Return the ports that its machine opens beside that of links."""
+    return tuple(spec.gateway.port + n for n in range(3))
+
+
+def offered(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
+    """Return what is sold for its machine, the cheapest first."""
+    asked = {**resources(spec), "ports": [spec.link_port, *ports(spec)]}
+    sold = cloud.offers(asked)
+    return tuple(sorted(sold, key=lambda o: (o.usd_per_hour, o.placement)))
