@@ -37,6 +37,8 @@ class Launch:
     link_port: int = LINK_PORT
     # A machine of another type in the same place may cost so much at most; None for no limit.
     limit_usd_per_hour: float | None = None
+    # Its machine exists, and is stopped; see `Stopping`.
+    is_there: bool = False
     # Others that are opened beside it.
     more_ports: tuple[int, ...] = ()
     # The replica dials its robots: nobody reaches it, so no port need be open.
@@ -127,6 +129,20 @@ class Accounts(Protocol):
 
     def unverified(self, cloud: str) -> str:
         """Return why a cloud's machines cannot be listed directly; empty when they can."""
+
+
+@runtime_checkable
+class Stopping(Protocol):
+    """A cloud whose on-demand machines can be stopped, and started with what is on their disks."""
+
+    def stop(self, order: Launch) -> None:
+        """Stop the machine of an order; return when it has stopped, and is listed as that.
+
+        Raises `CloudError`: it may run on.
+        """
+
+    def start(self, order: Launch) -> None:
+        """Start a stopped machine under its id, as `launch` does."""
 
 
 @runtime_checkable

@@ -202,6 +202,12 @@ class OnDemandSpec:
         "spot. Within `max_usd_per_hour` and `max_surge`.",
         default=False,
     )
+    standbys: int = key(
+        Whole(0, 10, "machines"),
+        "With `fallback`: number of on-demand machines that are stopped rather than ended when "
+        "spot is back, and started when it is lost again. Their disks cost. On real clouds only.",
+        default=0,
+    )
 
 
 @dataclass(frozen=True)

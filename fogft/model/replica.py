@@ -134,6 +134,7 @@ class MachinePhase(str, Enum):
 
     PROVISIONING = "provisioning"
     RUNNING = "running"
+    STOPPED = "stopped"  # it costs its disk, and can be started
     FAILED = "failed"  # a launch that will never run; stays listed until terminated
 
 
@@ -267,6 +268,7 @@ class Observed:
         rtt_s: ``cloud/region`` -> round trip from the robot in seconds, where it is known.
         doubt_s: By so much the clock was set just now: the time of day goes without it.
         gateway: The machine of a launched gateway; more than one while it is replaced.
+        standbys: Machines that are stopped.
     """
 
     now: float
@@ -277,12 +279,13 @@ class Observed:
     rtt_s: Mapping[str, float] = field(default_factory=dict)
     doubt_s: float = 0.0
     gateway: tuple[Machine, ...] = ()
+    standbys: tuple[Machine, ...] = ()
 
     def below(self, cap: float | None) -> float | None:
         """Return what a cap leaves for replicas."""
         if cap is None:
             return None
-        return max(0.0, cap - sum(machine.usd_per_hour for machine in self.gateway))
+        return max(0.0, cap - sum(m.usd_per_hour for m in (*self.gateway, *self.standbys)))
 
 
 @dataclass(frozen=True)

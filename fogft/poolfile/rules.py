@@ -173,6 +173,9 @@ def on_demand(section: Section, made: OnDemandSpec, replicas: int) -> None:
     if made.base > replicas:
         what = f"is {made.base}, but there are only {replicas} replicas"
         raise section.error("base", what, "write fewer, or ask for more replicas")
+    if made.standbys and not made.fallback:
+        what = "has no effect without `fallback`"
+        raise section.error("standbys", what, "write `fallback: true`, or remove it")
 
 
 def topology(section: Section, made: Topology) -> Topology:

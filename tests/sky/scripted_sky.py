@@ -184,6 +184,10 @@ class ScriptedSky:
     def provision_log(self, name: str, lines: int) -> str:
         return self.provision_logs.get(name, f"provisioning {name}")
 
+    def stop(self, name: str) -> None:
+        self._meet("stop", name)
+        self.records[name] = replace(self.records[name], state=ClusterState.STOPPED)
+
     def down(self, name: str) -> None:
         self._meet("down", name)
         if self.down_fails:
@@ -232,6 +236,7 @@ class ScriptedSky:
         kind = (self._room(self.task(name)) or [""])[0]
         place = Placement("aws", region, zone, kind, resources["use_spot"])
         number = next(self._counter)
+        self.preempt(name)  # a stopped one boots at another address
         self.records[name] = Cluster(
             name,
             ClusterState.INIT,

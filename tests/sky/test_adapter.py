@@ -70,6 +70,39 @@ def test_terminate_leaves_nothing_in_any_list_and_can_be_repeated(scene: Scene):
     assert not scene.cloud.journal.files(ID).exists()
 
 
+def test_a_machine_is_stopped_for_the_price_of_its_disk_and_started_under_its_id(scene: Scene):
+    on_demand = replace(EAST, spot=False)
+    order = scene.order(place=on_demand)
+    scene.launched(place=on_demand)
+    scene.cloud.stop(order)
+    stopped = scene.machine()
+    assert (stopped.phase, stopped.failure) == (MachinePhase.STOPPED, None)
+    assert stopped.usd_per_hour == pytest.approx(64 * 0.08 / 730)
+    scene.work(60)
+    assert scene.machine().phase is MachinePhase.STOPPED, "nobody takes it for a failure"
+    scene.cloud.start(replace(order, files={"replica.yaml": b"newer"}, is_there=True))
+    assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.sky.finish(NAME)
+    scene.work()
+    running = scene.machine()
+    assert (running.phase, running.usd_per_hour) == (MachinePhase.RUNNING, 0.021)
+    assert scene.sky.asked("launch") == [NAME, NAME]
+    assert (scene.cloud.journal.files(ID) / "replica.yaml").read_bytes() == b"newer"
+    scene.cloud.stop(order)
+    scene.cloud.terminate(ID)
+    assert not scene.machines()
+    assert not scene.provider.found
+
+
+def test_a_stopped_machine_that_is_gone_is_listed_no_more(scene: Scene):
+    scene.launched()
+    scene.cloud.stop(scene.order())
+    scene.sky.preempt(NAME)
+    del scene.sky.records[NAME]
+    scene.cloud.audit()
+    assert not scene.machines()
+
+
 def test_a_pool_sees_its_own_machines_only(scene: Scene):
     other = replica(uid="00000000000000bb")
     scene.cloud.launch(scene.order(other))

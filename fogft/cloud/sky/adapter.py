@@ -25,7 +25,7 @@ from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import ON_THE_MACHINE, UNDER_WAY, Entry, Journal, Stage
 from fogft.cloud.sky.naming import OWNER, cluster_name, label_value, replica_of
 from fogft.cloud.sky.presence import Presence
-from fogft.cloud.sky.prices import Prices
+from fogft.cloud.sky.prices import Prices, disk_usd_per_hour
 from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.cloud.sky.settings import GROUP
@@ -107,6 +107,8 @@ class SkyCloud:
         """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
         group = self._firewall(order)
         instead = self._prices.instead(order.placement, order.limit_usd_per_hour)
+        if order.is_there:
+            instead = ()
         packed = self.make_wheel(self.folder / "wheels")
         generation = f"{order.id.pool_uid}-{order.spec_hash}"
         made = task.build(
@@ -149,6 +151,20 @@ class SkyCloud:
             self._presence.forget()
         self.journal.close(id)
         self._census.forget(id)
+
+    def stop(self, order: Launch) -> None:
+        """See `Stopping`."""
+        self.sky.stop(cluster_name(order.id))
+        resources = task.alternative(order.task.get("resources") or {}, order.placement)
+        disk_size = resources.get("disk_size", task.DISK_GB)
+        usd_per_hour = disk_usd_per_hour(order.placement.cloud, disk_size)
+        self.journal.update(order.id, stage=Stage.STANDBY, usd_per_hour=usd_per_hour)
+        self._presence.forget()
+
+    def start(self, order: Launch) -> None:
+        """See `Stopping`. SkyPilot starts a cluster that it has when it is to launch it."""
+        self.journal.close(order.id)
+        self.launch(order)
 
     def log(self, id: ReplicaId) -> str | None:
         """See `Cloud`. Fetches the end of the log from the machine first; takes seconds."""

@@ -169,6 +169,13 @@ class InstalledSky:
             lambda out: sdk.tail_provision_logs(name, follow=False, tail=lines, output_stream=out)
         )
 
+    @_limited(DOWN_LIMIT_S, "the stop of `{0}`")
+    def stop(self, name: str) -> None:
+        """Stop a cluster; return when SkyPilot says that it has stopped."""
+        _, sdk = self._sky()
+        with as_answer():
+            sdk.get(sdk.stop(name))
+
     @_limited(DOWN_LIMIT_S, "the end of `{0}`")
     def down(self, name: str) -> None:
         """End a cluster; return when SkyPilot says that it is gone. Missing is no error."""

@@ -35,13 +35,14 @@ class Stage(str, Enum):
     LAUNCHING = "launching"  # it accepted: `request` says how it is doing
     SETTING_UP = "setting up"  # the VM runs; the job does not yet
     RUNNING = "running"  # the job runs
+    STANDBY = "standby"  # the VM is stopped
     FAILED = "failed"  # it never will; `failure` says why
     ENDING = "ending"  # to be gone
 
 
 _ORDER = list(Stage)
 UNDER_WAY = frozenset({Stage.ASKING, Stage.LAUNCHING, Stage.SETTING_UP})
-ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING})
+ON_THE_MACHINE = frozenset({Stage.SETTING_UP, Stage.RUNNING, Stage.STANDBY})
 
 
 @dataclass(frozen=True)

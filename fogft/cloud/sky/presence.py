@@ -35,7 +35,8 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
     if entry.stage is Stage.ENDING:
         # Listed until it is certain that nothing runs, so that a crash in between is repaired.
         failure = failure or _error("its end was not confirmed")
-    elif entry.stage is not Stage.FAILED and cluster and cluster.state is ClusterState.STOPPED:
+    is_stopped = cluster is not None and cluster.state is ClusterState.STOPPED
+    if is_stopped and entry.stage in (Stage.SETTING_UP, Stage.RUNNING):
         failure = _error("the machine was stopped")
     if failure is not None:
         phase, progress = MachinePhase.FAILED, ""
@@ -43,11 +44,17 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         phase = MachinePhase.RUNNING  # the machine runs; its services do not answer yet
     elif entry.stage is Stage.RUNNING:
         phase, progress = MachinePhase.RUNNING, ""
+    elif entry.stage is Stage.STANDBY:  # unless somebody else has started it
+        is_up = cluster is not None and not is_stopped
+        phase, progress = MachinePhase.RUNNING if is_up else MachinePhase.STOPPED, ""
     elif cluster is not None:
         progress = cluster.progress or progress
     placement = entry.placement
     if cluster is not None and cluster.placement is not None:
         placement = _as_found(entry, cluster.placement)
+    usd_per_hour = entry.instead.get(placement.instance, entry.usd_per_hour)
+    if phase is MachinePhase.STOPPED:
+        usd_per_hour = entry.usd_per_hour
     ip = (cluster.head_ip if cluster else "") or (instance.public_ip if instance else "")
     return Machine(
         id=entry.id,
@@ -55,7 +62,7 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         phase=phase,
         launched_at=entry.launched_at,
         endpoint=_endpoint(entry, ip) if phase is not MachinePhase.FAILED else None,
-        usd_per_hour=entry.instead.get(placement.instance, entry.usd_per_hour),
+        usd_per_hour=usd_per_hour,
         spec_hash=entry.spec_hash,
         failure=failure,
         progress=progress,

@@ -242,8 +242,12 @@ def extras_usd_per_hour(placement: Placement, disk_size: Any) -> float:
     address = ADDRESS_USD_PER_HOUR.get(cloud, 0.0)
     if placement.spot:
         address = SPOT_ADDRESS_USD_PER_HOUR.get(cloud, address)
-    disk = disk_gb(disk_size) * DISK_USD_PER_GB_MONTH.get(cloud, 0.0)
-    return address + disk / HOURS_A_MONTH
+    return address + disk_usd_per_hour(cloud, disk_size)
+
+
+def disk_usd_per_hour(cloud: str, disk_size: Any) -> float:
+    """Return what a disk of a `disk_size` costs."""
+    return disk_gb(disk_size) * DISK_USD_PER_GB_MONTH.get(cloud, 0.0) / HOURS_A_MONTH
 
 
 def disk_gb(asked: Any) -> float:

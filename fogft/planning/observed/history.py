@@ -168,7 +168,8 @@ class History:
         if event.generation > self._generations.get(event.slot, -1):
             self._generations[event.slot] = event.generation
         record = self._records.get(key)
-        if record is None:
+        starts = event.kind is EventKind.LAUNCH
+        if record is None or (starts and record.closed is EventKind.ENDED):  # a standby's, again
             record = Record(event.slot, event.generation, event.at, event.location)
             record.on_demand, record.version = event.on_demand, event.version
             self._records[key] = record

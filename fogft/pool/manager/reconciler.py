@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fogft import logfile
-from fogft.cloud.port import Cloud, Launch, Refreshing
-from fogft.errors import CloudError, FogftError, NoCapacity, QuotaExceeded, told
+from fogft.cloud.port import Cloud, Launch, Refreshing, Stopping
+from fogft.errors import CloudError, CloudUnreachable, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.model.groups import GATEWAY_SLOT, replica_hash, sales, task_at
 from fogft.model.intent import Intent
 from fogft.model.membership import Found, members_of, successor, with_by_hand
@@ -38,7 +38,7 @@ from fogft.model.replica import (
 from fogft.model.schedule import Wish, wish
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import certified
-from fogft.planning import lifetime
+from fogft.planning import lifetime, standbys
 from fogft.planning.observed.clock_jumps import Reading
 from fogft.planning.observed.health import judge
 from fogft.planning.observed.history import EventKind, History, fault_of
@@ -131,6 +131,7 @@ class Reconciler:
     ) -> None:
         self._cloud = cloud
         self._refreshing = cloud if isinstance(cloud, Refreshing) else None
+        self._stopping = cloud if isinstance(cloud, Stopping) else None
         self._distances = distances
         self._store = store
         self._links = links
@@ -234,7 +235,9 @@ class Reconciler:
             listed = {m.id: m for m in self._cloud.machines(identity.uid)}
             for id, order in busy.items():
                 if order is not None:
-                    listed[id] = replace(listed.get(id, order), launched_at=now)
+                    found = listed.get(id, order)
+                    starts = found.phase is MachinePhase.STOPPED
+                    listed[id] = replace(order if starts else found, launched_at=now)
             machines = tuple(sorted(listed.values(), key=by_id))
         except CloudError as error:
             log.warning("cloud_unreachable pool=%s reason=%r", identity.name, error.message)
@@ -244,10 +247,11 @@ class Reconciler:
         links = self._links(identity.uid, now)
         rtt_s = self._distances(spec, sold, machines or (), links or ())
         gateway = tuple(m for m in machines or () if m.id.slot == GATEWAY_SLOT)
-        if gateway and machines is not None:
-            machines = tuple(m for m in machines if m.id.slot != GATEWAY_SLOT)
+        stopped = tuple(m for m in machines or () if m.phase is MachinePhase.STOPPED)
+        if machines is not None and (gateway or stopped):
+            machines = tuple(m for m in machines if m not in (*gateway, *stopped))
         doubt_s = self._time.doubt_s
-        seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway)
+        seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway, stopped)
         return seen, trouble
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:
@@ -312,10 +316,17 @@ class Reconciler:
         self._mark_draining(plan, observed, history)
         self._publish(identity, spec, observed, plan)
         slack = _slack(spec, observed, plan)
+        starts = standbys.started(spec, plan.launches, observed)
+        stops = standbys.stopped(spec, plan.terminations, observed) if self._stopping else {}
         for planned in plan.launches:
-            self._launch(identity, spec, planned, slack)
+            started = starts.get(planned.slot)
+            self._launch(identity, spec, started or planned, slack, is_there=started is not None)
         for end in plan.terminations:
-            self._terminate(end.id, end.reason, history)
+            stopped = stops.get(end.id)
+            order = None if stopped is None else bare_order(identity, spec, stopped)
+            self._terminate(end.id, end.reason, history, stopped=order)
+        for id, reason in standbys.superfluous(spec, observed, starts.values()):
+            self._terminate(id, reason, history)
 
     def _mark_draining(self, plan: Plan, observed: Observed, history: History) -> None:
         ends = {end.id for end in plan.terminations} | observed.ending
@@ -365,9 +376,15 @@ class Reconciler:
         self._published_for = cause
 
     def _launch(
-        self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch, slack: float | None
+        self,
+        identity: Identity,
+        spec: PoolSpec,
+        planned: PlannedLaunch,
+        slack: float | None,
+        *,
+        is_there: bool = False,
     ) -> None:
-        order = self._build_order(identity, spec, planned)
+        order = replace(self._build_order(identity, spec, planned), is_there=is_there)
         if slack is not None:
             order = replace(order, limit_usd_per_hour=order.usd_per_hour + slack)
         self._order(order, planned.reason)
@@ -392,9 +409,13 @@ class Reconciler:
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
         )
-        self.operations.start(order.id, expected, lambda: self._cloud.launch(order))
+        stopping = self._stopping
+        start = stopping.start if stopping and order.is_there else self._cloud.launch
+        self.operations.start(order.id, expected, lambda: start(order))
 
-    def _terminate(self, id: ReplicaId, reason: Reason, history: History) -> None:
+    def _terminate(
+        self, id: ReplicaId, reason: Reason, history: History, *, stopped: Launch | None = None
+    ) -> None:
         if id in self.operations.busy():
             return  # its launch is under way: a later tick ends it
         record = history.record(id.slot, id.generation)
@@ -402,7 +423,21 @@ class Reconciler:
             self._remember.add(EventKind.ENDING, id, reason=reason)
             log.info("terminate_ordered replica=%s reason=%r", id.short, words(reason))
         never_ready = fault_of(reason) is Cause.NOT_READY
-        self.operations.start(id, None, lambda: self._end(id, keep_log=never_ready))
+        if stopped is None:
+            self.operations.start(id, None, lambda: self._end(id, keep_log=never_ready))
+        else:
+            self.operations.start(id, None, lambda: self._stop(stopped))
+
+    def _stop(self, order: Launch) -> None:
+        """Stop a machine, off the loop; end it where its cloud cannot stop it."""
+        try:
+            if self._stopping is not None:
+                self._stopping.stop(order)
+        except CloudUnreachable:
+            raise
+        except CloudError as error:
+            log.warning("stop_refused replica=%s reason=%r", order.id.short, error.message)
+            self._cloud.terminate(order.id)
 
     def _end(self, id: ReplicaId, *, keep_log: bool) -> None:
         """End a machine, off the loop; keep the end of its log where it says why it goes."""

@@ -381,7 +381,7 @@ def of_tick(
         uplink_suspected=bool(health and health.uplink_suspected),
         usd_per_hour=sum(
             machine.usd_per_hour
-            for machine in (*(one.machine for one in judged), *observed.gateway)
+            for machine in (*(one.machine for one in judged), *observed.gateway, *observed.standbys)
         ),
         usd_to_date=usd_to_date,
         credentials_end_at=credentials_end_at,

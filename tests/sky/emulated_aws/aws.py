@@ -78,11 +78,12 @@ class World:
         self.log.append({"event": event, "at": time.time(), **what})
         print(json.dumps(self.log[-1]), flush=True)
 
-    def boot(self, instance: Any) -> None:
+    def boot(self, instance: Any, *, again: bool = False) -> None:
+        """Start an instance's VM; `again` with the disk that it had when it was stopped."""
         cloud_config = config_of(instance)
         account = cloud_config["users"][0]
         user, key = account["name"], account["ssh_authorized_keys"][0]
-        first = "\n".join(cloud_config.get("runcmd") or [])
+        first = ":" if again else "\n".join(cloud_config.get("runcmd") or [])
         name = "f" + instance.id[-8:]
         with (IMAGE / f"{instance.id}.log").open("wb") as log:
             self.vms[instance.id] = subprocess.Popen(
@@ -110,7 +111,7 @@ class World:
             spot = getattr(instance, "lifecycle", None) == "spot"
             self.end(instance.id) if spot else instance.stop()
 
-    def kill(self, id: str) -> None:
+    def kill(self, id: str, *, keeps_disk: bool = False) -> None:
         with self.lock:
             vm = self.vms.pop(id, None)
         if vm is None:
@@ -124,7 +125,8 @@ class World:
         vm.wait()
         name = "f" + id[-8:]
         subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
-        subprocess.run(["rm", "-rf", IMAGE / "vm" / name], check=False)
+        if not keeps_disk:
+            subprocess.run(["rm", "-rf", IMAGE / "vm" / name], check=False)
         self.say("kill", id=id)
 
     def preempt(self, id: str) -> None:
@@ -219,6 +221,7 @@ def patch_moto() -> None:
     spot_instances.SpotInstances.describe_spot_price_history = price_history
     for name in ("terminate", "stop"):
         setattr(instances.Instance, name, killing(getattr(instances.Instance, name)))
+    instances.Instance.start = starting(instances.Instance.start)
 
 
 # As somebody is called who has logged in by SSO.
@@ -306,8 +309,19 @@ def price_history(self: Any) -> ActionResult:
 
 def killing(method: Any) -> Any:
     def wrapped(self: Any, *args: Any, **kw: Any) -> Any:
-        WORLD.kill(self.id)
+        WORLD.kill(self.id, keeps_disk=method.__name__ == "stop")
         return method(self, *args, **kw)
+
+    return wrapped
+
+
+def starting(method: Any) -> Any:
+    """Boot a stopped instance; moto gives it another address, as AWS does."""
+
+    def wrapped(self: Any, *args: Any, **kw: Any) -> Any:
+        found = method(self, *args, **kw)
+        WORLD.boot(self, again=True)
+        return found
 
     return wrapped
 

@@ -13,6 +13,7 @@ import sys
 import urllib.error
 import urllib.parse
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -84,6 +85,7 @@ class Proof:
     def run(self) -> None:
         a, b = self.two_regions()
         self.preemption(a)
+        self.standby()
         self.capacity_and_setup()
         self.another_takes_over(b)
         self.server_dies(b)
@@ -130,6 +132,27 @@ class Proof:
         assert [m.id.slot for m in left] == [1], left
         with step("terminate what is gone already"):
             self.cloud.terminate(a)
+
+    def standby(self) -> None:
+        """An on-demand machine is stopped and started: its disk is kept, its address is another."""
+        offer = self.cloud.offers({**RESOURCES, "use_spot": False})[0]
+        id, price = ReplicaId(UID, 100, 1), offer.usd_per_hour
+        order = Launch(id, "proof", offer.placement, price, "abcd", TASK, FILES)
+        with step("an on-demand machine is launched, until it answers"):
+            self.cloud.launch(order)
+            before = self.runs(id).endpoint or ""
+            until("it answers", lambda: get(before))
+        with step("it is stopped"):
+            self.cloud.stop(order)
+        assert self.phase(id) is MachinePhase.STOPPED
+        assert not [i for i in running() if i["labels"]["fogft-slot"] == "100"]
+        with step("it is started, until it answers"):
+            self.cloud.start(replace(order, is_there=True))
+            until("it answers", lambda: (m := self.machine(id)) and get(m.endpoint or ""))
+        after = self.machine(id)
+        assert after is not None
+        assert after.endpoint not in (None, before)
+        self.cloud.terminate(id)
 
     def capacity_and_setup(self) -> None:
         for region in ("us-east-1", "us-west-2"):

@@ -27,7 +27,7 @@ step = Steps()
 OTHERWISE = {
     *("servicequotas:GetServiceQuota", "iam:ListAttachedRolePolicies"),
     *("ec2:Describe*", "ec2:TerminateInstances", "ec2:DeleteSecurityGroup"),
-    "ec2:ModifyInstanceAttribute",
+    *("ec2:ModifyInstanceAttribute", "ec2:StopInstances", "ec2:StartInstances"),
 }
 
 

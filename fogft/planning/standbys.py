@@ -1,0 +1,85 @@
+"""On-demand machines that are stopped when spot is back, and started when it is lost again. Pure.
+
+The planner knows nothing of them: what it ends is stopped, and what it buys is started, where that
+is the same to it.
+
+Not here: who stands in, and when (`fallback`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from fogft.model.groups import group_of, groups_of, is_stand_in, replica_hash
+from fogft.model.reason import Cause, Reason
+from fogft.model.replica import Machine, Observed, Offer, ReplicaId
+from fogft.model.spec import PoolSpec
+from fogft.planning.buying import PlannedLaunch
+from fogft.planning.planner import PlannedEnd
+
+
+def started(
+    spec: PoolSpec, launches: Iterable[PlannedLaunch], observed: Observed
+) -> Mapping[int, PlannedLaunch]:
+    """Return, by the slot of a planned stand-in, the start of a standby in its place."""
+    groups = groups_of(spec)
+    prices = {(o.group, o.placement): o for o in observed.offers}
+    left = [m for m in observed.standbys if m.id not in observed.ending and _is_current(spec, m)]
+    found: dict[int, PlannedLaunch] = {}
+    for planned in launches:
+        if not is_stand_in(planned.slot):
+            continue
+        group = group_of(groups, planned.slot)
+        for machine in left:
+            offer = prices.get((group.name, machine.placement))
+            if group.owns(machine.id.slot) and offer is not None:
+                left.remove(machine)
+                id, why = machine.id, planned.reason
+                found[planned.slot] = PlannedLaunch(id.slot, id.generation, offer, why)
+                break
+    return found
+
+
+def stopped(
+    spec: PoolSpec, ends: Iterable[PlannedEnd], observed: Observed
+) -> Mapping[ReplicaId, PlannedLaunch]:
+    """Return the launches that are stopped rather than ended: enough spot machines are back."""
+    groups = groups_of(spec)
+    machines = {machine.id: machine for machine in observed.machines or ()}
+    room = {
+        group.name: group.on_demand.standbys - sum(group.owns(m.id.slot) for m in observed.standbys)
+        for group in groups
+    }
+    found: dict[ReplicaId, PlannedLaunch] = {}
+    for end in ends:
+        machine, group = machines.get(end.id), group_of(groups, end.id.slot)
+        enough = end.reason.cause is Cause.ENOUGH_SPOT and not (machine and machine.placement.spot)
+        if machine is not None and enough and room[group.name] > 0 and _is_current(spec, machine):
+            room[group.name] -= 1
+            offer = Offer(machine.placement, machine.usd_per_hour)
+            found[end.id] = PlannedLaunch(end.id.slot, end.id.generation, offer, end.reason)
+    return found
+
+
+def superfluous(
+    spec: PoolSpec, observed: Observed, starting: Iterable[PlannedLaunch]
+) -> list[tuple[ReplicaId, Reason]]:
+    """Return the standbys to end: of another version, or more than the file asks for."""
+    groups = groups_of(spec)
+    used = {(planned.slot, planned.generation) for planned in starting}
+    room = {group.name: group.on_demand.standbys for group in groups}
+    ends = []
+    for machine in observed.standbys:
+        if machine.id in observed.ending or (machine.id.slot, machine.id.generation) in used:
+            continue
+        group = group_of(groups, machine.id.slot)
+        room[group.name] -= 1
+        if not _is_current(spec, machine):
+            ends.append((machine.id, Reason(Cause.OUTDATED)))
+        elif room[group.name] < 0:
+            ends.append((machine.id, Reason(Cause.NOT_WANTED)))
+    return ends
+
+
+def _is_current(spec: PoolSpec, machine: Machine) -> bool:
+    return machine.spec_hash == replica_hash(spec, machine.id.slot)
