@@ -11,7 +11,7 @@ def test_the_pages_policy_allows_what_it_names_and_nothing_else():
     ours = [{"fogft-pool": "0" * 16}]
     for action in actions(rules):
         assert policy.allows(action.replace("*", "Instances"), lambda: ours)
-    for action in ("ec2:StopInstances", "iam:CreateRole", "s3:ListBuckets", "ec2:CreateVpc"):
+    for action in ("ec2:RebootInstances", "iam:CreateRole", "s3:ListBuckets", "ec2:CreateVpc"):
         assert not policy.allows(action, lambda: ours)
     assert policy.allows("sts:GetCallerIdentity", list)
 
