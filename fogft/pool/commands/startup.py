@@ -68,13 +68,19 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
 def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Identity:
     paths = store.paths
     uid = secrets.token_hex(8)
-    shutil.rmtree(paths.credentials, ignore_errors=True)  # of an `up` that was cut short
+    # Of an `up` that was cut short, or a pool whose identity was lost: what its client proxy would
+    # go on to tell is not of this pool.
+    for lock in (paths.manager_lock, paths.standby_lock, paths.proxy_lock):
+        process_control.end_holder(lock)
     old = (
         *(paths.history, paths.membership, paths.lease, paths.records, paths.manager_records),
-        *(paths.good_spec, paths.trial, paths.discovered),
+        *(paths.good_spec, paths.trial, paths.discovered, paths.status, paths.proxy_status),
     )
-    for left in old:
-        left.unlink(missing_ok=True)
+    for left in (paths.credentials, *old):
+        if left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left, ignore_errors=True)
+        else:
+            left.unlink(missing_ok=True)
     authority.create_authority(paths.credentials, uid)
     disk.write_whole(paths.spec, source)
     store.write_intent(Intent())

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 
 from fogft import disk
@@ -90,3 +93,25 @@ def test_an_up_cut_short_is_an_up_that_never_was(scene: Scene) -> None:
     name = authority.describe(scene.paths.credentials / "ca.crt").common_name
     assert name == f"fogft.{second.uid}"
     assert not scene.paths.history.exists()
+
+
+def test_the_client_proxy_of_a_pool_whose_identity_was_lost_tells_nothing_of_the_next(
+    scene: Scene,
+) -> None:
+    """It would go on with the replicas that it has, and the new pool be called ready for them."""
+    first = scene.write()
+    paths = scene.paths
+    held = "import sys,time; from fogft import disk; disk.Lock(disk.Path(sys.argv[1])).acquire("
+    program = held + "wait=False); print(flush=True); time.sleep(300)"
+    with subprocess.Popen(
+        [sys.executable, "-c", program, str(paths.proxy_lock)], stdout=subprocess.PIPE
+    ) as old:
+        assert old.stdout is not None
+        old.stdout.readline()
+        paths.proxy_status.write_text("{}")
+        paths.history.mkdir()
+        paths.identity.unlink()
+        assert scene.write().uid != first.uid
+        assert old.wait(20) != 0
+    assert not paths.proxy_status.exists()
+    assert scene.store.history().record(0, 1) is None
