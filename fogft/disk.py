@@ -89,7 +89,7 @@ def read_bytes(path: Path) -> bytes | None:
         raise StateError(f"`{path}` cannot be read: {error.strerror}", hint) from error
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Path, hint: str = "") -> Any:
     """Return what a JSON file holds, or None where there is no file. Raises StateError."""
     raw = read_bytes(path)
     if raw is None:
@@ -97,7 +97,7 @@ def read_json(path: Path) -> Any:
     try:
         return json.loads(raw.decode())
     except (ValueError, RecursionError) as error:
-        raise StateError(f"`{path}` is damaged: {error}") from error
+        raise StateError(f"`{path}` is damaged: {error}", hint) from error
 
 
 def read_as(cls: type[T], path: Path, hint: str = "") -> T | None:
@@ -106,7 +106,7 @@ def read_as(cls: type[T], path: Path, hint: str = "") -> T | None:
     Raises:
         StateError: It cannot be read, or describes none.
     """
-    raw = read_json(path)
+    raw = read_json(path, hint)
     return None if raw is None else stored(cls, raw, f"`{path}` is damaged", hint)
 
 

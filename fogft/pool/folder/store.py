@@ -26,6 +26,12 @@ from fogft.planning.rollout import Trial
 from fogft.pool.folder.history_file import HistoryFile
 from fogft.pool.folder.paths import PoolPaths
 
+_NO_INTENT = "remove it: then the pool file counts alone, without `scale`, `exclude` and `drain`"
+_NO_IDENTITY = (
+    "restore it, or remove the pool's folder, which ends the manager and the client proxy; "
+    "`fogft sweep --end` then ends the machines"
+)
+
 
 @dataclass(frozen=True)
 class Identity:
@@ -202,7 +208,7 @@ class PoolStore:
 
     def intent(self) -> Intent:
         """Return the user's changes besides the file; empty if there are none."""
-        return disk.read_as(Intent, self.paths.intent) or Intent()
+        return disk.read_as(Intent, self.paths.intent, _NO_INTENT) or Intent()
 
     def write_intent(self, intent: Intent) -> None:
         """Store the user's changes; the caller holds `intent_lock`."""
@@ -244,8 +250,13 @@ def digest(source: bytes) -> str:
 
 
 def read_identity(paths: PoolPaths) -> Identity:
-    """Return the identity of the pool in a folder."""
-    found = disk.read_as(Identity, paths.identity)
+    """Return the identity of the pool in a folder, where it is damaged as the manager told it."""
+    try:
+        found = disk.read_as(Identity, paths.identity)
+    except StateError as error:
+        found = _told_identity(paths)
+        if found is None:
+            raise StateError(error.message, _NO_IDENTITY) from error
     if found is None and paths.exported.exists():
         name = paths.folder.name
         raise PoolBusy(
@@ -255,6 +266,27 @@ def read_identity(paths: PoolPaths) -> Identity:
     if found is None:
         raise PoolNotFound(f"there is no pool `{paths.folder.name}`", "`fogft up FILE` starts one")
     return found
+
+
+@dataclass(frozen=True)
+class _Told:
+    pool: str
+    uid: PoolUid
+    cloud: str
+    file: str
+    epoch: Count
+
+
+def _told_identity(paths: PoolPaths) -> Identity | None:
+    """Return the identity that the manager last told in its status; None for none."""
+    try:
+        told = disk.read_as(_Told, paths.status)
+        created_at = (paths.credentials / "ca.crt").stat().st_mtime
+    except (StateError, OSError):
+        return None
+    if told is None or told.pool != paths.folder.name:
+        return None
+    return Identity(told.pool, told.uid, told.cloud, told.file, created_at, told.epoch)
 
 
 def write_identity(paths: PoolPaths, identity: Identity) -> None:

@@ -81,7 +81,8 @@ def end(
             limit_s=limit_s,
         )
         # The identity first: from here on there is no such pool.
-        paths.identity.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # what stands in its place is no file
+            paths.identity.unlink()
         shutil.rmtree(paths.folder, ignore_errors=True)
     return ended
 

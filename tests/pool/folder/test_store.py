@@ -126,8 +126,26 @@ def test_damaged_identity_is_an_error(pool: Scene, damage: dict[str, object]) ->
     """Machines are ended by uid, so a uid that is not one is never used."""
     raw = {**disk.read_json(pool.paths.identity), **damage}
     pool.paths.identity.write_text(json.dumps({k: v for k, v in raw.items() if v is not ...}))
-    with pytest.raises(StateError, match="damaged"):
+    with pytest.raises(StateError, match="damaged") as caught:
         read_identity(pool.paths)
+    assert "fogft sweep --end" in caught.value.hint
+
+
+@pytest.mark.parametrize("name", ["pool", "another"])
+def test_a_damaged_identity_is_as_the_manager_told_it(pool: Scene, name: str) -> None:
+    """So `fogft down` still ends the machines; what another pool's manager told is not taken."""
+    before = read_identity(pool.paths)
+    told = {"pool": name, "uid": before.uid, "cloud": before.cloud, "file": before.file, "epoch": 7}
+    disk.write_json(pool.paths.status, told)
+    pool.paths.identity.unlink()
+    pool.paths.identity.mkdir()
+    if name == "pool":
+        after = read_identity(pool.paths)
+        assert (after.uid, after.cloud, after.first_epoch) == (before.uid, before.cloud, 7)
+        assert abs(after.created_at - before.created_at) < 60.0
+    else:
+        with pytest.raises(StateError):
+            read_identity(pool.paths)
 
 
 def test_no_pool_is_its_own_error(tmp_path: Path) -> None:
