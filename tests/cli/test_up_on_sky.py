@@ -78,6 +78,17 @@ def test_a_file_that_names_clouds_is_for_sky_and_its_prices_are_told(scene, file
     assert started[0].cloud == "sky"
 
 
+def test_a_gateway_to_be_launched_is_shown_with_its_price(scene, file, started, capsys):
+    """As SkyPilot sells it on demand, with the ports of a pool: no key that a file may not have."""
+    file.write_text(SPEC + "  gateway: {launch: true}\nresources: {any_of: [{infra: aws}]}\n")
+    assert main.run(["up", str(file), "--yes"]) == 0
+    said = capsys.readouterr().err.splitlines()
+    (row,) = [line for line in said if line.startswith("  gateway  ")]
+    assert "aws/us-east-1/us-east-1a  m6i.large  $0.0" in row
+    assert scene.sky.asked_for["use_spot"] is False
+    assert scene.sky.asked_for["ports"] == [7448]
+
+
 def test_nothing_is_started_unasked(scene, file, started, monkeypatch, capsys):
     """No word from anybody is a no."""
     monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))

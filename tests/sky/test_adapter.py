@@ -94,6 +94,14 @@ def test_a_machine_is_stopped_for_the_price_of_its_disk_and_started_under_its_id
     assert not scene.provider.found
 
 
+def test_a_gateways_machine_opens_its_ports_too(scene: Scene):
+    """A replica's opens the link's alone."""
+    scene.cloud.launch(scene.order(more_ports=(7470, 7471, 7472)))
+    assert scene.sky.task(NAME)["resources"]["ports"] == ["7448", "7470", "7471", "7472"]
+    scene.cloud.launch(scene.order(replica(1)))
+    assert scene.sky.task(cluster_name(replica(1)))["resources"]["ports"] == ["7448"]
+
+
 def test_a_stopped_machine_that_is_gone_is_listed_no_more(scene: Scene):
     scene.launched()
     scene.cloud.stop(scene.order())

@@ -71,6 +71,5 @@ def ports(spec: PoolSpec) -> tuple[int, ...]:
 
 def offered(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
     """Return what is sold for its machine, the cheapest first."""
-    asked = {**resources(spec), "ports": [spec.link_port, *ports(spec)]}
-    sold = cloud.offers(asked)
+    sold = cloud.offers(resources(spec))
     return tuple(sorted(sold, key=lambda o: (o.usd_per_hour, o.placement)))

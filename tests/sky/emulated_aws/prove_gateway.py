@@ -37,7 +37,8 @@ NAT = """\
 table inet nat_of_robot { chain input {
   type filter hook input priority 0; policy accept;
   ip saddr 10.66.0.0/16 ip daddr 10.66.0.1 tcp dport != 5566 ct state new drop
-} }
+}
+}
 """
 step = Steps()
 
