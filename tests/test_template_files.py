@@ -12,7 +12,7 @@ import pytest
 from fogft import template_files
 from fogft.errors import FogftError
 from fogft.pool.commands import init
-from fogft.poolfile import file
+from fogft.poolfile import file, named_clouds
 from fogft.poolfile.schema import pool_schema
 
 EXAMPLES = ["detect", "echo", "inspection", "motion", "pick", "planner", "segment", "words"]
@@ -63,6 +63,15 @@ class TestExamples:
         ]
         script = re.fullmatch(r"exec python3 (\w+\.py)", spec.task["run"])
         assert (folder / script[1]).is_file()
+
+    def test_one_starts_on_aws_as_it_is(self):
+        """Within a price and a time; otherwise it is the local one's."""
+        folder = template_files.folder() / "echo"
+        here, there = file.read(folder / "pool.yaml"), file.read(folder / "aws.yaml")
+        assert named_clouds.clouds_named(there) == ["aws"]
+        assert (there.services, there.task["run"]) == (here.services, here.task["run"])
+        assert there.max_hours
+        assert there.max_usd_per_hour
 
     @pytest.mark.parametrize("name", EXAMPLES)
     def test_its_nodes_know_nothing_of_fogft(self, name):
