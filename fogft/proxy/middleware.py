@@ -82,10 +82,10 @@ def load_types(type_names: Sequence[str]) -> None:
 
 def declare_gone(participant: str, domain_id: int | None) -> None:
     """Tell the ROS domain that the process of this `Joined.participant` was killed."""
-    from fogft.ros import farewell
+    from fogft.ros import spdp
 
     with contextlib.suppress(ValueError):  # what a file says
-        farewell.declare_gone(bytes.fromhex(participant), domain_id)
+        spdp.declare_gone(bytes.fromhex(participant), domain_id)
 
 
 def join(

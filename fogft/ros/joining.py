@@ -1,8 +1,7 @@
 """Join a ROS domain: a context, optionally with a DDS participant before any visible node.
 
-DDS takes up to three seconds until a new participant and those that run know of each other (Fast
-DDS loses what it is answered in its first milliseconds, and hears it anew every three seconds). A
-participant that is known already has its services found within milliseconds.
+A participant that is known already has its services found within milliseconds. Until a new one and
+those that run know of each other it takes half a second (`fogft.ros.spdp`).
 
 Owns: contexts. Not here: the node of a proxy (`node`).
 """
@@ -15,6 +14,7 @@ from collections.abc import Callable
 from typing import Any
 
 from fogft.errors import RosError
+from fogft.ros import spdp
 from fogft.ros.shared_memory import make_private
 
 log = logging.getLogger(__name__)
@@ -128,6 +128,7 @@ class EarlyJoin:
             self._node = bare_node(name, self.context)
         except Exception as error:  # ImportError, or rclpy's
             raise RosError(f"ROS 2 cannot be used here: {error}") from error
+        self._introduction = spdp.Introduction(self.context.get_domain_id())
         self._timers = Timers()
 
     def look(self) -> None:
@@ -136,9 +137,10 @@ class EarlyJoin:
 
     def done(self) -> None:
         """End the hidden node, because another node uses the participant now."""
+        self._introduction.close()
         self._node.destroy_node()
 
     def close(self) -> None:
         """Leave the domain, if no node has taken over the context."""
-        self._node.destroy_node()
+        self.done()
         self.context.try_shutdown()

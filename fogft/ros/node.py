@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 from fogft.errors import RosError
 from fogft.model import ros_names
 from fogft.model.topic import Quality
-from fogft.ros import cyclone, farewell, topic_ends, vendors
+from fogft.ros import cyclone, spdp, topic_ends, vendors
 from fogft.ros.entities import Client, Server
 from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
 from fogft.ros.pacing.client_probes import NodeProbes
@@ -96,8 +96,11 @@ class SerialisedNode:
         except BaseException:
             self._context.try_shutdown()
             raise
+        self._introduction: spdp.Introduction | None = None
         if early is not None:
             early.done()
+        else:
+            self._introduction = spdp.Introduction(self._context.get_domain_id())
 
     @property
     def alive(self) -> bool:
@@ -217,7 +220,7 @@ class SerialisedNode:
         nodes = {bytes(end.endpoint_gid)[:16]: (end.node_name, end.node_namespace) for end in ends}
         if client not in nodes:
             return None
-        processes = {end[: farewell.PREFIX_BYTES] for end in nodes if nodes[end] == nodes[client]}
+        processes = {end[: spdp.PREFIX_BYTES] for end in nodes if nodes[end] == nodes[client]}
         return ClientNode(*nodes[client], unique=len(processes) == 1)
 
     def identity(self, handle: bytes) -> bytes:
@@ -231,7 +234,7 @@ class SerialisedNode:
         """
         requests, own = f"rq{service}Request", self._node.get_name()
         named = {
-            bytes(reader.endpoint_gid)[: farewell.PREFIX_BYTES]
+            bytes(reader.endpoint_gid)[: spdp.PREFIX_BYTES]
             for reader in self._endpoints(self._node.get_subscriptions_info_by_topic, requests)
             if reader.node_name == own
         }
@@ -388,6 +391,8 @@ class SerialisedNode:
         self._entities = ()
         for _, _, done in changes:
             done.set()
+        if self._introduction is not None:
+            self._introduction.close()
         self._guard.destroy()
         self._node.destroy_node()
         self._context.try_shutdown()

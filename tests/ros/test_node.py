@@ -78,10 +78,13 @@ def test_a_requests_handle_tells_whose_client_asked(ros_domain: int) -> None:
 
 TELLS = """
 import sys
+from time import sleep
 from fogft.ros.node import SerialisedNode
 node = SerialisedNode("standby", int(sys.argv[1]))
 node.serve("/flag", "std_srvs/srv/SetBool",
            lambda _, handle: print(node.identity(handle).hex(), flush=True))
+while not node.callers("/flag"): sleep(0.01)
+print("knows the caller", flush=True)
 sys.stdin.read()
 node.close()
 """
@@ -107,6 +110,7 @@ def test_two_processes_tell_a_request_by_the_same(ros_domain: int) -> None:
         )
         client = asks.client("/flag", SET_BOOL)
         wait_for(lambda: client.servers() == 2, "discovery")
+        assert standby.stdout.readline() == "knows the caller\n"
         for n in range(3):
             client.call(TRUE, lambda _: None)
             wait_for(lambda n=n: len(told) > n, "the request")

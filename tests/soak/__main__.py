@@ -38,6 +38,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1, help="of the schedule (default 1)")
     parser.add_argument("--keep", type=Path, help="folder for what the processes write")
     parser.add_argument("--robot", action="store_true", help="the robot's own side, under ROS")
+    parser.add_argument("--only", action="append", help="with --robot: this kind of fault")
     given = parser.parse_args()
     nightly = given.minutes >= LONG_MIN
     if given.robot:
@@ -46,7 +47,8 @@ def main() -> int:
         with tempfile.TemporaryDirectory(prefix="fogft-soak-") as folder:
             where = (given.keep or Path(folder)).resolve()
             where.mkdir(parents=True, exist_ok=True)
-            return robot.soak(where, given.seed, 60.0 * given.minutes, nightly=nightly)
+            kinds = given.only or robot.kinds(nightly=nightly)
+            return robot.soak(where, given.seed, 60.0 * given.minutes, kinds)
     kinds, namespaces = list(schedule.KINDS), can_make_namespaces()
     if not namespaces:
         kinds = [kind for kind in kinds if "uplink" not in kind]

@@ -395,13 +395,16 @@ def run(world: World, kinds: Sequence[str], seed: int, lasts_s: float, times: li
         time.sleep(1.0)
 
 
-def soak(folder: Path, seed: int, lasts_s: float, *, nightly: bool) -> int:
-    """Run in namespaces of one's own; return the exit status."""
-    kinds = list(DAMAGES)
+def kinds(*, nightly: bool) -> list[str]:
+    """Return the kinds of faults that can be done here in the time that there is."""
+    left_out = {"long suspend"} if not nightly else set()
     if not can_set():
-        kinds.remove("clock set")
-    if not nightly:
-        kinds.remove("long suspend")
+        left_out.add("clock set")
+    return [kind for kind in DAMAGES if kind not in left_out]
+
+
+def soak(folder: Path, seed: int, lasts_s: float, kinds: Sequence[str]) -> int:
+    """Run in namespaces of one's own; return the exit status."""
     taken: dict[int, int] = {}  # the domain's lock
     world = World(folder, lock_domain(taken))
     times: list[Time] = []

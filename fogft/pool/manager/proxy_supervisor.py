@@ -91,8 +91,8 @@ class ProxySupervisor:
         self._end_hanging()
         working = self._holder(self._paths.proxy_lock)
         waiting = self._holder(self._paths.standby_lock)
-        if working is None and waiting is not None:
-            return True  # it is about to take over
+        if working is None:  # the one in line is about to take over; the next one is due
+            working = waiting
         if waiting == working:  # it has just taken over
             waiting = None
         if working and working != self._serving:

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 LOOK_S = 0.2
 BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
-RENEWED_AFTER_S = 3.0  # a pause, a standby has joined anew and is known
+RENEWED_AFTER_S = 1.0  # a pause, a standby has joined anew and is known
 KNOWN_AFTER_S = 1.0  # once it offers them and knows the callers: until they know its services
 ORDER_LIMIT_S = 20.0  # what was ordered is answered by then, or not at all
 FINISH_LIMIT_S = 130.0  # in all less than systemd and `fogft service install` wait

@@ -180,6 +180,18 @@ def test_a_running_proxy_is_adopted(tmp_path: Path) -> None:
     held.release()
 
 
+def test_the_next_standby_is_started_while_the_last_one_takes_over(tmp_path: Path) -> None:
+    """The one that takes over may be killed as well, a second later."""
+    paths, ended = PoolPaths(tmp_path), threading.Event()
+    held = disk.Lock(paths.standby_lock)
+    assert held.acquire(wait=False)
+    supervisor = ProxySupervisor(paths, lambda: 1000.0, ended=ended.set)
+    assert supervisor.look()
+    assert ended.wait(20)  # it lacks its configuration
+    assert str(paths.proxy_config) in paths.proxy_log.read_text()
+    held.release()
+
+
 WORKS = "import sys, time\nfrom pathlib import Path\nfrom fogft import disk\n"
 WORKS += "disk.Lock(Path(sys.argv[1])).acquire(wait=True)\nprint('held', flush=True)\n"
 WORKS += "while True: time.sleep(0.01)"

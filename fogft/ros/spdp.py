@@ -1,0 +1,163 @@
+"""DDS participant discovery (SPDP) messages that fogft sends itself: RTPS 2.3, 8.5.3, 9.4.5.3.
+
+Others go on believing in a killed process for 20 seconds, DDS's lease: `service_is_ready` stays
+true, and a client with `KEEP_ALL` keeps its requests for it. A process that ends well takes its
+leave with one message, which whoever knows its id can send as well.
+
+A new process announces itself, and those that run answer. Fast DDS often loses these answers, for
+it listens only after it has announced itself, and hears the others up to three seconds later. So
+another participant is announced for an instant, when Fast DDS does listen; what it is answered is
+passed on. ROS does not see it: it has no node.
+
+Owns: these messages, and where they go. Not here: who was killed (`fogft.proxy.robot.process`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import socket
+import struct
+import threading
+import time
+from collections.abc import Iterator, Mapping
+
+PREFIX_BYTES = 12
+_FAST_DDS, _CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # who else keeps to this is not known
+_PARTICIPANT = b"\x00\x00\x01\xc1"
+_SPDP_WRITER, _SPDP_READER = b"\x00\x01\x00\xc2", b"\x00\x01\x00\xc7"
+_LITTLE_ENDIAN, _INLINE, _DATA, _KEY = 0x01, 0x02, 0x04, 0x08
+_END = struct.pack("<HH", 1, 0)
+_LAST = 0x7FFFFFFF  # a number above all that it can have used
+_GROUP = "239.255.0.1"
+_LOOPBACK = "127.0.0.1"
+_BASE_PORT, _DOMAIN_GAIN, _UNICAST_OFFSET, _ID_GAIN = 7400, 250, 10, 2
+_IDS = 64  # participants of one machine that are told, one by one
+_ANSWERED_WITHIN_S = 0.3
+_LOOK_S = 0.02
+
+
+def is_known(prefix: bytes) -> bool:
+    """Whether a participant id is of a middleware that understands the message."""
+    return len(prefix) == PREFIX_BYTES and prefix.startswith((_FAST_DDS, _CYCLONE_DDS))
+
+
+def _message(prefix: bytes, number: int, flags: int, parameters: bytes) -> bytes:
+    body = struct.pack("<HH", 0, 16) + _SPDP_READER + _SPDP_WRITER + struct.pack("<iI", 0, number)
+    body += parameters + _END
+    header = b"RTPS\x02\x03" + prefix[:2] + prefix
+    return header + struct.pack("<BBH", 0x15, _LITTLE_ENDIAN | flags, len(body)) + body
+
+
+def gone(prefix: bytes) -> bytes:
+    """Return the DDS disposal message of the participant with this id prefix."""
+    guid = prefix + _PARTICIPANT
+    parameters = struct.pack("<HH", 0x70, 16) + guid  # PID_KEY_HASH
+    parameters += struct.pack("<HH", 0x71, 4) + b"\x00\x00\x00\x03"  # disposed, unregistered
+    key = b"\x00\x03\x00\x00" + struct.pack("<HH", 0x50, 16) + guid
+    return _message(prefix, _LAST, _INLINE | _KEY, parameters + _END + key)
+
+
+def _here(prefix: bytes, port: int) -> bytes:
+    """Return the announcement of a participant that is to be answered at a port of this machine."""
+    at = struct.pack("<iI12x", 1, port) + socket.inet_aton(_LOOPBACK)
+    parameters = {
+        0x15: b"\x02\x03\x00\x00",  # protocol version
+        0x16: _FAST_DDS + b"\x00\x00",  # vendor
+        0x50: prefix + _PARTICIPANT,
+        0x32: at,  # for discovery
+        0x31: at,  # for data
+        0x02: struct.pack("<iI", 1, 0),  # it is gone after so many seconds without a sign of life
+        0x58: struct.pack("<I", 3),  # it has nothing but participant discovery
+    }
+    told = b"".join(struct.pack("<HH", id, len(value)) + value for id, value in parameters.items())
+    return _message(prefix, 1, _DATA, b"\x00\x03\x00\x00" + told)
+
+
+def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.environ) -> None:
+    port = _BASE_PORT + _DOMAIN_GAIN * domain_id
+    peers = re.split(r"[;\s]+", environ.get("ROS_STATIC_PEERS", ""))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
+        for host in filter(None, [_LOOPBACK, *peers]):
+            for id in range(_IDS):
+                with contextlib.suppress(OSError):
+                    to = port + _UNICAST_OFFSET + _ID_GAIN * id
+                    sending.sendto(message, (host, to))
+        for index in _interfaces():
+            with contextlib.suppress(OSError):
+                through = struct.pack("=4s4si", b"", b"", index)
+                sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, through)
+                sending.sendto(message, (_GROUP, port))
+
+
+def declare_gone(
+    prefix: bytes, domain_id: int | None, environ: Mapping[str, str] = os.environ
+) -> bool:
+    """Send a killed participant's disposal message; return whether it was sent.
+
+    Args:
+        prefix: The first 12 bytes of its id.
+        domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
+        environ: Where ROS's variables are.
+    """
+    if not is_known(prefix):
+        return False
+    if domain_id is None:
+        written = environ.get("ROS_DOMAIN_ID") or "0"
+        domain_id = int(written) if written.isdecimal() else 0
+    _send(gone(prefix), domain_id, environ)
+    return True
+
+
+class Introduction:
+    """Has this process's new participants in a domain hear of those that run, on a thread."""
+
+    def __init__(self, domain_id: int) -> None:
+        self._domain_id = domain_id
+        self._closed = False
+        self._thread = threading.Thread(target=self._run, name="introduction", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Return once it has ended, which it does soon by itself as well. Repeatable."""
+        self._closed = True
+        self._thread.join()
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):  # no descriptor: then they are heard of later
+            self._introduce()
+
+    def _introduce(self) -> None:
+        prefix = _FAST_DDS + os.urandom(PREFIX_BYTES - len(_FAST_DDS))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.bind((_LOOPBACK, 0))
+            sock.settimeout(_LOOK_S)
+            ours = _own_ports(_BASE_PORT + _DOMAIN_GAIN * self._domain_id)
+            _send(_here(prefix, sock.getsockname()[1]), self._domain_id)
+            end = time.monotonic() + _ANSWERED_WITHIN_S
+            while not self._closed and time.monotonic() < end:
+                with contextlib.suppress(TimeoutError):
+                    answer = sock.recv(1 << 16).replace(prefix, bytes(PREFIX_BYTES))  # to any
+                    for port in ours:
+                        sock.sendto(answer, (_LOOPBACK, port))
+            _send(gone(prefix), self._domain_id)
+
+
+def _own_ports(domain_port: int) -> list[int]:
+    """Return the ports at which this process's participants of a domain hear of others."""
+    sockets = set()
+    for descriptor in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            sockets.add(os.readlink(f"/proc/self/fd/{descriptor}"))
+    first = domain_port + _UNICAST_OFFSET
+    discovery = range(first, domain_port + _DOMAIN_GAIN, _ID_GAIN)
+    with open("/proc/self/net/udp") as table:
+        lines = [line.split() for line in table][1:]
+    ours = [line[1] for line in lines if f"socket:[{line[9]}]" in sockets]
+    return [port for address in ours if (port := int(address.partition(":")[2], 16)) in discovery]
+
+
+def _interfaces() -> Iterator[int]:
+    with contextlib.suppress(OSError):
+        yield from (index for index, _ in socket.if_nameindex())

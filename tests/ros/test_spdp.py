@@ -1,0 +1,44 @@
+"""A participant that has just joined need not wait until those that run announce themselves."""
+
+from __future__ import annotations
+
+import socket
+import struct
+
+from fogft.ros import spdp
+
+PREFIX = slice(8, 20)  # of a message's sender, in its header
+LIMIT_S = 20.0
+
+
+def listening(domain: int, id: int) -> socket.socket:
+    """Return a socket where a domain's participant of this number hears of others."""
+    made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    made.bind(("127.0.0.1", 7400 + 250 * domain + 10 + 2 * id))
+    made.settimeout(LIMIT_S)
+    return made
+
+
+def test_what_others_answer_an_introduction_reaches_this_process(ros_domain: int) -> None:
+    """The one introduced is one that nobody has seen, is answered at its port, and takes leave."""
+    with listening(ros_domain, 60) as other, listening(ros_domain, 61) as ours:
+        introduction = spdp.Introduction(ros_domain)
+        told = other.recv(1 << 16)
+        prefix = told[PREFIX]
+        assert spdp.is_known(prefix)
+        assert told == ours.recv(1 << 16)
+        place = struct.pack("<HHi", 0x32, 24, 1)
+        (port,) = struct.unpack_from("<I", told, told.index(place) + len(place))
+        other.sendto(b"RTPS I am here, " + prefix, ("127.0.0.1", port))
+        assert ours.recv(1 << 16) == b"RTPS I am here, " + bytes(spdp.PREFIX_BYTES)
+        assert spdp.gone(prefix) in iter(lambda: other.recv(1 << 16), b"")
+        introduction.close()
+
+
+def test_a_killed_participant_is_declared_gone_once_it_is_known(ros_domain: int) -> None:
+    """An id of another middleware, or a damaged one, is not told."""
+    known = b"\x01\x0f" + bytes(range(10))
+    with listening(ros_domain, 60) as other:
+        for prefix, sent in ((known, True), (known[:-1], False), (b"\x07" + known[1:], False)):
+            assert spdp.declare_gone(prefix, ros_domain) is sent
+        assert other.recv(1 << 16) == spdp.gone(known)
