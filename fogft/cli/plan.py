@@ -22,7 +22,7 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
         bool, typer.Option("--offline", help="Use known round trips; do not measure.")
     ] = False,
     everything: Annotated[
-        bool, typer.Option("--all", help="Show every offer, not just the best of each region.")
+        bool, typer.Option("--all", help="Show every offer, and which clouds can run such a pool.")
     ] = False,
     as_json: AsJson = False,
     plot: Plot = None,

@@ -40,6 +40,10 @@ def show(shown: PlanShown, *, everything: bool = False) -> None:
     if len(listed) < len(found):
         output.data(f"and {len(found) - len(listed)} more offers in these regions (--all)")
     output.data("")
+    if everything and shown.clouds:
+        clouds = [(name, "no" if why else "yes", why) for name, why in shown.clouds.items()]
+        output.show(table(("CLOUD", "FITS", "WHY NOT"), clouds, folds=("WHY NOT",), width=width))
+        output.data("")
     for line in _summary(shown):
         by = 4 if line.startswith(" ") else _MARGIN
         output.data(line[:by] + output.indented(line[by:], by, sys.stdout))

@@ -105,6 +105,9 @@ class Accounts(Protocol):
     def left_out(self) -> Sequence[str]:
         """Return, in sentences, what was left out of the offers because it cannot be launched."""
 
+    def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
+        """Return what each cloud lacks for machines of a pool; empty where it lacks nothing."""
+
     def credentials_end_at(self) -> float | None:
         """Return when the first credentials expire, in seconds since the epoch; None for never.
 

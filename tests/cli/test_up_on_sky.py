@@ -89,6 +89,14 @@ def test_a_gateway_to_be_launched_is_shown_with_its_price(scene, file, started, 
     assert scene.sky.asked_for["ports"] == [7448]
 
 
+def test_a_plan_of_all_says_which_clouds_can_run_such_a_pool(scene, file, capsys):
+    assert main.run(["plan", str(file), "--all"]) == 0
+    shown = [line.split(maxsplit=2) for line in capsys.readouterr().out.splitlines()]
+    assert shown.index(["CLOUD", "FITS", "WHY NOT"]) > 0
+    assert ["aws", "yes"] in shown
+    assert ["lambda", "no", "no spot machines"] in shown
+
+
 def test_nothing_is_started_unasked(scene, file, started, monkeypatch, capsys):
     """No word from anybody is a no."""
     monkeypatch.setattr("sys.stdin", io.StringIO("y\n"))

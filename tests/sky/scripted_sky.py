@@ -205,6 +205,10 @@ class ScriptedSky:
         found = [o for o in self.sold if resources.get("region") in (None, o.placement.region)]
         return Sale(found, self.left_out, self.vcpus, self.quotas)
 
+    def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
+        self._meet("lacking", "")
+        return {"aws": "", "lambda": "no spot machines" if resources.get("use_spot") else ""}
+
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
         self._meet("check", "")
         return {c: self.credentials.get(c, "no such") for c in clouds or self.credentials}

@@ -21,10 +21,12 @@ from unittest import mock
 import pytest
 
 from fogft.cloud.sky import sdk, settings, task
+from fogft.cloud.sky.adapter import SkyCloud
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, Sale
 from fogft.errors import CloudError, CloudUnreachable
+from fogft.model.names import VM_CLOUDS
 from fogft.model.replica import Placement
 from tests.needs import needs
 from tests.sky.scene import Scene
@@ -463,20 +465,14 @@ def test_a_cloud_that_refuses_the_launch_is_left_out_with_the_reason(
 
 
 @needs("skypilot")
-def test_the_pages_table_of_clouds_is_what_skypilot_says(home: Path):
+def test_the_pages_table_of_clouds_is_what_skypilot_says(home: Path, tmp_path: Path):
     """Of the pool that is the default: spot machines, one port, and a machine that ends itself."""
-    import sky
-
-    from fogft.cloud.sky.catalogue import missing
-    from fogft.model.names import VM_CLOUDS
-
     page = (Path(__file__).parents[2] / "docs/how-to/clouds.md").read_text()
-    for name in VM_CLOUDS:
-        cloud = sky.CLOUD_REGISTRY.from_str(name)
-        on = {"cloud": name, "use_spot": True}
-        (wanted,) = sky.Resources.from_yaml_config(task.as_launched(on))
-        steady = missing(cloud, wanted.copy(use_spot=False))
-        why = missing(cloud, wanted)
+    cloud = SkyCloud(tmp_path / "sky", InstalledSky(), owner="ann", base=tmp_path)
+    lacking = cloud.lacking({"use_spot": True, "cpus": "2+"})
+    assert tuple(lacking) == VM_CLOUDS
+    for name, why in lacking.items():
+        steady = cloud.lacking({"use_spot": False})[name]
         default = "no" if steady else "on demand only" if why else "yes"
         assert f"| `{name}` | {default} | {why} |" in page
 

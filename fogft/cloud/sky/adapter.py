@@ -221,6 +221,11 @@ class SkyCloud:
         """See `Accounts`."""
         return self._prices.left_out()
 
+    def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
+        """See `Accounts`."""
+        asked = task.as_launched(resources)
+        return self.sky.lacking({key: asked[key] for key in task.FEATURES if key in asked})
+
     def exposures(
         self, clouds: Sequence[str], *, open_port: int | None, allow_from: Sequence[str] = ()
     ) -> Sequence[str]:

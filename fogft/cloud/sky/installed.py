@@ -32,6 +32,7 @@ from fogft.cloud.sky.sdk import (
 )
 from fogft.cloud.sky.settings import Settings, report_nothing
 from fogft.errors import CloudError
+from fogft.model.names import VM_CLOUDS
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -196,6 +197,16 @@ class InstalledSky:
             enabled = sdk.get(sdk.enabled_clouds())
             return catalogue.sale(asked, [sky.CLOUD_REGISTRY.from_str(name) for name in enabled])
         return catalogue.sale(asked, ())
+
+    @_limited(REFRESH_LIMIT_S, "the features of clouds")
+    def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
+        """Return what each cloud with VMs lacks for such a `resources` section."""
+        sky, _ = self._sky()
+        found = {}
+        for name in VM_CLOUDS:
+            (asked,) = sky.Resources.from_yaml_config({**resources, "cloud": name})
+            found[name] = catalogue.missing(sky.CLOUD_REGISTRY.from_str(name), asked)
+        return found
 
     @_limited(CHECK_LIMIT_S, "the check of credentials")
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:

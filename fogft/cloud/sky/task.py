@@ -28,6 +28,7 @@ _CHOICES = (
     *("infra", "cloud", "region", "zone", "any_of", "ordered"),
     *("instance_type", "use_spot", "accelerators"),
 )
+FEATURES = ("use_spot", "ports", "autostop")  # what a cloud may lack, whatever it sells
 _REFUSED_TASK = {
     "num_nodes": "a replica is one machine: ask for more under `fogft.replicas`",
     "service": "that section is SkyServe's: the `fogft` section takes its place",

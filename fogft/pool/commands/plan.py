@@ -35,6 +35,7 @@ class PlanShown:
 
     Attributes:
         cloud: The adapter or the table that the prices are from.
+        clouds: What each cloud lacks for such a pool; empty on the local cloud.
         distances: ``cloud/region`` -> how far it is, and how that is known.
         traffic: Service name -> what its client proxy counted, where the file says nothing.
         ready_p90_s: By when nine in ten of this pool's launches were ready; None for too few.
@@ -49,6 +50,7 @@ class PlanShown:
     traffic: Mapping[str, Measured] = field(default_factory=dict)
     ready_p90_s: float | None = None
     launches: int = 0
+    clouds: Mapping[str, str] = field(default_factory=dict)
 
 
 def plan_file(
@@ -110,8 +112,12 @@ def plan_file(
     observed = Observed(now, (), None, sold, rtt_s={r: d.rtt_s for r, d in distances.items()})
     ready_p90_s = took_s[int(0.9 * len(took_s))] if len(took_s) >= LEAST_LAUNCHES else None
     explained = explain(spec, intent, observed, history, on_demand, recovery_s=ready_p90_s)
+    clouds = (
+        seller.lacking(spec.task.get("resources") or {}) if isinstance(seller, Accounts) else {}
+    )
     return PlanShown(
-        spec, now, name, explained, distances, tuple(notes), counted, ready_p90_s, len(took_s)
+        *(spec, now, name, explained, distances, tuple(notes), counted, ready_p90_s, len(took_s)),
+        clouds=clouds,
     )
 
 
