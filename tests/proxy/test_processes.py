@@ -164,24 +164,36 @@ def what_a_dying_command_worked_on_is_answered_by_the_next(robot, replica, calle
 
 @needs("night")
 def test_client_proxies_that_were_stopped_for_long_begin_anew(parts, call):
-    """DDS may have forgotten them: the standby joins anew and takes over."""
+    """DDS may have forgotten them: the standby joins anew and takes over; the last starts anew."""
     replica = parts.replica(0)
     robot = parts.robot("robot", replica)
     caller = call(robot)
+
+    def stop_for_long(*pids: int) -> None:
+        for number, seconds in ((signal.SIGSTOP, 25.0), (signal.SIGCONT, 0.0)):
+            for pid in (*pids, replica.process.pid):
+                os.kill(pid, number)
+            time.sleep(seconds)
+
+    def works_again() -> None:
+        wait_for(lambda: robot.report().get("pid") == robot.process.pid, "its report")
+        caller.wait()
+        caller.ask(50)
+        assert caller.all_answered()
+
     standby = robot.start_standby()
-    stopped = [robot.process.pid, standby.pid, replica.process.pid]
-    for number, seconds in ((signal.SIGSTOP, 25.0), (signal.SIGCONT, 0.0)):
-        for pid in stopped:
-            os.kill(pid, number)
-        time.sleep(seconds)
+    stop_for_long(robot.process.pid, standby.pid)
     assert robot.process.wait(LIMIT_S) == 1
-    assert "handed over to its standby" in robot.config.with_suffix(".log").read_text()
+    log = robot.config.with_suffix(".log")
+    assert "handed over to its standby" in log.read_text()
     robot.process = standby
-    wait_for(lambda: robot.report().get("pid") == standby.pid, "the standby's report")
     assert replica.log.read_text().count("services_ready") == 2
-    caller.wait()
-    caller.ask(50)
-    assert caller.all_answered()
+    works_again()
+    starts = log.read_text().count("proxy_started")
+    stop_for_long(robot.process.pid)
+    wait_for(lambda: log.read_text().count("proxy_started") > starts, "its start")
+    works_again()
+    assert robot.process.poll() is None
 
 
 def test_deadly_requests_and_notices_cost_no_others_answer(parts, call):

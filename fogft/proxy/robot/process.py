@@ -11,6 +11,7 @@ import functools
 import json
 import logging
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -91,16 +92,21 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     running = _Running(
         config_path, config, metrics=metrics, lock=lock, managing=managing, early=early
     )
+    handed_over = False
     try:
         end_start()
         notify("READY=1")
         renewed = running.loop(stop)
         if renewed or stop.is_set():
-            in_line.hand_over(config, running.proxy, running.callers, running.release)
+            handed_over = in_line.hand_over(config, running.proxy, running.callers, running.release)
+        if renewed and not handed_over:
+            in_line.start_anew(running.proxy)
     finally:
         running.close()
         log.info("proxy_stopped pool=%s", config.pool)
-    if renewed:
+    if renewed and not stop.is_set():
+        if not handed_over:
+            os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
         raise RosError("this process was stopped for too long, and has handed over to its standby")
 
 
@@ -261,10 +267,10 @@ class _Running:
             disk.write_json(status, {**told, "participant": ""}, durable=False)
 
     def loop(self, stop: threading.Event) -> bool:
-        """Serve until told to stop, until the pool's folder is gone, or the standby is to go on.
+        """Serve until told to stop, until the pool's folder is gone, or another is to go on.
 
         Returns:
-            Whether the standby is to go on: see `standby.Renewal`.
+            Whether another process is to go on: see `standby.Renewal`.
         """
         proxy, config, folder = self.proxy, self.config, self.config_path.parent
         memory, watchdog = memory_tuning.Trimmer(), Watchdog()
@@ -276,7 +282,7 @@ class _Running:
         started = reported = busy = time.monotonic()
         looked = 0.0
         changed = False  # since the last report
-        participant, renewal = b"", in_line.Renewal(config.lock)
+        participant, renewal = b"", in_line.Renewal()
         while not stop.is_set():
             changed = proxy.run_once() or changed
             now = time.monotonic()

@@ -44,9 +44,10 @@ log = logging.getLogger(__name__)
 
 LOOK_S = 0.2
 BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
-RENEWED_AFTER_S = 1.0  # a pause, a standby has joined anew and is known
+RENEWED_AFTER_S = 0.5  # a pause, a standby has joined anew and is known
 KNOWN_AFTER_S = 1.0  # once it offers them and knows the callers: until they know its services
 ORDER_LIMIT_S = 20.0  # what was ordered is answered by then, or not at all
+ANEW_LIMIT_S = 2.0  # without a standby: who asks now is answered only afterwards
 FINISH_LIMIT_S = 130.0  # in all less than systemd and `fogft service install` wait
 _PACED_S = 0.5  # until responses that are spread for their client are out
 # What a client proxy imports only when it needs it.
@@ -141,18 +142,17 @@ def request_ids(key: Path, identity: Callable[[Any], Any]) -> Callable[[str, Any
 
 
 class Renewal:
-    """Says when to hand over to the standby because this process was stopped for long."""
+    """Says when to join ROS anew, as another process, because this one was stopped for long."""
 
-    def __init__(self, lock: Path) -> None:
-        self._lock = disk.standby_lock(lock)
+    def __init__(self) -> None:
         self._pauses = Pauses()
         self._at = math.inf
 
     def due(self) -> bool:
-        """Whether it is time, and there is a standby. Call it every second or more often."""
+        """Whether it is time. Call it every second or more often."""
         if self._pauses.was_long():
             self._at = time.monotonic() + RENEWED_AFTER_S
-        return time.monotonic() >= self._at and disk.is_locked(self._lock)
+        return time.monotonic() >= self._at
 
 
 def hand_over(
@@ -160,8 +160,8 @@ def hand_over(
     proxy: ClientProxy,
     callers: Callable[[], Mapping[str, int]],
     release: Callable[[], None],
-) -> None:
-    """Hand over to the standby, if there is one; return when done.
+) -> bool:
+    """Hand over to the standby; return, when done, whether there was one.
 
     Args:
         config: This proxy's. Replicas that dial in have one door, so with it nothing is shared.
@@ -172,13 +172,13 @@ def hand_over(
     lock = disk.Lock(order)
     try:
         if config.dial_in or not disk.is_locked(disk.standby_lock(config.lock)):
-            return
+            return False
         taken.unlink(missing_ok=True)
         if not lock.acquire(wait=False):
             raise BlockingIOError("another one is handing over to this one")
     except (OSError, StateError) as error:
         log.error("handover_failed reason=%r", str(error))
-        return
+        return False
     log.info("handover_began pool=%s", config.pool)
     proxy.begin_leaving()
     release()
@@ -195,6 +195,13 @@ def hand_over(
     if _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting() == 0):
         _run(proxy, _PACED_S, lambda: False)
     log.info("handover_ended pool=%s", config.pool)
+    return True
+
+
+def start_anew(proxy: ClientProxy) -> None:
+    """Answer what is under way, as far as that is soon, before this process starts anew."""
+    proxy.take_no_more()
+    _run(proxy, ANEW_LIMIT_S, lambda: proxy.waiting() == 0)
 
 
 def is_held(lock: Path) -> bool:
