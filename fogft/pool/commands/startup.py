@@ -29,6 +29,7 @@ from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
 from fogft.pool.manager import process_control
+from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 
 MANAGER_LIMIT_S = 20.0
 
@@ -38,6 +39,7 @@ def start(order: Preview) -> bool:
     disk.make_folder(home())
     store, cloud = make_store(order.spec.name), order.cloud
     write(store, order.spec, source=order.source, file=order.file.resolve(), cloud=cloud)
+    revive_client_proxy(store.paths)
     return start_manager(store)
 
 
@@ -87,6 +89,13 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
     identity = Identity(spec.name, uid, cloud, str(file), time.time())
     write_identity(paths, identity)
     return identity
+
+
+def revive_client_proxy(paths: PoolPaths) -> None:
+    """Start the client proxy where the manager was killed: it serves without one, and sooner."""
+    killed = paths.manager_start.exists() and not disk.is_locked(paths.manager_lock)
+    if killed and paths.proxy_config.exists():
+        ProxySupervisor(paths, time.monotonic).look()
 
 
 def manager_version(paths: PoolPaths, pid: int | None = None) -> str:

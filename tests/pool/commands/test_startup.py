@@ -13,6 +13,7 @@ from fogft.model import intent as intents
 from fogft.model.names import POOL_UID_PATTERN
 from fogft.pool.commands import startup
 from fogft.pool.credentials import authority
+from fogft.pool.manager import proxy_supervisor
 from fogft.poolfile import file
 from tests.pool.scene import Scene
 
@@ -115,3 +116,19 @@ def test_the_client_proxy_of_a_pool_whose_identity_was_lost_tells_nothing_of_the
         assert old.wait(20) != 0
     assert not paths.proxy_status.exists()
     assert scene.store.history().record(0, 1) is None
+
+
+@pytest.mark.parametrize("killed", [True, False])
+def test_where_the_manager_was_killed_its_client_proxy_does_not_wait_for_the_next_one(
+    scene: Scene, killed: bool
+) -> None:
+    """One that was told to end has left word that nothing is to be started."""
+    scene.write()
+    scene.paths.proxy_config.write_text("")
+    if killed:
+        proxy_supervisor.allow_restart(scene.paths, {})
+    startup.revive_client_proxy(scene.paths)
+    log = scene.paths.proxy_log
+    if killed:
+        scene.wait(lambda: str(scene.paths.proxy_config) in log.read_text())
+    assert log.exists() is killed
