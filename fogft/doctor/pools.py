@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
-from functools import partial
 from pathlib import Path
 
 from fogft import disk
@@ -75,7 +74,7 @@ def pool_file(situation: Situation) -> Iterator[Finding]:
                 "pool file", f"service `{service.name}` is forwarded without checking its type"
             )
             continue
-        problem = trouble(partial(load_service_type, service.type))
+        problem = trouble(load_service_type, service.type)
         if problem:
             yield fail(
                 "pool file",

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from fogft.errors import FrameError
 from fogft.link.frame import VERSION, check_version
 from fogft.link.port import GatewayView, Probe, ProbeAnswer
 from fogft.model.plain import as_line, from_plain, to_plain
+from fogft.records.record import read_json
 
 T = TypeVar("T")
 PROBE_LIMIT = 1024
@@ -79,21 +80,10 @@ def _encoded(value: Probe | ProbeAnswer) -> bytes:
     return json.dumps(written, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _no_constant(text: str) -> float:
-    raise ValueError(f"the number {text}")
-
-
 def _decoded(cls: type[T], frame: bytes, limit: int) -> T:
-    if len(frame) > limit:
-        raise FrameError(f"a frame of {len(frame)} bytes")
     try:
-        raw: Any = json.loads(frame.decode(), parse_constant=_no_constant)
-    except (ValueError, RecursionError) as error:
-        raise FrameError("a frame that is not JSON") from error
-    if not isinstance(raw, dict):
-        raise FrameError("a frame that is not a JSON object")
-    check_version(raw.get("v"))
-    try:
+        raw = read_json(frame, limit)
+        check_version(raw.get("v"))
         return from_plain(cls, raw)
     except ValueError as error:
         raise FrameError(str(error)) from error

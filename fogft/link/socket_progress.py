@@ -21,9 +21,9 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from statistics import median_high
 
+from fogft.counters import worth_logging
 from fogft.link.compression import Compression
 from fogft.link.window import OpenAttempt
-from fogft.log_limits import worth_logging
 
 SPAN_S = 0.5
 ENOUGH = 4  # spans, before anybody is turned away: longer than any pause that is no loss

@@ -46,44 +46,25 @@ def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str
     return digest.hexdigest()[:32]
 
 
-def slot_prefix(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key prefix of a slot, which may serve only keys below it."""
-    return f"fogft/{pool_uid}/{slot}"
+# What stands behind a slot's prefix in its keys: the queries that carry a connection's answers,
+# probes, signed records, ids of requests that are no longer wanted, and all of its services.
+ANSWERS, PROBE, RECORDS, CANCEL, SERVICES = "answers", "probe", "records", "cancel", "s/*"
+
+
+def slot_key(pool_uid: str, slot: int, what: str) -> str:
+    """Return a Zenoh key of a slot, which may serve only keys of this form."""
+    return f"fogft/{pool_uid}/{slot}/{what}"
 
 
 def service_key(pool_uid: str, slot: int, service: str, type_name: str) -> str:
     """Return the Zenoh key at which a slot receives requests of a service."""
-    return f"{slot_prefix(pool_uid, slot)}/s/{connection_id(pool_uid, slot, service, type_name)}"
+    id = connection_id(pool_uid, slot, service, type_name)
+    return slot_key(pool_uid, slot, f"s/{id}")
 
 
 def service_keys(pool_uid: str, slot: int, types: Mapping[str, str]) -> dict[str, str]:
     """Return service -> Zenoh key of a slot, from service -> type."""
     return {name: service_key(pool_uid, slot, name, kind) for name, kind in types.items()}
-
-
-def services_key(pool_uid: str, slot: int) -> str:
-    """Return the key expression of all of a slot's services."""
-    return f"{slot_prefix(pool_uid, slot)}/s/*"
-
-
-def answers_key(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key of a slot for the queries that carry a connection's answers."""
-    return f"{slot_prefix(pool_uid, slot)}/answers"
-
-
-def probe_key(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key at which a slot answers probes."""
-    return f"{slot_prefix(pool_uid, slot)}/probe"
-
-
-def records_key(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key at which a slot receives signed records, such as revocations."""
-    return f"{slot_prefix(pool_uid, slot)}/records"
-
-
-def cancel_key(pool_uid: str, slot: int) -> str:
-    """Return the Zenoh key at which a slot receives cancellations."""
-    return f"{slot_prefix(pool_uid, slot)}/cancel"
 
 
 def gateway_slot(gateway: str) -> int:

@@ -17,17 +17,17 @@ import logging
 import secrets
 import socket
 import ssl
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any, cast
 
 from fogft import disk
-from fogft.errors import CredentialError, WireError
-from fogft.log_limits import worth_logging
+from fogft.counters import Counters
+from fogft.errors import CredentialError
 from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
 from fogft.records.exchange import Connection, Exchange
 from fogft.records.greetings import oldest_of_most
+from fogft.records.listening import listening
 from fogft.records.record import RecordError, Verify, Writer
 
 log = logging.getLogger(__name__)
@@ -53,36 +53,21 @@ class RendezvousServer:
         self._credentials = credentials
         self._verify = verify
         self._exchange = exchange
-        self.counts: Counter[str] = Counter()
+        self._counters = Counters()
         self._context: ssl.SSLContext | None = None
         self._version: tuple[int, int, int] | None = None
         self._binding = b""
         self._socket: socket.socket | None = None
-        self._endpoint = listen
+        self.endpoint = listen  # ``host:port``, as bound once it is
         self._tasks: set[asyncio.Task[None]] = set()
         self._greeting: dict[asyncio.Task[None], str] = {}  # oldest first, with their hosts
-
-    @property
-    def endpoint(self) -> str:
-        """``host:port`` as bound."""
-        return self._endpoint
 
     def bind(self) -> None:
         """Bind the port."""
         self._renew_context()
-        host, _, port = self._listen.rpartition(":")
-        try:
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            address = host.strip("[]"), int(port)
-            self._socket = socket.create_server(address, family=family, backlog=128)
-            self._socket.setblocking(False)
-        except (OSError, ValueError, OverflowError) as error:
-            words = getattr(error, "strerror", None) or str(error)
-            raise WireError(
-                f"cannot listen at `{self._listen}`: {words}",
-                "give `host:port` with a free port, for instance `0.0.0.0:7450`",
-            ) from error
-        self._endpoint = f"{host}:{self._socket.getsockname()[1]}"
+        self._socket = listening(self._listen)
+        self._socket.setblocking(False)
+        self.endpoint = f"{self._listen.rpartition(':')[0]}:{self._socket.getsockname()[1]}"
 
     async def serve(self) -> None:
         """Accept callers until cancelled."""
@@ -126,7 +111,7 @@ class RendezvousServer:
         except (OSError, EOFError) as error:  # TLS errors are OSErrors
             self._count("tls_failed", f"{host}: {error}")
         else:
-            self.counts["admitted"] += 1
+            self._counters.add("admitted")
             log.info("caller_admitted name=%s host=%s", connection.name, host)
             await self._exchange.keep(connection)
             log.info("caller_left name=%s host=%s", connection.name, host)
@@ -195,10 +180,7 @@ class RendezvousServer:
         self._binding = binding_of(der)
 
     def _count(self, event: str, detail: str) -> None:
-        self.counts[event] += 1
-        count = self.counts[event]
-        if worth_logging(count):
-            log.warning("caller_refused event=%s count=%d detail=%r", event, count, detail[:200])
+        self._counters.warn(log, event, "caller_refused event=%s detail=%r", event, detail[:200])
 
     def report(self) -> Mapping[str, Any]:
         """Return the counters, for people."""
@@ -206,7 +188,7 @@ class RendezvousServer:
         return {
             "callers": len(exchange),
             "records": len(exchange.records),
-            "port": dict(self.counts),
+            "port": dict(self._counters.snapshot()),
             "messages": dict(exchange.counts),
             "offered": dict(exchange.records.counts),
         }

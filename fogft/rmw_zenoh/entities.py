@@ -19,11 +19,10 @@ from typing import Any, NamedTuple
 import zenoh
 from zenoh import handlers
 
+from fogft.counters import Counters
 from fogft.errors import RosError, Unreadable
-from fogft.link.counters import Counters
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.work_queue import WorkQueue
-from fogft.log_limits import worth_logging
 from fogft.rmw_zenoh import naming
 from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.pacing.pacer import Pacer
@@ -67,7 +66,7 @@ class Server:
         self._faces: dict[str, tuple[Any, Any]] = {}
         self.name, self.type = token("").service, token("").type
         self._pacer = Pacer(self._reply, probes, self.name, client_of=lambda h: h.client)
-        self._worker = _worker(self.name)
+        self._worker = _worker(self.name, Counters())
         self._declare(hash)
 
     def clients_hash(self, hash: str) -> None:
@@ -179,10 +178,10 @@ class Client:
         self._told: tuple[naming.Token, Any] | None = None
         self._waiting: dict[int, _Waiting] = {}
         self._asked = 0
-        self._errors = 0
+        self._counters = Counters()
         self.is_open = True  # whether it may still be called with
         self._lock = threading.Lock()
-        self._worker = _worker(self._name)
+        self._worker = _worker(self._name, self._counters)
 
     def available(self) -> bool:
         """Whether any node offers this service."""
@@ -243,10 +242,7 @@ class Client:
     def _replied(self, ticket: int, reply: Any) -> None:
         threads.note()
         if reply.ok is None:
-            self._errors += 1
-            if worth_logging(self._errors):
-                log.warning("%s: an error came for a response (%d so far)", self._name,
-                            self._errors)  # fmt: skip
+            self._counters.warn(log, "errors", "%s: an error came for a response", self._name)
             return
         with self._lock:
             waiting = self._waiting.pop(ticket, None)
@@ -286,8 +282,8 @@ class Client:
             self._told = None
 
 
-def _worker(service: str) -> WorkQueue:
-    worker = WorkQueue(f"rmw{service}", Counters())
+def _worker(service: str, counters: Counters) -> WorkQueue:
+    worker = WorkQueue(f"rmw{service}", counters)
     worker.start()
     return worker
 

@@ -11,13 +11,12 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from functools import partial
 from typing import Any
 
 from fogft.errors import RosError
 from fogft.model.type_definition import nested
 from fogft.ros.messages import from_bytes
-from fogft.ros.types import load_service_type, nested_type, trouble
+from fogft.ros.types import load_service_type, nested_type
 
 _FLOAT = re.compile(r"(sequence<)?(float|double)\b.*")  # one, or a list of them
 
@@ -93,8 +92,3 @@ def _check_float(message_type: Any, type_name: str, path: str) -> None:
             f"the response of `{type_name}` has no float field `{path}`",
             "write the path from the response, such as `plan.poses.pose.position.x`",
         )
-
-
-def check_tolerances(type_name: str, tolerances: Mapping[str, float]) -> str | None:
-    """Return why responses cannot be compared with these tolerances, with a hint; else None."""
-    return trouble(partial(Comparison, type_name, tolerances))

@@ -15,8 +15,8 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from fogft.counters import Counters
 from fogft.errors import RosError
-from fogft.log_limits import worth_logging
 from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import OnBurst
@@ -27,19 +27,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 BURST = 128  # messages taken from one entity before the others get their turn
-
-
-class _Unreadable:
-    """Counts what could not be taken; logs the 1st, 2nd, 4th, 8th, ..."""
-
-    def __init__(self, name: str) -> None:
-        self._name = name
-        self._count = 0
-
-    def __call__(self, error: RosError) -> None:
-        self._count += 1
-        if worth_logging(self._count):
-            log.warning("%s: %s (%d so far)", self._name, error.message, self._count)
 
 
 class Server:
@@ -63,7 +50,7 @@ class Server:
         self._on_request = on_request
         self._on_burst = on_burst
         self._withdraw = withdraw
-        self._unreadable = _Unreadable(service.srv_name)
+        self._counters = Counters()
         self.mismatch = mismatch
         self._in_bursts = False  # several came together the last time
         self._lock = threading.Lock()
@@ -116,7 +103,7 @@ class Server:
         try:
             return self.take()
         except RosError as error:
-            self._unreadable(error)
+            self._counters.warn(log, "unreadable", "%s: %s", self._service.srv_name, error.message)
             return None
 
     def _deliver(self, taken: tuple[bytes, Any], *, together: bool = False) -> None:
@@ -164,7 +151,7 @@ class Client:
         self.take = end.take
         self._withdraw = withdraw
         self._pending: dict[int, Callable[[bytes], None]] = {}
-        self._unreadable = _Unreadable(client.srv_name)
+        self._counters = Counters()
         self._lock = threading.Lock()
 
     def available(self) -> bool:
@@ -214,7 +201,9 @@ class Client:
             try:
                 taken = self.take()
             except RosError as error:
-                self._unreadable(error)
+                self._counters.warn(
+                    log, "unreadable", "%s: %s", self._client.srv_name, error.message
+                )
                 return
             if taken is None:
                 return

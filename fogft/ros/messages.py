@@ -11,12 +11,12 @@ which status counts (`fogft.topics.goals`).
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any
 
 from fogft.errors import RosError, Unreadable
 from fogft.model.cdr import NUMBER_BYTES, Shape
-from fogft.ros.types import load_service_type, shape, trouble
+from fogft.ros.types import load_service_type, shape
 from fogft.topics import goals
 
 _XCDR1_HEADERS = (b"\x00\x00", b"\x00\x01")  # big and little endian
@@ -97,11 +97,6 @@ def fixed_offset(fields: dict[str, str], field: str) -> int | None:
             return 4 + offset  # after the header, from which alignment is counted
         offset += size
     return None
-
-
-def check_ok_field(name: str, field: str) -> str | None:
-    """Return why a type's response lacks a boolean field, with a hint; None if it has it."""
-    return trouble(partial(bool_field, name, field))
 
 
 def merged_status(said: Mapping[int, bytes]) -> bytes | None:

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import array
 import re
-from functools import partial
 from typing import Any
 
 from fogft.errors import RosError
 from fogft.model.state import StateService, StateSpec
 from fogft.ros.messages import from_bytes, to_bytes
-from fogft.ros.types import load_service_type, trouble
+from fogft.ros.types import load_service_type
 
 _SEQUENCE = re.compile(r"sequence<(octet|uint8|int8|char)(?:, \d+)?>")
 _TEXT = re.compile(r"string(?:<\d+>)?")
@@ -121,8 +120,3 @@ def _no_field(where: StateService, part: str, path: str) -> RosError:
         f"the {part} of `{where.type}` has no text or byte field `{path}`",
         "name a field of type `string`, `uint8[]`, `int8[]`, `char[]` or `byte[]`",
     )
-
-
-def check_state(spec: StateSpec) -> str | None:
-    """Return why a service's state cannot be carried by its types, with a hint; else None."""
-    return trouble(partial(StateBytes, spec))

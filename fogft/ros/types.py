@@ -16,7 +16,6 @@ import os
 import re
 import sys
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +68,15 @@ def load_message_type(name: str) -> Any:
     return message_type
 
 
-def check_type(name: str) -> str | None:
-    """Return why a service or message type cannot be loaded, with a hint; None if it can."""
-    return trouble(partial(load_message_type if "/msg/" in name else load_service_type, name))
+def load_type(name: str) -> Any:
+    """Return the Python class of a service or message type. Raises RosError."""
+    return load_message_type(name) if "/msg/" in name else load_service_type(name)
 
 
-def trouble(make: Callable[[], object]) -> str | None:
+def trouble(make: Callable[..., object], *arguments: Any) -> str | None:
     """Return why a ROS object cannot be created here, with a hint; None if it can."""
     try:
-        make()
+        make(*arguments)
     except RosError as error:
         return told(error)
     except ImportError as error:

@@ -62,10 +62,11 @@ def greets(session: zenoh.Session, files: CredentialPaths, at: Target) -> bytes:
     knows(session, at.peer.id.slot, at.peer.id.pool_uid)
     token = bytes(range(8))
     signed = greeting(Signer(files.certificate, files.key), at, token)
-    (said,) = session.get(names.probe_key(*at.place), payload=PROBE, attachment=signed)
+    (said,) = session.get(names.slot_key(*at.place, names.PROBE), payload=PROBE, attachment=signed)
     assert said.ok is not None
     bare = frame.encode_greeting(frame.Greeting(token))
-    session.get(names.answers_key(*at.place), lambda reply: None, attachment=bare, timeout=1e6)
+    answers = names.slot_key(*at.place, names.ANSWERS)
+    session.get(answers, lambda reply: None, attachment=bare, timeout=1e6)
     time.sleep(0.3)
     return token
 
@@ -83,12 +84,12 @@ def sends(
     cancel = frame.encode_cancel([request_id(1), request_id(2)])
     bare = frame.encode_greeting(frame.Greeting(token))
     probe = probe_frames.encode_probe(Probe("eve", describe=True))
-    asked = [(names.probe_key, probe), (names.records_key, b"{}"), (names.answers_key, b"")]
+    asked = [(names.PROBE, probe), (names.RECORDS, b"{}"), (names.ANSWERS, b"")]
 
     def send() -> None:
         kind = dice.randrange(10)
         if kind < 8:
-            to = names.cancel_key(*at.place) if kind == 0 else at.key
+            to = names.slot_key(*at.place, names.CANCEL) if kind == 0 else at.key
             payload = damaged((cancel if kind == 0 else content,), dice)
             head = dice.choice((*requests, packed))
             attachment = damaged((head,), dice) if kind < 6 else head
@@ -98,7 +99,7 @@ def sends(
             # Not the last as it should be: who asks for answers anew ends those to himself.
             key, payload = dice.choice(asked[:-1] if token in hello else asked)
             session.get(
-                key(*at.place),
+                names.slot_key(*at.place, key),
                 lambda reply: None,
                 payload=damaged((payload,), dice),
                 attachment=hello,

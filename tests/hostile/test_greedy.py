@@ -69,7 +69,7 @@ def greet(session: zenoh.Session, at: Target, signer: Signer, token: bytes) -> N
     """Greet under a token, and ask for its answers to come; waits for neither."""
     signed = greeting(signer, at, token)
     bare = frame.encode_greeting(frame.Greeting(token))
-    key, answers = names.probe_key(*at.place), names.answers_key(*at.place)
+    key, answers = names.slot_key(*at.place, names.PROBE), names.slot_key(*at.place, names.ANSWERS)
     session.get(key, lambda reply: None, payload=PROBE, attachment=signed, timeout=60.0)
     session.get(answers, lambda reply: None, attachment=bare, timeout=60.0)
 
@@ -106,7 +106,7 @@ def flood(
 ) -> None:
     """Greet as fast as the replica takes it, waiting for nothing."""
     signed = greeting(Signer(files.certificate, files.key), at, bytes(7) + b"f")
-    key = names.probe_key(*at.place)
+    key = names.slot_key(*at.place, names.PROBE)
     while not done.is_set():
         with contextlib.suppress(zenoh.ZError):
             session.get(key, lambda reply: None, payload=PROBE, attachment=signed, timeout=5.0)

@@ -82,10 +82,10 @@ def hears(session: zenoh.Session, key: str) -> None:
 
 def knows(session: zenoh.Session, slot: int, pool_uid: str = POOL_UID) -> None:
     """Wait until a session knows all that a replica or gateway hears; what it declares last."""
-    querier = session.declare_querier(names.probe_key(pool_uid, slot))
+    querier = session.declare_querier(names.slot_key(pool_uid, slot, names.PROBE))
     wait_for(lambda: querier.matching_status.matching)  # type: ignore[attr-defined]
     querier.undeclare()  # type: ignore[no-untyped-call]
-    hears(session, names.cancel_key(pool_uid, slot))
+    hears(session, names.slot_key(pool_uid, slot, names.CANCEL))
 
 
 def request_id(number: int) -> bytes:

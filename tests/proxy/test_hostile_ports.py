@@ -182,7 +182,7 @@ def test_a_replayed_membership_at_a_gateways_port(scene):
     nobody = admission_content(Membership("p", POOL_UID, 1, 1, ()))
     elsewhere = Member(ReplicaId(POOL_UID, 0, 1), "127.0.0.1:1")
     admitted = admission_content(Membership("p", POOL_UID, 1, 2, (elsewhere,)))
-    key, held = names.records_key(POOL_UID, SLOT), []
+    key, held = names.slot_key(POOL_UID, SLOT, names.RECORDS), []
 
     with scene.unchanged(), scene.session(eve) as session:
         knows(session, SLOT)

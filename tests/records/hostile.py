@@ -105,8 +105,9 @@ def _asked(key: str) -> Send:
 
 def messages(slot: int, service_key: str) -> Iterator[tuple[Send, bytes, bytes | None]]:
     """Return how, payload and attachment of what cannot be read, on every key there is."""
-    probe, cancel = _asked(names.probe_key(POOL_UID, slot)), names.cancel_key(POOL_UID, slot)
-    records = _asked(names.records_key(POOL_UID, slot))
+    probe = _asked(names.slot_key(POOL_UID, slot, names.PROBE))
+    cancel = names.slot_key(POOL_UID, slot, names.CANCEL)
+    records = _asked(names.slot_key(POOL_UID, slot, names.RECORDS))
     header = frame.encode_request(request_id(1), 5.0, frame.origin("eve", bytes(8)))
     greeting = frame.encode_greeting(frame.Greeting(bytes(8), b"c" * 500, b"s" * 70))
     for content in (header[:10], header + bytes(100), b"\x07" + header[1:], os.urandom(40)):
@@ -117,7 +118,7 @@ def messages(slot: int, service_key: str) -> Iterator[tuple[Send, bytes, bytes |
     for payload in (b"", b"{}", b"[" * 5000, b'{"v":9,"robot":"eve"}', bytes(100_000)):
         yield probe, payload, greeting
     for content in (None, b"", greeting[:5], b"\x07" + greeting[1:], bytes(5000)):
-        yield _asked(names.answers_key(POOL_UID, slot)), b"", content
+        yield _asked(names.slot_key(POOL_UID, slot, names.ANSWERS)), b"", content
     for payload in (b"", b"\x07", bytes(100_000)):
         yield _published(cancel), payload, None
     token = frame.encode_greeting(frame.Greeting(bytes(8)))

@@ -7,7 +7,8 @@ import math
 import pytest
 
 from fogft.errors import RosError
-from fogft.ros.comparison import Comparison, check_tolerances
+from fogft.ros.comparison import Comparison
+from fogft.ros.types import trouble
 
 pytestmark = pytest.mark.ros
 
@@ -93,10 +94,10 @@ def test_noise_is_no_response():
     "path", ["plan", "plan.header.frame_id", "plan.poses.x", "no_such", "plan.header.stamp.sec"]
 )
 def test_only_floats_have_tolerances(path):
-    reason = check_tolerances(PLAN, {path: 0.1})
+    reason = trouble(Comparison, PLAN, {path: 0.1})
     assert reason is not None
     assert f"`{path}`; " in reason
 
 
 def test_paths_lead_through_lists():
-    assert check_tolerances(PLAN, {X: 0.1}) is None
+    assert trouble(Comparison, PLAN, {X: 0.1}) is None

@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from fogft.errors import SpecError
 from fogft.model import ros_names
+from fogft.pool.commands.preview import checks_here
 from fogft.poolfile import file
-from fogft.poolfile.pool import Checks
-from fogft.ros import messages, types
+from fogft.ros.messages import bool_field
+from fogft.ros.types import trouble
 from tests.needs import need
 
 pytestmark = pytest.mark.ros
@@ -51,7 +52,7 @@ def test_the_longest_name_that_we_accept_is_accepted_by_ros():
 def fault(service):
     source = f"run: x\nfogft:\n  services: [{{name: a, {service}}}]\n"
     with pytest.raises(SpecError) as caught:
-        file.parse(source, "p.yaml", Checks(types.check_type, messages.check_ok_field))
+        file.parse(source, "p.yaml", checks_here())
     return caught.value.message, caught.value.hint
 
 
@@ -71,4 +72,4 @@ def test_a_field_that_is_not_boolean():
 
 
 def test_a_boolean_field_and_its_type():
-    assert messages.check_ok_field("std_srvs/srv/SetBool", "success") is None
+    assert trouble(bool_field, "std_srvs/srv/SetBool", "success") is None

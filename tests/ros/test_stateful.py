@@ -6,8 +6,9 @@ import pytest
 
 from fogft.errors import RosError
 from fogft.model.state import FIELD, RESTORE_TYPE, SNAPSHOT_TYPE, StateService, StateSpec
-from fogft.ros.state_bytes import StateBytes, check_state
+from fogft.ros.state_bytes import StateBytes
 from fogft.ros.stateful import AttributeState, StateServices
+from fogft.ros.types import trouble
 
 pytestmark = pytest.mark.ros
 
@@ -116,11 +117,11 @@ def test_text_fields_carry_text_and_a_refusal_its_message():
     ],
 )
 def test_what_cannot_carry_a_state_is_told_with_what_to_do(out, into, what):
-    reason = check_state(spec(out, into))
+    reason = trouble(StateBytes, spec(out, into))
     assert reason is not None
     assert what in reason
     assert "; " in reason
 
 
 def test_the_defaults_are_usable():
-    assert check_state(DEFAULT) is None
+    assert trouble(StateBytes, DEFAULT) is None

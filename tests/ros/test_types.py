@@ -49,7 +49,7 @@ def test_a_wrong_type_says_what_is_wrong_and_what_to_do(name: str, message: str,
 
 
 def test_a_good_type_has_nothing_against_it() -> None:
-    assert types.check_type(SET_BOOL) is None
+    assert types.trouble(types.load_type, SET_BOOL) is None
     assert types.load_service_type(SET_BOOL).Request().data is False
 
 
@@ -90,8 +90,8 @@ def test_a_type_without_its_c_library_is_an_error(
 def test_checking_a_type_does_not_start_ros() -> None:
     """The pool file's reader checks types: that must stay cheap."""
     code = (
-        "import sys; from fogft.ros.types import check_type as check\n"
-        f"assert check('{SET_BOOL}') is None\n"
+        "import sys; from fogft.ros.types import load_type, trouble\n"
+        f"assert trouble(load_type, '{SET_BOOL}') is None\n"
         "assert 'rclpy' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=100)

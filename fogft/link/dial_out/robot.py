@@ -22,15 +22,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 
-from fogft.errors import WireError
-from fogft.link.counters import Counters
+from fogft.counters import Counters
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.tunnel import Tunnels, hang_up, keep_alive
 from fogft.model.credentials import Role, holder_of
-from fogft.model.names import host_and_port
 from fogft.model.replica import ReplicaId
 from fogft.records import frames
 from fogft.records.greetings import oldest_of_most
+from fogft.records.listening import listening
 from fogft.records.record import RecordError, Verify
 
 log = logging.getLogger(__name__)
@@ -87,7 +86,7 @@ class DialIn:
         self._tunnels = Tunnels()
         self._greeting: dict[socket.socket, str] = {}  # oldest first, with their hosts
         self._closed = False
-        self._door = _listening(listen)
+        self._door = listening(listen)
         host, port = listen.rpartition(":")[0], self._door.getsockname()[1]
         self.endpoint = f"{host}:{port}"
         threading.Thread(target=self._accept, name="fogft-dial-in", daemon=True).start()
@@ -215,7 +214,7 @@ class DialIn:
         with self._lock:
             port = self._local.get(id)
             if port is None:
-                port = self._local[id] = _listening("127.0.0.1:0")
+                port = self._local[id] = listening("127.0.0.1:0")
                 threading.Thread(
                     target=self._accept_local, args=(id, port), name="fogft-door", daemon=True
                 ).start()
@@ -305,19 +304,3 @@ def _drained(link: socket.socket) -> bool:
                 return False
     except OSError:
         return False
-
-
-def _listening(listen: str) -> socket.socket:
-    try:
-        host, port = host_and_port(listen)
-        bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
-        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind((host, port))
-        bound.listen(64)
-    except (OSError, ValueError, OverflowError) as error:
-        words = getattr(error, "strerror", None) or str(error)
-        raise WireError(
-            f"cannot listen at `{listen}` for replicas that dial in: {words}",
-            "give `host:port` with a free port",
-        ) from error
-    return bound

@@ -79,7 +79,7 @@ def robot_settings(
     peer: Peer, credentials: CredentialPaths, settings: LinkSettings
 ) -> dict[str, Any]:
     """Return the settings of a robot's session towards one replica."""
-    keys = f"{names.slot_prefix(peer.id.pool_uid, peer.id.slot)}/**"
+    keys = names.slot_key(peer.id.pool_uid, peer.id.slot, "**")
     # Of an IPv6 address in brackets Zenoh makes a name for TLS that is none; without, it reads it.
     endpoint = peer.endpoint.replace("[", "").replace("]", "")
     return {
@@ -118,7 +118,7 @@ def replica_settings(
     listen: str, id: ReplicaId, credentials: CredentialPaths, settings: LinkSettings
 ) -> dict[str, Any]:
     """Return the settings of a replica's session, which listens at ``host:port``."""
-    keys = f"{names.slot_prefix(id.pool_uid, id.slot)}/**"
+    keys = names.slot_key(id.pool_uid, id.slot, "**")
     return {
         **_common(settings),
         # Not `router`: that would carry robots' messages to each other.

@@ -15,7 +15,7 @@ from queue import SimpleQueue
 
 import zenoh
 
-from fogft.link.counters import Counters
+from fogft.counters import Counters
 
 log = logging.getLogger(__name__)
 

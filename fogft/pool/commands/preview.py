@@ -10,6 +10,7 @@ import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from fogft.cloud.port import Accounts
@@ -201,12 +202,13 @@ def _tested(
 
 def checks_here() -> Checks:
     """Return the checks that depend on this machine: installed types and their fields."""
-    from fogft.ros.comparison import check_tolerances
-    from fogft.ros.messages import check_ok_field
-    from fogft.ros.state_bytes import check_state
-    from fogft.ros.types import check_type
+    from fogft.ros.comparison import Comparison
+    from fogft.ros.messages import bool_field
+    from fogft.ros.state_bytes import StateBytes
+    from fogft.ros.types import load_type, trouble
 
-    return Checks(check_type, check_ok_field, check_state, check_tolerances)
+    made = (load_type, bool_field, StateBytes, Comparison)
+    return Checks(*(partial(trouble, make) for make in made))
 
 
 def mistakes(file: Path) -> list[SpecError]:

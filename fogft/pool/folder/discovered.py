@@ -7,7 +7,6 @@ Not here: how it grows (`fogft.planning.observed.services`).
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from fogft import disk
@@ -88,4 +87,4 @@ def _check(name: str, kind: str, *, load: bool) -> str:
             return "its name is not absolute"
     except ValueError as error:
         return str(error)
-    return (trouble(partial(load_service_type, kind)) if load else None) or ""
+    return (trouble(load_service_type, kind) if load else None) or ""

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
+from fogft.counters import worth_logging
 from fogft.errors import RosError
-from fogft.log_limits import worth_logging
 from fogft.metrics.outcomes import Outcome
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.request import Ledger, Request

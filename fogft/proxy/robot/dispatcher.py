@@ -23,9 +23,9 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from typing import Any
 
+from fogft.counters import worth_logging
 from fogft.errors import RosError
 from fogft.link.port import Answer, Link
-from fogft.log_limits import worth_logging
 from fogft.metrics.outcomes import Outcome
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal

@@ -192,7 +192,8 @@ class _Running:
         managing: ManagerRestart,
         early: EarlyJoin | None,
     ) -> None:
-        from fogft.ros.messages import check_ok_field, merged_status
+        from fogft.ros.messages import bool_field, merged_status
+        from fogft.ros.types import trouble
 
         began = time.monotonic()
         self.config_path, self.metrics, self.config = config_path, metrics, config
@@ -221,7 +222,8 @@ class _Running:
             config.pool_uid, joined.node, self.dialer, make, define=joined.define, merge=merge
         )
         made.append(proxy)
-        self.seen = SeenFromRos(config.pool, config.robot, self._make_visible, check_ok_field)
+        check_field = functools.partial(trouble, bool_field)
+        self.seen = SeenFromRos(config.pool, config.robot, self._make_visible, check_field)
         proxy.serve(self.seen.follow(config.services))
         proxy.pass_topics(config.topics, cast("SerialisedNode", joined.node))
         self.following = Following(config)

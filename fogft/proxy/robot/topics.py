@@ -14,9 +14,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
+from fogft.counters import worth_logging
 from fogft.errors import FrameError, RosError, Unreadable
 from fogft.link.port import Answer, Link
-from fogft.log_limits import worth_logging
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Refusal
 from fogft.model.replica import short

@@ -188,9 +188,9 @@ def test_who_did_not_greet_is_refused_and_counted(
     bare = frame.encode_greeting(frame.Greeting(bytes(8)))
     probe = b'{"v":%d,"robot":"ada"}' % frame.VERSION
     tries = [
-        (names.probe_key(POOL_UID, 0), probe, frame.encode_greeting(forged)),
-        (names.probe_key(POOL_UID, 0), probe, bare),
-        (names.answers_key(POOL_UID, 0), b"", bare),
+        (names.slot_key(POOL_UID, 0, names.PROBE), probe, frame.encode_greeting(forged)),
+        (names.slot_key(POOL_UID, 0, names.PROBE), probe, bare),
+        (names.slot_key(POOL_UID, 0, names.ANSWERS), b"", bare),
     ]
     try:
         for sent, (key, payload, attachment) in enumerate(tries, 1):

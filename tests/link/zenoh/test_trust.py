@@ -204,7 +204,7 @@ def test_nothing_is_sent_to_an_impostor_after_a_reconnect(
     settings = config.robot_settings(peer(replica.endpoint), authority.robot(), LinkSettings())
     session = zenoh.open(config.to_zenoh(settings))
     try:
-        probe_key = names.probe_key(POOL_UID, 0)
+        probe_key = names.slot_key(POOL_UID, 0, names.PROBE)
 
         def heard() -> bool:
             list(session.get(probe_key, payload=b"{}", timeout=5.0))
@@ -239,7 +239,7 @@ def test_a_robot_that_did_not_greet_is_neither_heard_nor_told_anything(
         listener = session.declare_subscriber("**", stolen.append)
         away = zenoh.Locality.REMOTE
         session.put(keys(0)[SERVICE], b"published", allowed_destination=away)
-        for key in (names.probe_key(POOL_UID, 1), "@/**"):
+        for key in (names.slot_key(POOL_UID, 1, names.PROBE), "@/**"):
             assert list(session.get(key, timeout=1.0, allowed_destination=away)) == []
         link = dial(replica.endpoint)
         wait_for(lambda: link.usable)

@@ -6,7 +6,7 @@ import logging
 import threading
 from functools import partial
 
-from fogft.link.counters import Counters
+from fogft.counters import Counters
 from fogft.link.zenoh.work_queue import LANES_LIMIT, LIMIT, WorkQueue
 from tests.link.wire_pool import LIMIT_S, wait_for
 

@@ -59,7 +59,7 @@ def test_every_name_of_a_replica_gives_its_id_back(slot: int, generation: int) -
 def test_slots_have_connections_and_keys_of_their_own() -> None:
     """Below all gateways' slots."""
     keys = {names.service_key(UID, slot, "/plan", "T") for slot in SOME}
-    keys |= {names.probe_key(UID, slot) for slot in SOME}
+    keys |= {names.slot_key(UID, slot, names.PROBE) for slot in SOME}
     assert len(keys) == 2 * len(SOME)
     assert max(SOME) < names.GATEWAY_SLOTS <= names.gateway_slot("edge")
 

@@ -24,7 +24,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 
-from fogft.link.counters import Counters
+from fogft.counters import Counters
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S

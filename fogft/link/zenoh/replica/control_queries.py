@@ -15,10 +15,10 @@ from functools import partial
 
 import zenoh
 
+from fogft.counters import Counters
 from fogft.errors import FrameError
 from fogft.link import frame, probe_frames
 from fogft.link.compression import ACCEPTED
-from fogft.link.counters import Counters
 from fogft.link.port import Probe, ProbeAnswer
 from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues

@@ -14,7 +14,6 @@ Owns: the session, its queryables, the reply threads. Not here: what a request i
 from __future__ import annotations
 
 import logging
-import socket
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TypeVar
@@ -22,10 +21,10 @@ from typing import TypeVar
 import zenoh
 from zenoh import handlers
 
+from fogft.counters import Counters
 from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
 from fogft.link.compression import Unpacker
-from fogft.link.counters import Counters
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import sockets, threads
 from fogft.link.zenoh.handshakes import HandshakeLog
@@ -42,6 +41,7 @@ from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
+from fogft.records.listening import listening
 from fogft.records.record import Record, RecordKind
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import LazyVerifier
@@ -147,13 +147,13 @@ class ZenohListener:
             stuck_after_s=self._settings.stuck_after_s,
         )
         self.add(services)
-        place = self._id.pool_uid, self._id.slot
-        self._hear(session, names.services_key(*place), partial(self._request, on_request))
-        self._hear(session, names.cancel_key(*place), partial(self._cancel, on_cancel))
-        self._declare(session, names.answers_key(*place), self._control.open_answers)
-        self._declare(session, names.records_key(*place), self._control.records)
+        key = partial(names.slot_key, self._id.pool_uid, self._id.slot)
+        self._hear(session, key(names.SERVICES), partial(self._request, on_request))
+        self._hear(session, key(names.CANCEL), partial(self._cancel, on_cancel))
+        self._declare(session, key(names.ANSWERS), self._control.open_answers)
+        self._declare(session, key(names.RECORDS), self._control.records)
         # Last: who is told that this replica is ready finds every service.
-        self._declare(session, names.probe_key(*place), partial(self._control.probe, on_probe))
+        self._declare(session, key(names.PROBE), partial(self._control.probe, on_probe))
 
     def add(self, services: Mapping[str, str]) -> None:
         """Serve further services too (name -> key); only after `serve`."""
@@ -331,10 +331,5 @@ def _with_port(listen: str) -> str:
     if int(port) != 0:
         return listen
     # Zenoh does not tell which port it was given, so we ask the kernel for a free one first.
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    try:
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
-            probe.bind((host.strip("[]"), 0))
-            return f"{host}:{probe.getsockname()[1]}"
-    except OSError as error:
-        raise WireError(f"cannot listen at `{listen}`: {error.strerror or error}") from error
+    with listening(listen) as probe:
+        return f"{host}:{probe.getsockname()[1]}"

@@ -23,9 +23,9 @@ from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 
+from fogft.counters import Counters
 from fogft.link import batch_frames, frame
 from fogft.link.compression import Compression
-from fogft.link.counters import Counters
 from fogft.link.credit import SMALL_BYTES
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S

@@ -124,8 +124,8 @@ class Connection:
         greeting = frame.Greeting(self._token, self.certificate, signature)
         self._greeting = frame.encode_greeting(greeting)
         self._bare = frame.encode_greeting(frame.Greeting(self._token))
-        self._cancel_key = zenoh.KeyExpr(names.cancel_key(peer.id.pool_uid, peer.id.slot))
-        self._answers_key = names.answers_key(peer.id.pool_uid, peer.id.slot)
+        key = partial(names.slot_key, peer.id.pool_uid, peer.id.slot)
+        self._cancel_key, self._answers_key = zenoh.KeyExpr(key(names.CANCEL)), key(names.ANSWERS)
         self.lost_because = ""
         self.told = b""
         self._session = zenoh.open(config)

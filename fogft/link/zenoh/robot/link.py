@@ -328,7 +328,8 @@ class ZenohLink:
         records, id = self._shared.records, self.peer.id
         if records != connection.told:
             newer = partial(self._shared.newer.__setitem__, id.slot)
-            connection.tell_records(names.records_key(id.pool_uid, id.slot), records, newer)
+            key = names.slot_key(id.pool_uid, id.slot, names.RECORDS)
+            connection.tell_records(key, records, newer)
 
     def _renewal_due(self, now: float) -> bool:
         if self._renew_at is not None and now >= self._renew_at:

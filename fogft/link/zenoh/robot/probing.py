@@ -81,7 +81,7 @@ class Probing:
     def __init__(self, peer: Peer, came: Callable[[], None]) -> None:
         self._peer = peer
         self._came = came
-        self._key = names.probe_key(peer.id.pool_uid, peer.id.slot)
+        self._key = names.slot_key(peer.id.pool_uid, peer.id.slot, names.PROBE)
         self._queue: SimpleQueue[Heard] = SimpleQueue()
         self._of_replica = Silence()
         self.silent_s = self._of_replica.for_s  # for how long the replica has been

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from fogft.link.counters import Counters
+from fogft.counters import Counters
 from fogft.link.zenoh.replica import reply_queue
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from tests.link.wire_pool import wait_for

@@ -7,7 +7,7 @@ import signal
 import sys
 from collections.abc import Callable
 
-from fogft.link.counters import Counters
+from fogft.counters import Counters
 from fogft.link.frame import Greeting
 from fogft.link.zenoh.replica.control_queries import ControlQueries
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns

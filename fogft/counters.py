@@ -10,7 +10,10 @@ import threading
 from collections import Counter
 from collections.abc import Mapping
 
-from fogft.log_limits import worth_logging
+
+def worth_logging(count: int) -> bool:
+    """Whether to log the `count`-th event of its kind: the 1st, 2nd, 4th, 8th, ..."""
+    return count > 0 and count & (count - 1) == 0
 
 
 class Counters:

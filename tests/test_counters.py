@@ -1,6 +1,6 @@
-"""Which of many like events are logged."""
+"""Counting events, and which of many like ones are logged."""
 
-from fogft.log_limits import worth_logging
+from fogft.counters import worth_logging
 
 
 def test_the_1st_2nd_4th_8th_and_so_on_are_logged() -> None:
