@@ -20,23 +20,26 @@ from tests.hostile.robot import PROBE, Target, greeting, greets, session_at, tar
 from tests.link.wire_pool import SERVICE, Authority, Owner, ReplicaProcess, request_id, wait_for
 from tests.nightly import by_day
 
-SESSIONS = 140  # a replica has room for 128
+ROOM = 40  # for sessions, at a replica
+SESSIONS = 48
 
 
 def test_a_robot_that_opens_all_connections_keeps_no_other_out(
     authority: Authority,
-    replica: ReplicaProcess,
-    good: ZenohLink,
+    start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
     owner: Owner,
 ) -> None:
     """Its oldest ones are ended; who has a link keeps it, and who comes finds room."""
+    replica = start_replica(sessions=ROOM)
+    good = dial(replica.endpoint)
+    wait_for(lambda: good.usable)
     at, eve = target(replica.endpoint), authority.robot("eve")
     with contextlib.ExitStack() as held:
         for _ in range(SESSIONS):
             with contextlib.suppress(zenoh.ZError):  # it is one too many at this moment
                 held.enter_context(session_at(at, eve))
-        wait_for(lambda: replica.count("surplus_links") > SESSIONS // 2 - LINKS_LIMIT)
+        wait_for(lambda: replica.count("surplus_links") > SESSIONS - LINKS_LIMIT)
         late = dial(replica.endpoint, robot="late", owner=Owner())
         wait_for(lambda: late.usable)
         assert good.offer(SERVICE, request_id(1), b"x", 30.0)

@@ -14,7 +14,7 @@ from pathlib import Path
 import zenoh
 
 from fogft.link.port import Answer, Link, Peer
-from fogft.link.zenoh.settings import LinkSettings
+from fogft.link.zenoh.settings import SESSIONS_LIMIT, LinkSettings
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
@@ -138,12 +138,14 @@ class ReplicaProcess:
         delay_s: float = 0.0,
         reply_bytes: int = -1,
         settings: LinkSettings | None = None,
+        sessions: int = SESSIONS_LIMIT,
         records: Path | None = None,
     ) -> None:
         """Start one.
 
         Args:
             claims: Slot and generation that it says it is, where that is a lie.
+            sessions: How many it has room for.
             records: What it was launched with of what the pool has signed.
         """
         arguments = {
@@ -157,6 +159,7 @@ class ReplicaProcess:
             "delay_s": delay_s,
             "reply_bytes": reply_bytes,
             "settings": asdict(settings or LinkSettings()),
+            "sessions": sessions,
             "records": str(records or ""),
         }
         self._process = forked.start("tests.link.zenoh.replica_process", json.dumps(arguments))

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     import zenoh
 
 MESSAGE_BYTES_LIMIT = 256 << 20
-_SESSIONS_LIMIT = 128  # robots, and gateways, at one replica
+SESSIONS_LIMIT = 128  # robots, and gateways, at one replica
 _HANDSHAKES_LIMIT = 32
 _SIGN_OF_LIFE_EVERY_S = 2.0
 
@@ -126,7 +126,7 @@ def replica_settings(
         "connect/endpoints": [],
         "listen/endpoints": [f"tls/{listen}"],
         "listen/exit_on_failure": True,
-        "transport/unicast/max_sessions": _SESSIONS_LIMIT,
+        "transport/unicast/max_sessions": SESSIONS_LIMIT,
         "transport/unicast/accept_pending": _HANDSHAKES_LIMIT,
         "transport/link/tls": {
             "root_ca_certificate": str(credentials.ca),

@@ -19,6 +19,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.cloud import notice
 from fogft.link.port import Incoming, Probe, ProbeAnswer
+from fogft.link.zenoh import settings as zenoh_settings
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.settings import LinkSettings
@@ -95,6 +96,7 @@ def main() -> None:
     files = CredentialPaths(Path(given["ca"]), Path(given["certificate"]), Path(given["key"]))
     id = ReplicaId(POOL_UID, given["slot"], given["generation"])
     settings = LinkSettings(**given["settings"])
+    zenoh_settings.SESSIONS_LIMIT = given["sessions"]
     listener = ZenohListener(
         given["endpoint"], files, id, settings=settings, handshakes=HandshakeLog()
     )
