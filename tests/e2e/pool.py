@@ -31,10 +31,11 @@ class Pool:
 
     def __init__(self, folder: Path, domain: int) -> None:
         self.folder = folder
+        self.home = folder / "home"
         self.file = folder / "pool.yaml"
         self.environ = {
             **os.environ,
-            "FOGFT_HOME": str(folder / "home"),
+            "FOGFT_HOME": str(self.home),
             "ROS_DOMAIN_ID": str(domain),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "NO_COLOR": "1",
@@ -80,7 +81,7 @@ class Pool:
 
     def status(self) -> dict[str, Any]:
         """Return what `fogft status --json` says, without a process: tests look often."""
-        [folder] = (self.folder / "home" / "pools").iterdir()
+        [folder] = (self.home / "pools").iterdir()
         status = seen.read(PoolPaths(folder), time.time()).to_json()
         self.uids.add(status["uid"])
         return status
@@ -134,7 +135,7 @@ class Pool:
 
     def close(self) -> None:
         """End the pool through the command line, and what is left of it by force."""
-        if (self.folder / "home" / "pools").exists():
+        if (self.home / "pools").exists():
             self.fogft("down", ok=False)
         for pid in self.processes():
             try:

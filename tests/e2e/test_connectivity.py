@@ -112,6 +112,7 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
     machines[used].kill()
     wait(lambda: passed(machines[other]) > before + 25)
     wait(lambda: {link["through"] for link in up_of(report(pool), "links")} == {other})
+    wait(lambda: len(up_of(report(pool), "gateways")) == 1)
     tree = wait(lambda: (tree := drawn(pool)).count(" up ") == 1 and tree).splitlines()
     wait(lambda: phases(pool.status()) == {0: "ready", 1: "ready", 2000: "ready"})
     result = client.finish()

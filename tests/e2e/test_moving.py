@@ -29,7 +29,7 @@ class Elsewhere(Pool):
 
     def manages(self) -> bool:
         """Whether its manager sees two replicas that answer through its own client proxy."""
-        status = json.loads(self.fogft("status", "--json"))
+        status = self.status()
         ready = [one for one in status["replicas"] if one["phase"] == "ready"]
         return len(ready) == 2 and bool(status["answers"])
 

@@ -134,7 +134,8 @@ def status_says_what_is_true_now(pool: Pool) -> None:
     assert "answering?" in pool.fogft("status")
     for pid in all_of_it:
         os.kill(pid, signal.SIGCONT)
-    pool.wait(lambda: answers(pool))
+    pool.wait(lambda: pool.status()["answers"])
+    assert answers(pool)
 
     all_of_it = robot_side(pool)
     for number in (signal.SIGSTOP, signal.SIGKILL):  # none of them has the time to start another
@@ -146,7 +147,8 @@ def status_says_what_is_true_now(pool: Pool) -> None:
     assert not any(one["link"] for one in seen["replicas"])
     assert "no request is answered" in pool.fogft("doctor", ok=False)
     pool.fogft("up", str(pool.file), "--yes")  # what doctor says to do
-    pool.wait(lambda: answers(pool))
+    pool.wait(lambda: pool.status()["answers"])
+    assert answers(pool)
 
 
 def robot_side(pool: Pool) -> list[int]:
