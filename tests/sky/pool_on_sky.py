@@ -56,7 +56,7 @@ class PoolOnSky:
             self.scene.cloud,
             self.store,
             clock=lambda: self.scene.now,
-            links=self._links,
+            links=self.links,
             epoch=epoch,
         )
 
@@ -68,7 +68,7 @@ class PoolOnSky:
         self.store.reopen()
         self.manager = self._new_manager(2)
 
-    def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...]:
+    def links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...]:
         """Report as the client proxy does: a machine that runs answers."""
         members = self.store.published.members if self.store.published else ()
         return tuple(self._link(member.id) for member in members)

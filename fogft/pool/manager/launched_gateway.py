@@ -5,6 +5,7 @@ Not here: the decision (`planning.gateway`), and carrying it out (`reconciler`).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -19,6 +20,8 @@ from fogft.planning.buying import PlannedLaunch
 from fogft.planning.gateway import GatewayPlan, plan_gateway, resources
 from fogft.planning.observed.history import History
 from fogft.pool.manager.offers import Seller
+
+ASK_EVERY_S = 10.0
 
 
 @dataclass
@@ -36,6 +39,7 @@ class LaunchedGateway:
     order: Callable[[PoolSpec, Offer, int], Launch]
     place: Callable[[str], object]
     _up_at: float | None = field(default=None, init=False)
+    _asked_at: float = field(default=-math.inf, init=False)
 
     def look(
         self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
@@ -56,6 +60,12 @@ class LaunchedGateway:
     def just_seen(self, now: float) -> bool:
         """Whether the robot reached it at this look."""
         return self._up_at == now
+
+    def is_doubted(self, now: float) -> bool:
+        """Whether the cloud is to be asked about it: it was reached, and is not. Not too often."""
+        due = self._up_at not in (None, now) and not 0 <= now - self._asked_at < ASK_EVERY_S
+        self._asked_at = now if due else self._asked_at
+        return due
 
 
 def planned(cloud: Seller, spec: PoolSpec) -> tuple[PlannedLaunch, ...]:

@@ -298,6 +298,11 @@ class Reconciler:
             record = history.record(machine.id.slot, machine.id.generation)
             if record is not None and record.first_ready_at is None:
                 self._remember.add(EventKind.READY, machine.id)
+        cloud = self._refreshing
+        if cloud is not None and self._gateway.is_doubted(observed.now):
+            for machine in observed.gateway:
+                ask = functools.partial(cloud.refresh, machine.id)
+                self._refreshes.start(machine.id, None, ask)
         for id, reason in step.ends:
             if id in step.failed:
                 self._remember.add(EventKind.FAILED, id, reason=reason)
@@ -306,7 +311,8 @@ class Reconciler:
             generation = history.generation(GATEWAY_SLOT) + 1
             order = self._gateway.order(spec, step.launch, generation)
             self._order(order, Reason(Cause.NEW_SLOT))
-        return None if spec.dial_in else step.note
+        there = step.host and spec.dial_in == spec.gateway.endpoints(step.host)[2]
+        return None if there or not spec.gateway.launch else step.note
 
     # -- apply ------------------------------------------------------------------------------
 

@@ -55,7 +55,6 @@ def answers(pool: Pool) -> dict[str, Any]:
 def main() -> int:
     subprocess.run(["nft", "-f", "-"], input=NAT, text=True, check=True)
     pool = Pool(NATTED)
-    pool.sky_api("start")
     try:
         with step("`up --yes`, until the service answers through the gateway"):
             print(pool.fogft("up", str(pool.file), "--yes"))
