@@ -90,7 +90,7 @@ def simulate(
 
 
 HEADER = (
-    *("POLICY", "AVAILABLE", "95 %", "UNDER TARGET", "$/HOUR", "$/MONTH"),
+    *("POLICY", "AVAILABLE", "95 %", "UNDER TARGET", "$/HOUR", "OF 1 VM", "OF N VMS"),
     *("LAUNCHES/DAY", "LOST/DAY", "LONGEST OUTAGE"),
 )
 
@@ -99,12 +99,13 @@ def _show(report: Report) -> None:
     from fogft.cli.table import table
 
     width = output.width(sys.stdout)
-    output.show(table(HEADER, map(_cells, report.rows), right=HEADER[1:], width=width))
+    rows = [_cells(row, report) for row in report.rows]
+    output.show(table(HEADER, rows, right=HEADER[1:], width=width))
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "simulated"
     output.data(
         f"\n{report.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
-        f"{scenario.days:.4g} days."
+        f"{scenario.days:.4g} days. A VM is the cheapest on-demand one; N is {report.replicas}."
     )
     best = report.cheapest
     if best is None:
@@ -114,15 +115,16 @@ def _show(report: Report) -> None:
         output.data(f"Cheapest for {percent(report.target)}: {best.name}, at ${costs:.4f}/h.")
 
 
-def _cells(row: Row) -> list[str | Text]:
+def _cells(row: Row, report: Report) -> list[str | Text]:
     up, cost = row.estimate("available"), row.estimate("usd_per_hour")
+    units = report.in_machines(row)
     return [
         output.cell(row.name, "bold" if row.name == "fogft" else ""),
         percent(up.mean),
         output.cell(f"{percent(up.low)}-{percent(up.high)}", "dim"),
         percent(row.estimate("under_target").mean),
         f"{cost.mean:.4f}",
-        f"{cost.mean * 730:.0f}",
+        *([f"{unit:.3f}" for unit in units] if units else ["-", "-"]),
         f"{row.estimate('launches_per_day').mean:.1f}",
         f"{row.estimate('preemptions_per_day').mean:.1f}",
         age(row.longest_outage_s) if row.longest_outage_s else "none",

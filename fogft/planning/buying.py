@@ -75,7 +75,7 @@ class Buyer:
         self._catalogue = catalogue(self.observed.offers)
         self._markets: dict[tuple[object, ...], Market] = {}
         self._whole: dict[tuple[str, bool | None], Market] = {}
-        self.scale = Scale(self.spec.placement.latency_weight, self.observed.rtt_s)
+        self.scale = Scale(self.spec.placement.latency_weight, self.observed.rtt_s, self.spec.name)
         wrong = self._catalogue.impossible
         if wrong:
             self.notes.append(Reason(Cause.IMPOSSIBLE_PRICE, location=wrong))

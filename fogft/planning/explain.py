@@ -45,7 +45,7 @@ class Considered:
         rtt_s: Round trip to its region in seconds; None for not known.
         losses: Replicas of this pool lost there in the last hours.
         losses_per_hour: As the planner reckons with; None on demand.
-        losses_assumed: No spot machine of this pool has lived there: it is the prior.
+        losses_assumed: This pool has asked for no spot machine there: it is the prior.
     """
 
     offer: Offer

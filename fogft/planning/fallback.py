@@ -27,10 +27,10 @@ from fogft.planning.observed.history import History
 SETTLED_S = 20.0
 # Under a cap that has no room for both, a stand-in makes way for a spot machine after so long.
 STAYS_S = 600.0
-# Where spot machines are lost so often, one of a group is on demand. An hour of it then costs
-# little more than that of a spot machine with the stand-ins that follow it.
-OFTEN = 4
-OFTEN_S = 3600.0
+# Where spot machines are lost so often, one of a group is on demand: losses come in clusters, and
+# without one all that are left may go at once.
+OFTEN = 2
+OFTEN_S = 2700.0
 
 
 def stand_ins(machines: Classification) -> list[Assessment]:

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from operator import itemgetter
 from typing import NamedTuple
+from zlib import crc32
 
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement, supply
@@ -35,10 +36,17 @@ UNKNOWN_RTT_S = 0.150
 
 @dataclass(frozen=True)
 class Scale:
-    """The weight of round trips, and known ones by ``cloud/region``, in seconds."""
+    """How offers are compared.
+
+    Attributes:
+        weight: Of round trips.
+        rtt_s: Known ones by ``cloud/region``, in seconds.
+        pool: Whose: what is otherwise equal comes in another order for each.
+    """
 
     weight: float = 1.0
     rtt_s: Mapping[str, float] = field(default_factory=dict)
+    pool: str = ""
 
     def latency(self, placement: Placement) -> float | None:
         """Return the round trip to a placement's region in seconds; None if it is not known."""
@@ -67,18 +75,20 @@ def gain(before: float, after: float) -> float:
     return 1.0 - math.exp(after - before)
 
 
-without_offer = itemgetter(slice(0, 7))
+without_offer = itemgetter(slice(0, 8))
 
 
 class Row(NamedTuple):
     """An offer with its rank; fields are in tie-breaking order.
 
     Attributes:
+        lot: Drawn for the location, so that no name is preferred.
         supply: See `Placement.supply`.
     """
 
     score: float
     usd_per_hour: float
+    lot: int
     cloud: str
     region: str
     location: str
@@ -144,7 +154,7 @@ class Catalogue:
             scale: How price and distance are weighed.
         """
         far = tuple(sorted(scale.rtt_s.items()))
-        key = group, spot, frozenset(excluded), scale.weight, far
+        key = group, spot, frozenset(excluded), scale.weight, far, scale.pool
         if key not in self._listings:
             mine = [
                 o
@@ -193,6 +203,7 @@ def _listing(offers: Sequence[Offer], excluded: Collection[str], scale: Scale) -
 def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:
     """Yield the rows of offers. There may be thousands: what is equal is worked out once."""
     regions: dict[tuple[str, str], tuple[str, float]] = {}
+    lots: dict[str, int] = {}
     for offer in offers:
         place = offer.placement
         key = (place.cloud, place.region)
@@ -203,9 +214,12 @@ def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:
             )
         region, far = regions[key]
         location = f"{region}/{place.zone}"
+        if location not in lots:
+            lots[location] = crc32(f"{scale.pool} {location}".encode())
         yield Row(
             scale.of_price(offer.usd_per_hour) + far,
             offer.usd_per_hour,
+            lots[location],
             place.cloud,
             region,
             location,

@@ -4,8 +4,8 @@ Only a pool that is whole and quiet moves anything, one replica at a time, the n
 A replica moves when
 
 * it is on demand and should be spot, or the other way round; or
-* its new place would leave the pool better spread over clouds, regions or zones, where they are
-  not lost `TOO_OFTEN`; or
+* its new place would leave the pool better spread over clouds, regions or zones, and is not known
+  to lose more than its own; or
 * the spread stays as it is, and its score falls by `gain`.
 
 It has then been ready for `stay_s`, and the new place neither backs off nor has it refused within
@@ -28,11 +28,9 @@ from fogft.model.replica import ReplicaId
 from fogft.planning.buying import Buyer
 from fogft.planning.classification import Classification
 from fogft.planning.listing import gain
+from fogft.planning.observed.hazard import UNKNOWN
 from fogft.planning.observed.health import Assessment, Health
 from fogft.planning.placement import Choice, Crowd, crowding
-
-# Losses an hour with which no better spread is worth a move: lower, and outages of a region count.
-TOO_OFTEN = 1.0
 
 
 def is_quiet(machines: Classification, health: Health) -> bool:
@@ -136,7 +134,7 @@ def _is_better(
         return Move(replica, Reason(cause, location=offer.placement.location), (-1.0,))
     here = [count[domain] for domain in placement.domains]
     losses, losses_there = (buyer.losses_per_hour(p) for p in (placement, offer.placement))
-    if there < here and (at_most or losses_there <= max(losses, TOO_OFTEN)):
+    if there < here and (at_most or losses_there <= max(losses, UNKNOWN)):
         why = Reason(Cause.BETTER_SPREAD, location=offer.placement.location)
         return Move(replica, why, (0.0, *there))
     better = gain(

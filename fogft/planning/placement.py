@@ -3,7 +3,7 @@
 Spread first, price and distance second: replicas in one zone are preempted together, and a
 cloud or a region fails as a whole. So the offer whose cloud, then region, then zone holds
 the fewest of our replicas wins; among those the one with the lowest score; among those
-the cheaper one; among those the first by name.
+the cheaper one; among those one drawn by lot, for each pool another.
 
 Owns: the rank of an offer and the reason when none is left.
 Not here: the order within a rank (`listing`), how long a location is avoided

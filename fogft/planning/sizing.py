@@ -86,7 +86,7 @@ def spot_sold(spec: PoolSpec, intent: Intent, observed: Observed) -> list[Placem
     groups = groups_of(spec)
     if any(group.on_demand.fallback for group in groups):
         return []
-    scale = Scale(spec.placement.latency_weight, observed.rtt_s)
+    scale = Scale(spec.placement.latency_weight, observed.rtt_s, spec.name)
     sold = catalogue(observed.offers)
     rows = (
         row
@@ -166,7 +166,7 @@ def _for_target(
         one = 1.0 - unavailability_of(asked, spot=True)
         needed = replicas_needed(one, asked.target, limit=10_000)
         return min(MAX_REPLICAS, max(spec.replicas, running, needed)), None
-    scale = Scale(spec.placement.latency_weight, observed.rtt_s)
+    scale = Scale(spec.placement.latency_weight, observed.rtt_s, spec.name)
     markets = Markets(observed.offers, scale, intent.excluded)
     laid = [o.placement for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
     down: list[float] = []

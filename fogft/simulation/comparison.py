@@ -6,6 +6,7 @@ Not here: how it is shown (`fogft.cli`, `plot`).
 from __future__ import annotations
 
 import logging
+import math
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -40,6 +41,13 @@ FIGURES = (
     "preemptions_per_day",
     "outages_per_day",
 )
+# Figure -> the sums of days that it is the ratio of, and its unit.
+_OF_DAYS = {
+    "available": ("up_s", "wanted_s", 1.0),
+    "under_target": ("under_s", "wanted_s", 1.0),
+    "mean_ready": ("ready_s", "seconds", 1.0),
+    "usd_per_hour": ("usd", "seconds", 3600.0),
+}
 _RESAMPLES = 1000
 
 
@@ -64,6 +72,12 @@ class Scenario:
     def length_s(self) -> float:
         """How long each run takes, in simulated seconds."""
         return SETTLE_S + self.days * DAY_S
+
+    @property
+    def replays_all(self) -> bool:
+        """Whether every seed replays all that was recorded, two days or more."""
+        known_s = min((line.length_s for line in self.recorded.values()), default=math.inf)
+        return known_s - 1.0 < self.length_s and self.days >= 2.0
 
     def market(self, seed: int) -> Market:
         """Return the market of a seed: a section of the recordings, or a generated one."""
@@ -109,15 +123,35 @@ class Row:
     outcomes: tuple[Outcome, ...]
     # Of the first seed: from when how many served, in seconds from the beginning.
     curve: tuple[tuple[float, int], ...] = ()
+    same_days: bool = False  # all seeds replay the same ones
 
     def estimate(self, figure: str) -> Estimate:
         """Return a figure's mean and interval; ``..._per_day`` is per day."""
+        if self.same_days and figure in _OF_DAYS:
+            return self._over_days(*_OF_DAYS[figure])
         if figure.endswith("_per_day"):
             counted = figure.removesuffix("_per_day")
             values = [getattr(o, counted) / (o.seconds / DAY_S) for o in self.outcomes]
         else:
             values = [getattr(o, figure) for o in self.outcomes]
         return estimate(values)
+
+    def _over_days(self, above: str, below: str, unit: float) -> Estimate:
+        """Return a ratio with its interval by block bootstrap: whole days are drawn anew."""
+        days = [
+            [
+                sum(getattr(outcome.days[index], sums) for outcome in self.outcomes)
+                for sums in (above, below)
+            ]
+            for index in range(min(len(outcome.days) for outcome in self.outcomes))
+        ]
+
+        def ratio(drawn: Sequence[Sequence[float]]) -> float:
+            return sum(day[0] for day in drawn) / max(sum(day[1] for day in drawn), 1e-9) * unit
+
+        chance = random.Random(len(days))
+        found = sorted(ratio(chance.choices(days, k=len(days))) for _ in range(_RESAMPLES))
+        return Estimate(ratio(days), *_middle(found))
 
     @property
     def longest_outage_s(self) -> float:
@@ -131,7 +165,7 @@ class Row:
             out[figure] = asdict(self.estimate(figure))
         out["usd_per_month"] = out["usd_per_hour"]["mean"] * HOURS_A_MONTH
         out["longest_outage_s"] = self.longest_outage_s
-        out["by_seed"] = [asdict(o) for o in self.outcomes]
+        out["by_seed"] = [asdict(replace(o, days=())) for o in self.outcomes]
         return out
 
 
@@ -144,7 +178,12 @@ def estimate(values: Sequence[float]) -> Estimate:
     means = sorted(
         sum(chance.choices(values, k=len(values))) / len(values) for _ in range(_RESAMPLES)
     )
-    return Estimate(mean, means[int(0.025 * _RESAMPLES)], means[int(0.975 * _RESAMPLES)])
+    return Estimate(mean, *_middle(means))
+
+
+def _middle(means: Sequence[float]) -> tuple[float, float]:
+    """Return the bounds of the 95 % in the middle."""
+    return means[int(0.025 * _RESAMPLES)], means[int(0.975 * _RESAMPLES)]
 
 
 Factory = Callable[[World], Policy]
@@ -183,6 +222,12 @@ def _sold(spec: PoolSpec, market: Market) -> tuple[list[Offer], list[Offer]]:
     spots = [o for o in market.offers(with_spot(kind, True)) if o.placement.spot]
     reserved = [o for o in market.offers(with_spot(kind, False)) if not o.placement.spot]
     return spots, sorted(reserved, key=lambda o: (o.usd_per_hour, o.placement))
+
+
+def on_demand_usd_per_hour(scenario: Scenario) -> float | None:
+    """Return the price of the cheapest on-demand machine; None where none is sold."""
+    _, reserved = _sold(scenario.spec, scenario.market(scenario.seeds[0]))
+    return reserved[0].usd_per_hour if reserved else None
 
 
 def replicas_of(spec: PoolSpec, offers: Sequence[Offer]) -> int:
@@ -238,7 +283,8 @@ def compare(
             outcomes[name].append(meter.outcome())
             curve = tuple((at - meter.begin_s, ready) for at, ready in meter.curve)
             curves.setdefault(name, curve)
-    rows = [Row(name, tuple(outcomes[name]), curves[name]) for name in made]
+    same = scenario.replays_all
+    rows = [Row(name, tuple(outcomes[name]), curves[name], same) for name in made]
     known = [bound(scenario, scenario.market(seed)) for seed in scenario.seeds]
     reached = tuple(outcome for outcome in known if outcome is not None)
     if len(reached) == len(known) and scenario.spec.schedule is None:

@@ -8,6 +8,18 @@ HOURS_A_MONTH = 730.0
 DAY_S = 86_400.0
 
 
+@dataclass
+class Day:
+    """Sums over a day, from the beginning of what is measured."""
+
+    seconds: float = 0.0
+    wanted_s: float = 0.0
+    up_s: float = 0.0
+    under_s: float = 0.0
+    ready_s: float = 0.0
+    usd: float = 0.0
+
+
 @dataclass(frozen=True)
 class Outcome:
     """One policy in one market, measured over `seconds`."""
@@ -22,6 +34,7 @@ class Outcome:
     preemptions: int  # machines that were taken away or failed
     outages: int  # how often the pool stopped to answer, and how long the longest was
     longest_outage_s: float
+    days: tuple[Day, ...] = ()
 
 
 @dataclass
@@ -41,6 +54,7 @@ class Meter:
     outages: int = 0
     longest_outage_s: float = 0.0
     curve: list[tuple[float, int]] = field(default_factory=list)
+    days: list[Day] = field(default_factory=list)
     _down_s: float = 0.0
     _pending: tuple[float, int, int, float] = (0.0, -1, 0, 0.0)  # unlike any other
 
@@ -66,6 +80,7 @@ class Meter:
     def _add_pending(self) -> None:
         seconds, ready, wanted, usd_per_hour = self._pending
         self._pending = (0.0, ready, wanted, usd_per_hour)
+        self._add_to_days(seconds, ready, wanted, usd_per_hour)
         self.seconds += seconds
         self.ready_s += seconds * ready
         self.usd += seconds / 3600.0 * usd_per_hour
@@ -79,6 +94,22 @@ class Meter:
             self.outages += self._down_s == 0.0
             self._down_s += seconds
             self.longest_outage_s = max(self.longest_outage_s, self._down_s)
+
+    def _add_to_days(self, seconds: float, ready: int, wanted: int, usd_per_hour: float) -> None:
+        at = self.seconds
+        end = at + seconds
+        while at < end:
+            index = int(at // DAY_S)
+            part_s = min(end, (index + 1) * DAY_S) - at
+            self.days += [Day() for _ in range(len(self.days), index + 1)]
+            day = self.days[index]
+            day.seconds += part_s
+            day.wanted_s += part_s * bool(wanted)
+            day.up_s += part_s * bool(wanted and ready)
+            day.under_s += part_s * bool(ready < wanted)
+            day.ready_s += part_s * ready
+            day.usd += part_s / 3600.0 * usd_per_hour
+            at += part_s
 
     def counts(self, now_s: float) -> bool:
         """Whether events now are counted."""
@@ -98,4 +129,5 @@ class Meter:
             preemptions=self.preemptions,
             outages=self.outages,
             longest_outage_s=self.longest_outage_s,
+            days=tuple(self.days),
         )

@@ -20,7 +20,15 @@ from fogft.pool.manager.offers import ask
 from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import located as located_in_file
 from fogft.simulation import fitting
-from fogft.simulation.comparison import BOUND, Row, Scenario, compare, replicas_of, spot_locations
+from fogft.simulation.comparison import (
+    BOUND,
+    Row,
+    Scenario,
+    compare,
+    on_demand_usd_per_hour,
+    replicas_of,
+    spot_locations,
+)
 from fogft.simulation.market import FindOffers, remembered
 from fogft.simulation.meter import DAY_S
 from fogft.simulation.model import MARKET_KEYS, MarketModel, Timing, applied, read_values
@@ -38,6 +46,7 @@ class Report:
     scenario: Scenario
     rows: tuple[Row, ...]
     replicas: int  # how many the planner wants outside of the schedule's windows
+    one_on_demand: float | None = None  # US dollars per hour of one such machine
     notes: tuple[str, ...] = ()  # what a reader should know, in sentences
 
     @property
@@ -56,8 +65,16 @@ class Report:
         ]
         return min(enough, key=lambda row: row.estimate("usd_per_hour").mean, default=None)
 
+    def in_machines(self, row: Row) -> tuple[float, float] | None:
+        """Return what a policy costs in units of one on-demand machine, and of one a replica."""
+        if not self.one_on_demand or not self.replicas:
+            return None
+        of_one = row.estimate("usd_per_hour").mean / self.one_on_demand
+        return of_one, of_one / self.replicas
+
     def to_json(self) -> dict[str, Any]:
         """Return everything, seed by seed."""
+        units = [self.in_machines(row) or (None, None) for row in self.rows]
         scenario = self.scenario
         return {
             "pool": scenario.spec.name,
@@ -69,7 +86,11 @@ class Report:
             "timing": asdict(scenario.timing),
             "days": scenario.days,
             "seeds": list(scenario.seeds),
-            "policies": [row.to_json() for row in self.rows],
+            "one_on_demand_usd_per_hour": self.one_on_demand,
+            "policies": [
+                {**row.to_json(), "cost_of_one_on_demand": of_one, "cost_of_all_on_demand": of_all}
+                for row, (of_one, of_all) in zip(self.rows, units, strict=True)
+            ],
             "target": self.target,
             "cheapest": self.cheapest.name if self.cheapest else None,
             "notes": list(self.notes),
@@ -87,7 +108,8 @@ def simulate_scenario(
     rows = compare(scenario, told)
     world = World(scenario.market(scenario.seeds[0]), seed=0, length_s=0.0)
     replicas = replicas_of(scenario.spec, ask(world, scenario.spec))
-    return Report(scenario, tuple(rows), replicas, (*notes, *more))
+    one = on_demand_usd_per_hour(scenario)
+    return Report(scenario, tuple(rows), replicas, one, (*notes, *more))
 
 
 def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
@@ -117,7 +139,10 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
     if scenario.days >= most:
         scenario = replace(scenario, days=most)
         notes.append(f"the traces cover {most:.1f} days after the first hour: all are used")
-        notes.append("every seed replays the same days: intervals reflect only boot times")
+        notes.append(
+            "every seed replays the same days; intervals are of "
+            + ("whole days drawn anew (block bootstrap)" if scenario.replays_all else "boot times")
+        )
     return scenario, notes
 
 

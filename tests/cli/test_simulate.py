@@ -48,6 +48,8 @@ def test_a_table_of_policies_side_by_side(file, capsys):
         *("SkyServe, spot only", "SkyServe, fallback"),
     ]
     assert "2 replicas wanted; 2 markets (simulated) of 0.25 days." in out
+    single = next(line for line in lines if line.startswith("one on-demand")).split()
+    assert {"1.000", "0.500"} <= set(single)  # of one on-demand machine, and of two
     assert "note: the market is simulated" in err
 
 

@@ -155,6 +155,29 @@ def test_where_spot_machines_were_lost_less_often_the_next_one_goes():
     assert [x.offer.placement.zone for x in later.plan().launches] == ["a"]
 
 
+@pytest.mark.parametrize("pool", ["a", "b", "c", "d"])
+def test_a_place_that_refused_often_comes_after_one_that_did_not(pool):
+    """Long enough ago that neither rests; what else is equal is drawn by lot, by pool."""
+    places = [Placement("c", "r", zone, "m") for zone in ("a", "b")]
+    refused = [
+        Event(NOW - 9000 + 60 * n + after_s, kind, 0, n, "c/r/a", Reason(Cause.CAPACITY))
+        for n in range(1, 5)
+        for after_s, kind in enumerate((EventKind.LAUNCH, EventKind.REFUSED))
+    ]
+    asked = World(replace(spec(1), name=pool), offers=tuple(Offer(place, 0.1) for place in places))
+    seen = replace(asked, events=tuple(refused))
+    assert [x.offer.placement.zone for x in seen.plan().launches] == ["b"]
+
+
+def test_of_equal_places_no_name_is_preferred():
+    places = [Placement("c", "r", zone, "m") for zone in "abcd"]
+    offers = tuple(Offer(place, 0.1) for place in places)
+    pools = [
+        World(replace(spec(1), name=f"pool{n}"), offers=offers).plan().launches for n in range(40)
+    ]
+    assert {launch.offer.placement.zone for [launch] in pools} == set("abcd")
+
+
 @pytest.mark.parametrize(("losses", "is_held"), [(OFTEN - 1, False), (OFTEN, True)])
 def test_where_spot_machines_are_lost_too_often_a_stand_in_is_held_in_place_of_one(losses, is_held):
     gone = [

@@ -36,7 +36,6 @@ from fogft.simulation.comparison import (
     unlogged,
 )
 from fogft.simulation.market import remembered
-from fogft.simulation.meter import HOURS_A_MONTH
 from fogft.simulation.model import MarketModel, Timing
 from fogft.simulation.report import Report, simulate_scenario
 from fogft.simulation.world import World
@@ -175,6 +174,7 @@ def page(found: dict[str, Report], errors: list[dict[str, Any]]) -> Iterator[str
         f"{scenario.days:g} days.",
         f"A boot takes {timing.boot_s:g} s, a notice comes {timing.notice_s:g} s ahead, a loss",
         f"without one is seen after {timing.detect_s:g} s. In brackets: 95 % bootstrap interval.",
+        "Costs are in units of one on-demand VM, and of one for each replica.",
     )
     for name, report in found.items():
         yield from ("", f"## A market {name}", "", *table(report))
@@ -193,18 +193,21 @@ def table(report: Report) -> Iterator[str]:
         f"{model.correlation_cloud:g} between regions."
     )
     yield ""
-    yield "| policy | available | under target | $/month | launches/day | longest outage |"
-    yield "|---|---|---|---|---|---|"
-    yield from (f"| {' | '.join(cells(row))} |" for row in report.rows)
+    yield (
+        "| policy | available | under target | of 1 VM | of "
+        f"{report.replicas} VMs | launches/day | longest outage |"
+    )
+    yield "|---|---|---|---|---|---|---|"
+    yield from (f"| {' | '.join(cells(row, report))} |" for row in report.rows)
 
 
-def cells(row: Row) -> Iterator[str]:
+def cells(row: Row, report: Report) -> Iterator[str]:
     """Yield what a table says of a policy."""
     up = row.estimate("available")
     yield f"**{row.name}**" if row.name == "fogft" else row.name
     yield f"{percent(up.mean)} [{percent(up.low)}, {percent(up.high)}]"
     yield percent(row.estimate("under_target").mean)
-    yield f"{row.estimate('usd_per_hour').mean * HOURS_A_MONTH:.0f}"
+    yield from (f"{unit:.3f}" for unit in report.in_machines(row) or ())
     yield f"{row.estimate('launches_per_day').mean:.1f}"
     yield age(row.longest_outage_s) if row.longest_outage_s else "none"
 

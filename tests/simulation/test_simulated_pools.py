@@ -315,15 +315,24 @@ def test_a_region_that_has_become_dear_is_left(replicas):
     assert region not in {place.region for place in places}
 
 
-def test_recorded_traces_shorter_than_asked_are_used_whole():
+@pytest.mark.parametrize(
+    ("hours", "of"), [(48, "boot times"), (73, "whole days drawn anew (block bootstrap)")]
+)
+def test_recorded_traces_shorter_than_asked_are_used_whole(hours, of):
+    """Room on every other day alone: the interval of availability is that of days."""
     wanted = scenario(spec(1), days=5.0)
-    lines = {p: of_samples([1] * 48, HOUR_S) for p in wanted.market(0).timelines}
+    samples = [int(hour // 24 != 1) for hour in range(hours)]
+    lines = {p: of_samples(samples, HOUR_S) for p in wanted.market(0).timelines}
     report = simulate_scenario(replace(wanted, recorded=lines))
-    assert report.scenario.days == pytest.approx(47 / 24)
+    assert report.scenario.days == pytest.approx((hours - 1) / 24)
     assert report.notes == (
-        "the traces cover 2.0 days after the first hour: all are used",
-        "every seed replays the same days: intervals reflect only boot times",
+        f"the traces cover {(hours - 1) / 24:.1f} days after the first hour: all are used",
+        f"every seed replays the same days; intervals are of {of}",
     )
+    row = report.rows[0]
+    found, seconds = row.estimate("available"), sum(o.seconds for o in row.outcomes)
+    assert found.mean == pytest.approx(sum(o.available * o.seconds for o in row.outcomes) / seconds)
+    assert (found.high - found.low > 0.5) is row.same_days
 
 
 def test_boots_that_the_pool_file_does_not_wait_for_are_told():

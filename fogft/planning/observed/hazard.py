@@ -1,14 +1,15 @@
 """Loss rates of spot machines at each location, learned from this pool's history. Pure.
 
 The rate is (PRIOR_LOSSES + losses) / (PRIOR_S + seconds lived there), what is longer ago
-counting for less: by half after HALF_LIFE_S. So a location that nobody was in has the
-prior's rate, one loss tells something and ten tell much, and in time all is forgiven.
+counting for less: by half after HALF_LIFE_S. A launch that was refused for want of room is
+REFUSED of a loss. So a location that was never asked has the prior's rate, one loss tells
+something and ten tell much, and in time all is forgiven.
 
 It is worked out as of the last multiple of EVERY_S, losses since included, so that it does not
 depend on who asks when.
 
 Owns: the rate and what it is worth in a score.
-Not here: refusals and the rest after them (`backoff`).
+Not here: the rest after refusals (`backoff`).
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 
-from fogft.planning.observed.history import EventKind, History, Record
+from fogft.model.reason import Cause
+from fogft.planning.observed.history import EventKind, Failure, History, Record
 
 PRIOR_LOSSES = 1.0
 PRIOR_S = 4 * 3600.0
@@ -25,11 +27,13 @@ EVERY_S = 1800.0
 # What a loss costs, in hours of the machine lost: its successor boots while another one, mostly a
 # dearer one, serves, and while it does one more loss is an outage.
 LOSS_COSTS_H = 1.0
+# A refusal counts as so much of a loss: where there is often no room, it does not last.
+REFUSED = 0.1
 _DECAY = math.log(2.0) / HALF_LIFE_S
 
 
 def hazards(history: History, now: float) -> Mapping[str, float]:
-    """Return the losses per hour at each location where a spot machine has lived."""
+    """Return the losses per hour at each location that was asked for spot machines."""
     return history.of_lives(hazard, as_of(now))
 
 
@@ -38,9 +42,14 @@ def as_of(now: float) -> float:
     return now // EVERY_S * EVERY_S
 
 
-def hazard(lives: Iterable[Record], at: float) -> float:
-    """Return the losses per hour of a location, by its spot machines, as of a time."""
+def hazard(lives: Iterable[Record], failures: Iterable[Failure], at: float) -> float:
+    """Return the losses per hour of a location, by its spot machines and failures, as of a time."""
     losses, lived_s = PRIOR_LOSSES, PRIOR_S
+    losses += REFUSED * sum(
+        _weight(max(at - failure.at, 0.0))
+        for failure in failures
+        if failure.cause is Cause.CAPACITY
+    )
     for record in lives:
         ended = record.closed is not None
         end = min(record.closed_at, at) if ended else at

@@ -278,6 +278,7 @@ class History:
 
     def _fail(self, record: Record, event: Event) -> None:
         failure = Failure(event.at, fault_of(event.reason))
+        self._of_lives.pop(record.location, None)
         insort(self._failures.setdefault(record.supply, []), failure, key=_AT)
 
     def record(self, slot: int, generation: int) -> Record | None:
@@ -342,9 +343,9 @@ class History:
         return self._proven_at.get(supply, float("-inf"))
 
     def of_lives(
-        self, work_out: Callable[[Sequence[Record], float], float], at: float
+        self, work_out: Callable[[Sequence[Record], Sequence[Failure], float], float], at: float
     ) -> Mapping[str, float]:
-        """Return the cached summary of spot machines' lives at each location, as of a time.
+        """Return the cached summary of spot machines' lives and failures at each location.
 
         Args:
             work_out: Pure, and always the same. It is asked again for another time, and after a
@@ -352,9 +353,10 @@ class History:
             at: Seconds since the epoch.
         """
         for location, lives in self._lives.items():
-            if lives and self._of_lives.get(location, (None, 0.0))[0] != at:
-                self._of_lives[location] = at, work_out(lives, at)
-        return {place: self._of_lives[place][1] for place, lives in self._lives.items() if lives}
+            if self._of_lives.get(location, (None, 0.0))[0] != at:
+                failures = self._failures.get(location, ())
+                self._of_lives[location] = at, work_out(lives, failures, at)
+        return {place: self._of_lives[place][1] for place in self._lives}
 
     @property
     def losses(self) -> Mapping[str, list[float]]:
