@@ -23,7 +23,7 @@ class FolderCloud:
         folder.mkdir(parents=True, exist_ok=True)
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        return [Offer(zone, 0.1) for zone in ZONES]
+        return [Offer(zone, 0.1 + index / 1000) for index, zone in enumerate(sorted(ZONES))]
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         self._reach()
