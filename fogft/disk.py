@@ -1,6 +1,7 @@
 """Files shared between processes: replaced atomically, private, locked by the kernel.
 
-A reader sees the old file or the new one, never a torn one; a full disk leaves the old one.
+A reader sees the old file or the new one, never a torn one; a full disk leaves the old one, but for
+a report, which is written over where it lies.
 Locks are flocks: they end with the process that holds them, whatever ends it.
 """
 
@@ -71,6 +72,28 @@ def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
     """Replace a file with a value as JSON, on one line where it is not durable."""
     # Indented it takes ten times as long.
     write_whole(path, to_json(value) if durable else json.dumps(value), durable=durable)
+
+
+def write_report(path: Path, value: Any) -> None:
+    """Replace a JSON file that says how things are now; on a full disk, write over it in place.
+
+    Then whoever reads it at that very moment may find it damaged.
+    """
+    data = json.dumps(value).encode()
+    try:
+        write_whole(path, data, durable=False)
+    except StateError:
+        if not _written_over(path, data):
+            raise
+
+
+def _written_over(path: Path, data: bytes) -> bool:
+    """Write over a file, with spaces up to its end; return whether that needs no more room."""
+    with contextlib.suppress(OSError), path.open("r+b", buffering=0) as file:
+        old = os.fstat(file.fileno())
+        if len(data) <= old.st_blocks * 512:
+            return file.write(data.ljust(old.st_size)) >= len(data)
+    return False
 
 
 def to_json(value: Any) -> str:

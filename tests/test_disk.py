@@ -151,15 +151,34 @@ for state in free full free read-only; do
     rm -f "$1/fill"
     [ "$state" != full ] || head -c 2m /dev/zero >"$1/fill" 2>/dev/null || true
     [ "$state" != read-only ] || mount -o remount,ro "$1"
-    "$2" -c 'import sys; from fogft import disk; print(disk.unwritable(sys.argv[1]))' "$1"
+    "$2" -c "$3" "$1" "$state"
 done
+"""
+TRIES = """
+import sys
+from pathlib import Path
+from fogft import disk
+from fogft.errors import StateError
+folder, state = Path(sys.argv[1]), sys.argv[2]
+for write in disk.write_report, disk.write_json:
+    try:
+        write(folder / write.__name__, [state] if state == "full" else [state, "more"])
+    except StateError:
+        pass
+report, other = (disk.read_json(folder / name) for name in ("write_report", "write_json"))
+print(disk.unwritable(folder), report[0], other[0])
 """
 
 
 @needs("namespaces")
-def test_a_disk_that_takes_nothing_more_is_known(tmp_path):
-    done = subprocess.run(
-        ["unshare", "--mount", "bash", "-c", DISKS, "bash", str(tmp_path), sys.executable],
-        capture_output=True, text=True, timeout=100, check=False,
-    )  # fmt: skip
-    assert done.stdout.split("\n") == ["", "full", "", "read-only", ""], done.stderr
+def test_a_disk_that_takes_nothing_more_is_known_and_a_report_is_written_on_a_full_one(tmp_path):
+    """A shorter report takes the place of a longer one, whole; any other file stays as it is."""
+    words = ["unshare", "--mount", "bash", "-c", DISKS, "bash", str(tmp_path), sys.executable]
+    done = subprocess.run([*words, TRIES], capture_output=True, text=True, timeout=100, check=False)
+    told = [line.split(" ") for line in done.stdout.splitlines()]
+    assert told == [
+        ["", "free", "free"],
+        ["full", "full", "free"],
+        ["", "free", "free"],
+        ["read-only", "free", "free"],
+    ], done.stderr

@@ -114,8 +114,8 @@ def _remark(seen: Seen, folder: Path) -> None:
             f"start one with `fogft up {seen.status.file}`, or shut the pool down with `fogft down`"
         )
     elif why := disk.unwritable(folder):
-        output.warn(f"the disk of `{folder}` is {why}: this output is old, and nothing is launched")
-        output.hint("requests continue; the manager resumes once there is space")
+        output.warn(f"the disk of `{folder}` is {why}: nothing is launched")
+        output.hint("the manager resumes once there is space; requests need none")
     elif seen.status.manager_version not in ("", __version__):
         output.warn(
             f"the pool runs fogft {seen.status.manager_version}, this command is {__version__}"

@@ -95,9 +95,7 @@ class _Rendezvous:
             report = {"pid": os.getpid(), "endpoint": self._server.endpoint}
             report.update(self._server.report())
             if self._config.status is not None and str(report) != self._reported:
-                disk.write_json(
-                    self._config.status, {**report, "written_at": time.time()}, durable=False
-                )
+                disk.write_report(self._config.status, {**report, "written_at": time.time()})
                 self._reported = str(report)
             self._trouble = ""
         except StateError as error:

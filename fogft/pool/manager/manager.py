@@ -338,7 +338,7 @@ class Manager:
             log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
         self._told = seen
         self._tally.seen(seen.replicas, tick.observed.now)
-        disk.write_json(self._paths.status, seen.to_json(), durable=False)
+        disk.write_report(self._paths.status, seen.to_json())
 
     # -- waiting ----------------------------------------------------------------------------
 

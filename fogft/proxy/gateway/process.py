@@ -216,7 +216,7 @@ class _Gateway:
             **self._following.report(),
         }
         status = self._config.status
-        try_step(functools.partial(disk.write_json, status, report, durable=False), status)
+        try_step(functools.partial(disk.write_report, status, report), status)
 
     def close(self) -> None:
         """Refuse what is under way, and leave."""

@@ -369,7 +369,7 @@ class _Running:
             **self.following.report(self.dialer.newer()),
             "callers": self.callers(),
         }
-        disk.write_json(self.config.status, report, durable=False)
+        disk.write_report(self.config.status, report)
 
 
 _troubles: dict[Path, str] = {}

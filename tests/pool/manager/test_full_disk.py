@@ -13,6 +13,7 @@ import pytest
 
 from fogft import disk
 from fogft.model import intent
+from fogft.pool.commands import status
 from tests.needs import needs
 from tests.pool.scene import Scene
 
@@ -62,6 +63,9 @@ def test_a_full_disk_ends_nothing_and_is_waited_out(small: Scene) -> None:
     time.sleep(ROUNDS_S)
     assert manager.poll() is None, small.output()
     assert small.running() == ["0.1"]
+    seen = status.read(small.paths, time.time())
+    assert not seen.stale
+    assert any("No space left" in note for note in seen.to_json()["notes"])
     filler.unlink()
     scaled_by(small, 1)
     small.wait(lambda: small.whole(2))
