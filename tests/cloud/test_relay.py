@@ -21,9 +21,9 @@ SOME = 20 * 1024 * 1024
 class Path:
     """A relay that runs on a thread of its own, before an echo server or whatever is given."""
 
-    def __init__(self) -> None:
+    def __init__(self, begins: bytes = b"") -> None:
         self.server = socket.create_server(("127.0.0.1", 0))
-        self.relay = Relay(self.server.getsockname())
+        self.relay = Relay(self.server.getsockname(), begins)
         self._commands: list = []
         self._open = True
         self._thread = threading.Thread(target=self._run)
@@ -42,9 +42,9 @@ class Path:
         self._commands.append(lambda: (self.relay.set_faults(LinkFaults(**faults)), done.set()))
         assert done.wait(30)
 
-    def client(self) -> socket.socket:
+    def client(self, source: str = "127.0.0.1") -> socket.socket:
         host, port = self.relay.endpoint.split(":")
-        made = socket.create_connection((host, int(port)), timeout=30)
+        made = socket.create_connection((host, int(port)), 30, (source, 0))
         self._sockets.append(made)
         return made
 
@@ -284,3 +284,38 @@ def test_a_connection_that_gives_up_while_it_waits_is_forgotten(path):
     wait_for(lambda: path.relay.connections == 1)
     client.close()
     wait_for(lambda: path.relay.connections == 0)
+
+
+@pytest.fixture
+def guarded():
+    made = Path(begins=b"\x16\x03")
+    yield made
+    made.close()
+
+
+def test_strangers_without_end_reach_no_server_and_keep_nobody_out(guarded):
+    """Who says nothing, something else, or leaves: the server sees none of them; others come."""
+    client = guarded.client()
+    client.sendall(b"\x16\x03first")
+    guarded.server.settimeout(30)
+    server, _ = guarded.server.accept()
+    assert receive(server, 7) == b"\x16\x03first"
+    for number in range(300):
+        stranger = guarded.client()
+        if number % 3:
+            stranger.sendall(b"GET /" if number % 3 == 1 else b"\x16\x03hello")
+            if number % 3 == 2:
+                stranger.close()
+    late = guarded.client("127.0.0.66")
+    late.sendall(b"\x16\x03late")
+    while True:
+        taken, (host, _) = guarded.server.accept()
+        if host == "127.0.0.66":
+            break
+        taken.close()  # it had left a moment too late
+    assert receive(taken, 6) == b"\x16\x03late"
+    taken.close()
+    server.sendall(b"back")
+    assert receive(client, 4) == b"back"
+    assert guarded.relay.connections <= 40
+    server.close()

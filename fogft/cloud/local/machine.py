@@ -174,7 +174,7 @@ class Machine:
         if self._record.zone.relay:
             from fogft.cloud.local.relay import Relay  # late: it loads asyncio
 
-            self._relay = Relay(("127.0.0.1", port.number))
+            self._relay = Relay(("127.0.0.1", port.number), begins=b"\x16\x03")  # of TLS
             endpoint = self._relay.endpoint
         running = State(
             MachinePhase.RUNNING,

@@ -4,6 +4,9 @@ A path is modelled as networks are: a chunk occupies it for its size over the ra
 before it, and arrives the delay later, in order whatever changes meanwhile. What the other side
 does not take stops the reading, so backpressure is the kernel's own.
 
+As on a network, the server sees from which host who connects, and a host that floods the port costs
+the others little: of those that wait for the server, the newest are kept.
+
 Not here: who sets the faults (`chaos`).
 """
 
@@ -15,8 +18,10 @@ import math
 import socket
 import struct
 import time
+from functools import partial
 
 from fogft.cloud.local.faults import LinkFaults
+from fogft.records.greetings import oldest_of_most
 
 CHUNK_BYTES = 256 << 10
 MAX_HELD_BYTES = 32 << 20
@@ -24,6 +29,9 @@ RETRY_S = 0.05
 _CHUNK_S = 0.02  # how much a slow path takes at a time
 _MIN_CHUNK_BYTES = 1024
 _SLACK_BYTES = 64 << 10
+_YOUNG_LIMIT = 32  # connections that the server has not taken yet
+_FIRST_S = 5.0  # within which a client has to say something
+_CONNECT_S = 2.0  # a server that drops connections is tried no longer
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER with no time: close sends RST
 
 
@@ -72,6 +80,11 @@ class _Pipe:
         self._has_room = asyncio.Event()
         self.held_bytes = 0
 
+    def put(self, chunk: bytes) -> None:
+        """Put a chunk on the path."""
+        self._chunks.put_nowait((self._shaper.arrival(len(chunk), time.monotonic()), chunk))
+        self.held_bytes += len(chunk)
+
     async def receive(self) -> None:
         loop = asyncio.get_running_loop()
         chunk = b"-"
@@ -79,8 +92,7 @@ class _Pipe:
             await self._passes.wait()
             chunk = await loop.sock_recv(self._source, self._shaper.chunk_bytes)
             await self._passes.wait()
-            self._chunks.put_nowait((self._shaper.arrival(len(chunk), time.monotonic()), chunk))
-            self.held_bytes += len(chunk)
+            self.put(chunk)
             while self.held_bytes > self._shaper.room_bytes:
                 self._has_room.clear()
                 await self._has_room.wait()
@@ -107,10 +119,13 @@ class Relay:
 
     Args:
         upstream: Where the server listens, or will.
+        begins: What clients say first, if they always do: who says else is not passed on.
     """
 
-    def __init__(self, upstream: tuple[str, int]) -> None:
+    def __init__(self, upstream: tuple[str, int], begins: bytes = b"") -> None:
         self._upstream = upstream
+        self._begins = begins
+        self._young: dict[asyncio.Task[None], str] = {}  # oldest first, with the client's host
         self._shapers = (Shaper(), Shaper())
         self._loop = asyncio.new_event_loop()
         self._passes = asyncio.Event()  # unless there is a blackhole
@@ -162,29 +177,52 @@ class Relay:
     async def _accept(self) -> None:
         while True:
             try:
-                client, _ = await self._loop.sock_accept(self._listener)
+                client, (host, _) = await self._loop.sock_accept(self._listener)
             except OSError:  # out of descriptors
                 await asyncio.sleep(RETRY_S)
                 continue
-            connection = self._loop.create_task(self._serve(client))
+            connection = self._loop.create_task(self._serve(client, host))
             self._connections[connection] = ()
-            connection.add_done_callback(self._connections.pop)
+            self._young[connection] = host
+            connection.add_done_callback(partial(self._forget, client))
+            if len(self._young) > _YOUNG_LIMIT:
+                oldest_of_most(self._young).cancel()
+            await asyncio.sleep(0)  # however many come, those that are through have their turn
 
-    async def _serve(self, client: socket.socket) -> None:
+    def _forget(self, client: socket.socket, connection: asyncio.Task[None]) -> None:
+        client.close()  # of one that was cancelled before it began
+        self._young.pop(connection, None)
+        del self._connections[connection]
+
+    async def _serve(self, client: socket.socket, host: str) -> None:
+        client.setblocking(False)
         with client, contextlib.ExitStack() as stack:
             sides = [client]
             try:
                 await self._passes.wait()
-                sides.append(stack.enter_context(await self._connected(client)))
-                await self._exchange(*sides)
-            except (OSError, asyncio.CancelledError):
+                first = await asyncio.wait_for(self._first_of(client), _FIRST_S)
+                server = stack.enter_context(await self._connected(client, host))
+                sides.append(server)
+                connection = asyncio.current_task()
+                assert connection is not None
+                self._young.pop(connection, None)
+                await self._exchange(client, server, first)
+            except (OSError, asyncio.TimeoutError, asyncio.CancelledError):
                 for side in sides:
                     with contextlib.suppress(OSError):
                         side.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
 
-    async def _connected(self, client: socket.socket) -> socket.socket:
+    async def _first_of(self, client: socket.socket) -> bytes:
+        """Return what the client says first, if that matters. Raises OSError: it may not."""
+        if not self._begins:
+            return b""
+        first = await self._loop.sock_recv(client, self._shapers[0].chunk_bytes)
+        if not self._begins.startswith(first[: len(self._begins)]) or _has_left(client):
+            raise ConnectionAbortedError("no client of ours")
+        return first
+
+    async def _connected(self, client: socket.socket, host: str) -> socket.socket:
         """Connect to the server; wait until it first listens, as for a machine that still boots."""
-        client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         while True:
             reached = self.reached  # before: meanwhile another connection may find it listening
@@ -193,8 +231,10 @@ class Relay:
             server.setblocking(False)
             server.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             try:
-                await self._loop.sock_connect(server, self._upstream)
-            except (OSError, asyncio.CancelledError) as error:
+                server.bind((host, 0))
+                connecting = self._loop.sock_connect(server, self._upstream)
+                await asyncio.wait_for(connecting, _CONNECT_S)
+            except (OSError, asyncio.TimeoutError, asyncio.CancelledError) as error:
                 server.close()
                 if reached or isinstance(error, asyncio.CancelledError) or _has_left(client):
                     raise
@@ -203,9 +243,11 @@ class Relay:
                 self.reached = True
                 return server
 
-    async def _exchange(self, client: socket.socket, server: socket.socket) -> None:
+    async def _exchange(self, client: socket.socket, server: socket.socket, first: bytes) -> None:
         up, down = self._shapers
         pipes = (_Pipe(client, server, up, self._passes), _Pipe(server, client, down, self._passes))
+        if first:
+            pipes[0].put(first)
         connection = asyncio.current_task()
         assert connection is not None
         self._connections[connection] = pipes
