@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from struct import Struct
 
 from fogft.model.type_definition import Fields
@@ -42,7 +42,6 @@ class _Uncheckable(Exception):
     """A field whose form is not the same in every middleware."""
 
 
-@dataclass(frozen=True)
 class _Bytes:
     """A message's bytes.
 
@@ -51,22 +50,26 @@ class _Bytes:
         booleans: Where the booleans that were stepped over stand.
     """
 
-    payload: bytes
-    length_at: Struct
-    booleans: list[int] = field(default_factory=list)
+    __slots__ = "booleans", "length_at", "payload", "size"
+
+    def __init__(self, payload: bytes, length_at: Struct) -> None:
+        self.payload, self.length_at = payload, length_at
+        self.size = len(payload)
+        self.booleans: list[int] = []
 
     def length(self, at: int) -> tuple[int, int]:
         """Return a length that stands at an offset, aligned, and the offset behind it."""
         at += -(at - HEADER_BYTES) % 4
-        if at + 4 > len(self.payload):
+        if at + 4 > self.size:
             raise _Malformed("it ends within a length")
         return self.length_at.unpack_from(self.payload, at)[0], at + 4
 
     def skip(self, at: int, size: int) -> int:
         """Return the offset behind so many bytes."""
-        if at + size > len(self.payload):
-            raise _Malformed(f"it ends {at + size - len(self.payload)} bytes early")
-        return at + size
+        end = at + size
+        if end > self.size:
+            raise _Malformed(f"it ends {end - self.size} bytes early")
+        return end
 
     def check_booleans(self, first: int, end: int, step: int) -> None:
         """Make sure that each `step`-th byte between two offsets is 0 or 1."""
@@ -143,17 +146,18 @@ class Shape:
 
 def _number(kind: str) -> _Kind:
     size = NUMBER_BYTES[kind]
-    is_boolean = kind == "boolean"
 
     def walk(data: _Bytes, at: int) -> int:
-        at += -(at - HEADER_BYTES) % size
-        end = data.skip(at, size)
-        if is_boolean:
-            data.booleans.append(at)
+        return data.skip(at - (at - HEADER_BYTES) % -size, size)
+
+    def walk_boolean(data: _Bytes, at: int) -> int:
+        end = data.skip(at, 1)
+        data.booleans.append(at)
+        if data.payload[at] > 1:
             data.check_booleans(at, end, 1)
         return end
 
-    return _Kind(walk, size, True)
+    return _Kind(walk_boolean if kind == "boolean" else walk, size, True)
 
 
 def _string(bound: int) -> _Kind:
@@ -178,7 +182,7 @@ def _sequence(of: _Kind, bound: int) -> _Kind:
         count, at = data.length(at)
         if bound and count > bound:
             raise _Malformed(f"a sequence of at most {bound} elements has {count}")
-        if count > len(data.payload) - at:  # each has a byte at the least
+        if count > data.size - at:  # each has a byte at the least
             raise _Malformed(f"it ends within a sequence of {count} elements")
         known = len(data.booleans)
         end = _several(of, count, data, at)

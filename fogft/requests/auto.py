@@ -25,7 +25,7 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import Demand, Load
+from fogft.requests.load import NEVER, Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
@@ -131,7 +131,9 @@ class Auto(Learning):
         if not able:
             return ()
         for replica in able:  # what others answered first it may never end: `more` does not see it
-            self._doubts(replica, self._replicas[replica].oldest_begun, now)
+            begun = self._replicas[replica].oldest_begun
+            if begun < NEVER:
+                self._doubts(replica, begun, now)
         best = self._best(request, able, now)
         known = self._replicas[best]
         self._spares.request(known.service_s, now)
@@ -195,6 +197,8 @@ class Auto(Learning):
 
     def _best(self, request: bytes, able: Sequence[int], now: float) -> int:
         """Return who is expected to answer first; among equals any, by the request's random id."""
+        if len(able) == 1:
+            return able[0]
         chance = request[-1] if request else 0
         known = [self._replicas[replica] for replica in able]
         times_s = sorted(one.service_s for one in known)

@@ -27,7 +27,7 @@ class Latencies:
     half_life_s = 60.0  # after so much time, too
 
     def __init__(self) -> None:
-        self._weights = [0.0] * _BUCKETS
+        self._weights: dict[int, float] = {}  # by bucket, of those that have had a sample
         self._weight = 1.0  # of the next sample: grows, instead of all others shrinking
         self._total = 0.0
         self._sum = 0.0
@@ -42,14 +42,15 @@ class Latencies:
         self._weight *= self.per_sample
         if self._weight > _RESCALE_AT:
             self._rescale()
-        self._weights[_bucket(took_s)] += self._weight
+        bucket = _bucket(took_s)
+        self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight
         self._total += self._weight
         self._sum += self._weight * took_s
         self.samples += 1
 
     def _rescale(self) -> None:
         scale = 1.0 / self._weight
-        self._weights = [weight * scale for weight in self._weights]
+        self._weights = {bucket: weight * scale for bucket, weight in self._weights.items()}
         self._total *= scale
         self._sum *= scale
         self._weight = 1.0
@@ -66,10 +67,8 @@ class Latencies:
         """Return a quantile and the mean below it. From the top: interesting ones are high."""
         above = (1.0 - share) * self._total
         sum_below, quantile_s = self._sum, _FIRST_S
-        for bucket in range(_BUCKETS - 1, -1, -1):
+        for bucket in sorted(self._weights, reverse=True):
             weight = self._weights[bucket]
-            if not weight:
-                continue
             upper_s = _FIRST_S * _GROWTH**bucket
             if weight > above:
                 inside = above / weight  # as if its samples lay evenly in the bucket

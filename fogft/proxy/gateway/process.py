@@ -34,7 +34,7 @@ from fogft.proxy.config import read_gateway
 from fogft.proxy.gateway.gateway import Forwarder, numbers
 from fogft.proxy.middleware import fault_of
 from fogft.proxy.robot.client import ClientProxy
-from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.process import make_dialer, try_step
 from fogft.records.signing import Signer
@@ -108,7 +108,7 @@ class _Gateway:
         return holder
 
     def _make_dispatcher(
-        self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Callable[[], None]
+        self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Wake
     ) -> Dispatcher:
         dispatcher = Dispatcher(
             spec,

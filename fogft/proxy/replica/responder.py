@@ -279,7 +279,7 @@ class Responder:
                     self._known.forget(job)
                 elif not job.unwanted:
                     self._known.keep(job, payload)
-            more = queue.at_work > 1
+            more = queue.answers_together
             load = queue.load(now - job.arrived, ended=1)
         try:
             for incoming in waiting:

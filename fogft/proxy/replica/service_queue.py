@@ -40,6 +40,7 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
+_TOGETHER_S = 0.001  # answers that follow each other so closely leave in one message
 
 
 class Job:
@@ -109,6 +110,11 @@ class ServiceQueue:
             return False
         nearly_over = now - self._begun_last >= NEARLY * self.limit.takes_s > 0.0
         return self.at_work < max(1, self.limit.known) or (self.at_work == 1 and nearly_over)
+
+    @property
+    def answers_together(self) -> bool:
+        """Whether another answer is expected right after this one."""
+        return self.at_work > 1 and self.limit.service_s < _TOGETHER_S
 
     def takes(self, job: Job) -> bool:
         """Whether a job that arrives now is passed on at once."""

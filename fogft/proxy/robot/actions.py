@@ -26,7 +26,7 @@ from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import short
 from fogft.model.spec import Part, ServiceSpec
-from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.requests.decide import Decide, Judgement, Means, Pending, Reachable, Send
 from fogft.topics import goals
 from fogft.topics.goals import Goals, Had
@@ -303,7 +303,7 @@ class Actions:
         self,
         spec: ServiceSpec,
         respond: Callable[[Any, bytes], None],
-        wake: Callable[[], None],
+        wake: Wake,
         **how: Any,
     ) -> Dispatcher:
         """Create the dispatcher of an action's service; `how` as for `Dispatcher`."""

@@ -9,11 +9,13 @@ Not here: which links there are (`links`), files and signals (`process`), reques
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 from fogft.errors import RosError
@@ -22,7 +24,7 @@ from fogft.model import names
 from fogft.model.replica import Membership, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
-from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.proxy.robot.links import Define, Links, TypeCheck
 from fogft.proxy.robot.proxied_service import ProxiedService
 from fogft.proxy.robot.sending import key_of
@@ -39,9 +41,7 @@ _TICK_S = 0.02  # where topics pass
 _IDLE_TICK_S = 0.1
 
 # Makes the dispatcher of a service, given how to respond and how to have `tick` called soon.
-MakeDispatcher = Callable[
-    [ServiceSpec, Callable[[Any, bytes], None], Callable[[], None]], Dispatcher
-]
+MakeDispatcher = Callable[[ServiceSpec, Callable[[Any, bytes], None], Wake], Dispatcher]
 
 
 class ClientProxy:
@@ -79,10 +79,12 @@ class ClientProxy:
         self._version = (0, 0)
         self._membership: Membership | None = None
         self._through_gateways = False
-        self._wake = threading.Event()
-        self._topics = TopicsOnRobot(self._wake.set, merge, clock)
+        self._topics = TopicsOnRobot(self._wake, merge, clock)
+        # When services are to be looked at next; who brings it forward tells the waiting thread.
         self._next_look = NEVER
-        self._changed = False  # set before the event, so that it is not missed
+        self._look_lock = threading.Lock()
+        self._sooner: SimpleQueue[None] = SimpleQueue()
+        self._changed = False
 
     # -- configuration --------------------------------------------------------------------
 
@@ -122,7 +124,7 @@ class ClientProxy:
                 service.server.respond(handle, payload)
 
         make = self._make_dispatcher
-        service = ProxiedService(spec, make(self._here(spec), respond, self._wake.set))
+        service = ProxiedService(spec, make(self._here(spec), respond, self._wake))
         if spec.fallback is not None:
             self._adopt(service)
         return service
@@ -218,7 +220,16 @@ class ClientProxy:
     def look_again(self) -> None:
         """Have routes recomputed, for instance after a type became known. Any thread."""
         self._changed = True
-        self._wake.set()
+        self._wake()
+
+    def _wake(self, at: float = -NEVER, /) -> None:
+        """Have services looked at then, if not sooner. Any thread."""
+        with self._look_lock:
+            sooner = at < self._next_look
+            if sooner:
+                self._next_look = at
+        if sooner:
+            self._sooner.put(None)
 
     # -- the proxy's own thread -----------------------------------------------------------
 
@@ -230,8 +241,7 @@ class ClientProxy:
         """
         if self._node is not None and not self._node.alive:
             raise RosError("ROS has stopped; see the log for the reason", "start the proxy again")
-        self._wake.wait(max(0.0, min(timeout_s, self._next_look - self._clock())))
-        self._wake.clear()
+        self._await_look(timeout_s)
         changed, self._changed = self._changed, False
         with self._lock:
             if changed:
@@ -244,10 +254,19 @@ class ClientProxy:
             if self._node is not None:
                 for service in self._services.values():
                     service.advertise(self._node, now)
-        self._next_look = min(looks, default=NEVER)
-        if len(self._topics):
-            self._next_look = min(self._next_look, now + _TICK_S)
+        looks.append(now + _TICK_S if len(self._topics) else NEVER)
+        with self._look_lock:
+            self._next_look = min(self._next_look, *looks)
         return changed
+
+    def _await_look(self, timeout_s: float) -> None:
+        """Wait until it is time to look, at most so long. What comes after that is for the next."""
+        until = self._clock() + timeout_s
+        with contextlib.suppress(Empty):
+            while (left_s := min(until, self._next_look) - self._clock()) > 0:
+                self._sooner.get(timeout=left_s)  # then it is to be sooner
+        with self._look_lock:
+            self._next_look = NEVER
 
     def _differences(self, link: Link) -> Mapping[str, str]:
         return self._type_check.differences(link, [s.spec for s in self._services.values()])

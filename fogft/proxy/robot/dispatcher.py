@@ -21,7 +21,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
-from typing import Any
+from typing import Any, Protocol
 
 from fogft.counters import worth_logging
 from fogft.errors import RosError
@@ -45,9 +45,19 @@ log = logging.getLogger(__name__)
 
 MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
 _SHORTEST_S = 0.002
-_TICK_S = 0.02  # while losers may have to be told
+_TICK_S = 0.02  # until losers are told, at the latest
 _SELDOM_S = 0.1  # while requests wait: else it looks when the policy or a deadline wants it
-_LINGERS_S = 0.1
+
+
+class Wake(Protocol):
+    """Has `Dispatcher.tick` called then, if not sooner; without a moment, at once. Any thread."""
+
+    def __call__(self, at: float = -NEVER, /) -> None:
+        """Bring it about."""
+
+
+def _nobody(at: float = -NEVER, /) -> None:
+    """Wake nobody."""
 
 
 class Dispatcher:
@@ -78,7 +88,7 @@ class Dispatcher:
         fault_of: Callable[[bytes], str] = lambda payload: "",
         ok_of: Callable[[str], Accepts] | None = None,
         empty_response: bytes | None = None,
-        wake: Callable[[], None] = lambda: None,
+        wake: Wake = _nobody,
         clock: Callable[[], float] = time.monotonic,
         max_pending_bytes: int = 256 << 20,
         max_pending: int = 1 << 16,
@@ -97,7 +107,6 @@ class Dispatcher:
         self._decide = Decide() if decide is None else decide
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
-        self._busy_until = NEVER if self._decide.replicates else -NEVER
         self._asked = False  # since the last tick
         self._requests: PendingRequests[Request] = PendingRequests(
             policy(spec),
@@ -131,11 +140,10 @@ class Dispatcher:
         """Take a caller's request and offer it to the replicas that the policy chooses."""
         spec = self._ledger.spec
         request = self._id_of(spec.name, handle)
-        with self._lock:
-            if self.leaving:
-                return
-            if self.taken is not None:
-                self.taken.append(request)
+        if self.leaving:
+            return
+        if self.taken is not None:
+            self.taken.append(request)
         self.forward(request, payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
@@ -158,16 +166,12 @@ class Dispatcher:
             if item.trace is not None:
                 item.trace.asked.update(dict.fromkeys(chosen, now))
             soon = min(requests.choose.look_at, deadline, now + _SELDOM_S)
-            if len(chosen) > 1:
-                self._busy_until = max(self._busy_until, now + _LINGERS_S)
-                soon = min(soon, now + _TICK_S)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
         self._sender.first(request, payload, links, chosen, timeout_s)
         if self._decide.replicates:
             self._sender.replicate()
-        if soon < self._sender.next_look:
-            self._wake()
+        self._wake(soon)
         return True
 
     def _turn_away(self, request: bytes, size: int) -> None:
@@ -233,6 +237,7 @@ class Dispatcher:
             self._delivery.give(pending, payload)  # first: what is counted can wait
             if losers:
                 self._sender.forget(request, losers)
+                self._wake(now + _TICK_S)
             with self._lock:
                 outcomes.won(replica, now - pending.item.arrived, len(payload))
                 if outcomes.trace is not None:
@@ -365,24 +370,19 @@ class Dispatcher:
         for request, pending in expired:
             self._delivery.expired(request, pending)
             self._sender.forget(request, tuple(self._sender.links))
-        self._sender.offer_more(now)
+        look_at = self._sender.offer_more(now)
         self._sender.replicate()
         with self._lock:
             idle = self._requests.idle()
         for request in idle:
             self._settle(request)
-        look_at = min(self._sender.next_look, self._delivery.tick(now, able=self.able))
+        look_at = min(look_at, self._delivery.tick(now, able=self.able))
         look_at = max(look_at, now + _SHORTEST_S)
-        self._sender.next_look = look_at
-        # After that was set: who comes later sees it, and wakes.
         if self._asked or len(self._requests):
             self._asked = False
             deadline = max(self._requests.soonest_deadline, now + _SHORTEST_S)
             look_at = min(look_at, deadline, now + _SELDOM_S)
-        if now < self._busy_until:
-            look_at = min(look_at, now + _TICK_S)
-        self._sender.next_look = look_at
-        return look_at
+        return min(look_at, now + _TICK_S) if self._decide.replicates else look_at
 
     def close(self) -> None:
         """Release external resources."""

@@ -38,7 +38,7 @@ from fogft.proxy.robot import standby as in_line
 from fogft.proxy.robot.actions import Actions
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.diagnostics import SeenFromRos
-from fogft.proxy.robot.dispatcher import Dispatcher
+from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.manager_restart import ManagerRestart
 from fogft.proxy.robot.order_mark import OrderMark
@@ -134,7 +134,7 @@ def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
 def make_dispatcher(
     spec: ServiceSpec,
     respond: Callable[[Any, bytes], None],
-    wake: Callable[[], None],
+    wake: Wake,
     *,
     marks: Path,
     pool_uid: str,

@@ -17,7 +17,7 @@ from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
 from fogft.proxy.robot.request import Ledger
 from fogft.requests.decide import Reachable
-from fogft.requests.load import NEVER, Handling
+from fogft.requests.load import Handling
 
 
 class Sender:
@@ -26,7 +26,6 @@ class Sender:
     Attributes:
         links: Those that may be asked, by replica.
         able: The replicas that the policy may choose.
-        next_look: When the policy wants to be asked, as `offer_more` found it.
     """
 
     def __init__(self, ledger: Ledger) -> None:
@@ -38,7 +37,6 @@ class Sender:
         self._hanging: set[int] = set()
         self.links: dict[int, Link] = {}
         self.able: tuple[int, ...] = ()
-        self.next_look = NEVER
 
     def burst(self, begins: bool) -> None:
         """Batch what is sent until the burst ends into few messages."""
@@ -102,17 +100,22 @@ class Sender:
             self.offer_more(now)
         self.replicate()
 
-    def offer_more(self, now: float) -> None:
-        """Ask the policy about each request that may need a further replica."""
+    def offer_more(self, now: float) -> float:
+        """Ask the policy about each request that may need a further replica.
+
+        Returns:
+            When it wants to be asked again.
+        """
         newest_first = self._ledger.spec.freshness is Freshness.LATEST
         with self._ledger.lock:
             links, requests = self.links, self._ledger.requests
             steps = requests.more(self.able, now, newest_first=newest_first)
-            self.next_look = requests.choose.look_at
+            look_at = requests.choose.look_at
         full: set[int] = set()  # who declined a request a moment ago is offered no other
         for request, replica in steps:
             if not self._offer(request, replica, links[replica], skip=replica in full):
                 full.add(replica)
+        return look_at
 
     def _offer(self, request: bytes, replica: int, link: Link, *, skip: bool) -> bool:
         now = self._ledger.clock()

@@ -79,7 +79,8 @@ class Pacer:
             client.requested(now, together=together)
             if client.probing in (Probing.ASKED, Probing.NO) and now >= client.ask_again_at:
                 client.ask_again_at = now + _ASK_AGAIN_S
-                self._asked[id] = now + _ASK_LIMIT_S
+                # Of a node that has long been known one look is enough.
+                self._asked[id] = now + (_ASK_LIMIT_S if client.strict else 0.0)
                 self._begin()
             elif client.waiting:
                 self._wake.notify()

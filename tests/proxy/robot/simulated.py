@@ -279,8 +279,9 @@ class World:
     def at(self, when: float, what: Callable[[], None]) -> None:
         self.time.at(when, what)
 
-    def _wake(self) -> None:
-        self._plan_tick(self.now)
+    def _wake(self, at: float = 0.0) -> None:
+        if at < self._tick_at:
+            self._plan_tick(max(at, self.now))
 
     def _plan_tick(self, when: float) -> None:
         self._tick_at = when

@@ -27,7 +27,7 @@ class Scene:
         self.answers: list[tuple[Any, bytes]] = []
         actions = Actions(self.clock)
         self.parts = {
-            spec.part.value: actions.make(spec, self._answered, lambda: None)
+            spec.part.value: actions.make(spec, self._answered, lambda at=0.0: None)
             for spec in (GOAL, CANCEL, RESULT)
         }
         self.links = [FakeLink(slot) for slot in range(replicas)]

@@ -28,7 +28,7 @@ class Scene:
             fallback=FallbackSpec("/local", **fallback), trace=trace,
             ok_field="ok" if is_ok else "",
         )  # fmt: skip
-        self.wakes = 0
+        self.wake_at = float("inf")
         self.dispatcher = Dispatcher(
             self.spec,
             lambda handle, payload: self.responses.append((handle, payload)),
@@ -41,8 +41,8 @@ class Scene:
         self.dispatcher.route(self.links)
         self.dispatcher.tick()
 
-    def _wake(self) -> None:
-        self.wakes += 1
+    def _wake(self, at: float = 0.0) -> None:
+        self.wake_at = min(self.wake_at, at)
 
     def ask(self, handle: object = "caller") -> None:
         self.dispatcher.submit(b"q", handle)
@@ -128,7 +128,7 @@ def test_a_request_that_kills_services_is_left_to_the_fallback_which_is_asked_on
 def test_at_once_while_no_replica_is_ready():
     scene = Scene(links=0, while_none_ready=True)
     scene.ask()
-    assert scene.wakes
+    assert scene.wake_at <= scene.clock()
     scene.pass_time(0.0)
     scene.local.calls[0][1](b"from here")
     assert scene.responses == [("caller", b"from here")]
