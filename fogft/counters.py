@@ -26,8 +26,8 @@ class Counters:
     def add(self, event: str, times: int = 1) -> int:
         """Count an event; return how often it has happened."""
         with self._lock:
-            self._counts[event] += times
-            return self._counts[event]
+            count = self._counts[event] = self._counts[event] + times
+        return count
 
     def warn(self, log: logging.Logger, event: str, message: str, *values: object) -> None:
         """Count an event and log it with its count, less often the more it happens."""

@@ -298,7 +298,7 @@ class Auto(Learning):
             "replicas": {
                 short(replica): {
                     "service_s": known.service_s,
-                    "delay_s": known.delay_s(),
+                    "delay_s": known.delay_s,
                     "doubted": known.doubted,
                 }
                 for replica, known in sorted(self._replicas.items())

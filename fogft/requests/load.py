@@ -88,6 +88,7 @@ class ReplicaLoad:
 
     Attributes:
         service_s: How long it works on a request, as far as is known.
+        delay_s: After how long an attempt takes unusually long.
         doubted: An attempt is overdue, and it has ended none since that one began.
         ended_at: When it last ended an attempt, with an answer or too late for one.
     """
@@ -106,8 +107,8 @@ class ReplicaLoad:
         self._others_until = -NEVER
         self._avoided_s = 0.0
         self._avoided_until = -NEVER
-        self._delay_s = UNKNOWN_DELAY_S
-        self._delay_holds_until = 0
+        self.delay_s = UNKNOWN_DELAY_S
+        self._delay_holds_until = _SAMPLES_NEEDED
 
     # -- what is believed -----------------------------------------------------------------
 
@@ -157,6 +158,8 @@ class ReplicaLoad:
         if typical_s / _ALIKE < service_s < typical_s * _ALIKE:
             service_s = typical_s
         rtt_s = self._rtt_s or 0.0
+        if not self._at_work:
+            return rtt_s + service_s * (1 + self.ahead(now))
         left_s, spent_s = service_s * (1 + self.ahead(now)), self._spent_s(now)
         if spent_s <= _LATE * (rtt_s + service_s):
             left_s -= min(spent_s, service_s)
@@ -164,19 +167,9 @@ class ReplicaLoad:
             left_s += spent_s
         return rtt_s + left_s
 
-    def delay_s(self) -> float:
-        """Return after how long an attempt takes unusually long."""
-        samples = self.latencies.samples
-        if samples < _SAMPLES_NEEDED:
-            return UNKNOWN_DELAY_S
-        if samples >= self._delay_holds_until:  # of many, one more makes little difference
-            self._delay_holds_until = samples + 1 + min(samples // 16, 15)
-            self._delay_s = max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
-        return self._delay_s
-
     def overdue_at(self, request: bytes, begun: float) -> float:
         """Return when an attempt is slower than nearly all others and than its expected wait."""
-        return self._at_work.get(request, (0.0, begun + self.delay_s()))[1]
+        return self._at_work.get(request, (0.0, begun + self.delay_s))[1]
 
     def doubtful_at(self, begun: float) -> float:
         """Return when an attempt that began then is long overdue.
@@ -186,14 +179,14 @@ class ReplicaLoad:
         """
         if self.latencies.samples < _SAMPLES_NEEDED:
             return begun + _UNKNOWN_DOUBT_S
-        return begun + _DOUBT_AFTER * self.delay_s()
+        return begun + _DOUBT_AFTER * self.delay_s
 
     # -- what happens ---------------------------------------------------------------------
 
     def asked(self, request: bytes, now: float) -> None:
         """Note an attempt about to be sent."""
         expected_s = (self._rtt_s or 0.0) + self.service_s * (1 + self.ahead(now))
-        self._at_work[request] = now, now + _LATE * max(self.delay_s(), expected_s)
+        self._at_work[request] = now, now + _LATE * max(self.delay_s, expected_s)
         self.asked_at = now
 
     def heard(self, request: bytes, load: Load, now: float) -> None:
@@ -237,11 +230,15 @@ class ReplicaLoad:
 
     def overtaken(self, begun: float, now: float) -> None:
         """Learn from a stopped attempt, if it was already unusually slow."""
-        if now - begun >= self.delay_s():
+        if now - begun >= self.delay_s:
             self._took(now - begun, now)
 
     def _took(self, seconds: float, now: float) -> None:
         self.latencies.add(seconds, now)
+        samples = self.latencies.samples
+        if samples >= self._delay_holds_until:  # of many, one more makes little difference
+            self._delay_holds_until = samples + 1 + min(samples // 16, 15)
+            self.delay_s = max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
         if self._rtt_s is None:  # it never told its load
             self.service_s = self.latencies.mean_below_s(LATE_SHARE) or 0.0
 

@@ -40,7 +40,7 @@ from fogft.ros.reservations import Reservation, own_domain, reserve_domain
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.05
-_IDLE_TICK_S = 0.15  # while all is ready, and nobody waits
+_IDLE_TICK_S = 0.15  # while all is ready, and no order, goal or topic waits
 _LEAVE_S = 4.0
 """From a SIGTERM to the end: robots probe each second, and some clouds kill after five."""
 

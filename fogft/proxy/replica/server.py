@@ -255,12 +255,8 @@ class ServerProxy:
 
     @property
     def idle(self) -> bool:
-        """Whether all services can answer, and nothing is pending."""
-        return (
-            self.complete
-            and not self.responder.in_flight
-            and not (self._topics or self._goals or self._ordered)
-        )
+        """Whether all services can answer, and none of them needs frequent looks."""
+        return self.complete and not (self._topics or self._goals or self._ordered)
 
     @property
     def endpoint(self) -> str:

@@ -286,11 +286,6 @@ class ClientProxy:
 
     # -- what people see ------------------------------------------------------------------
 
-    @property
-    def idle(self) -> bool:
-        """Whether nothing is pending."""
-        return self._next_look == NEVER
-
     def report(self) -> dict[str, Any]:
         """Return the report of links and services for `proxy-status.json`."""
         with self._lock:

@@ -46,7 +46,6 @@ log = logging.getLogger(__name__)
 MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
 _SHORTEST_S = 0.002
 _TICK_S = 0.02  # until losers are told, at the latest
-_SELDOM_S = 0.1  # while requests wait: else it looks when the policy or a deadline wants it
 
 
 class Wake(Protocol):
@@ -107,7 +106,6 @@ class Dispatcher:
         self._decide = Decide() if decide is None else decide
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
-        self._asked = False  # since the last tick
         self._requests: PendingRequests[Request] = PendingRequests(
             policy(spec),
             self._decide,
@@ -161,11 +159,11 @@ class Dispatcher:
                 return False
             links, able = self._sender.links, self._sender.able
             item = Request(payload, handle, now, traced=outcomes.trace is not None)
-            deadline, self._asked = now + timeout_s, True
+            deadline = now + timeout_s
             chosen = requests.begin(request, item, able, deadline=deadline, now=now)
             if item.trace is not None:
                 item.trace.asked.update(dict.fromkeys(chosen, now))
-            soon = min(requests.choose.look_at, deadline, now + _SELDOM_S)
+            soon = min(requests.choose.look_at, deadline)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
         self._sender.first(request, payload, links, chosen, timeout_s)
@@ -377,11 +375,7 @@ class Dispatcher:
         for request in idle:
             self._settle(request)
         look_at = min(look_at, self._delivery.tick(now, able=self.able))
-        look_at = max(look_at, now + _SHORTEST_S)
-        if self._asked or len(self._requests):
-            self._asked = False
-            deadline = max(self._requests.soonest_deadline, now + _SHORTEST_S)
-            look_at = min(look_at, deadline, now + _SELDOM_S)
+        look_at = max(min(look_at, self._requests.soonest_deadline), now + _SHORTEST_S)
         return min(look_at, now + _TICK_S) if self._decide.replicates else look_at
 
     def close(self) -> None:

@@ -56,8 +56,7 @@ log = logging.getLogger(__name__)
 _STATEFUL_BYTES = 64 << 20  # of requests; each is in the log of its order, too
 TRACE_NAME = "trace.jsonl"
 _TRACE_BYTES = 16 << 20
-_REPORT_EVERY_S = 0.5
-_REPORT_IDLE_EVERY_S = 1.0  # after so long without a request
+_REPORT_EVERY_S = 1.0
 _REPORT_AFTER_CHANGE_S = 0.05
 _LOOK_EVERY_S = 0.1  # at files, and what else needs no haste
 
@@ -281,15 +280,13 @@ class _Running:
         watched_certificate = Watched(config.credentials.certificate)  # written after its key
         watched_certificate.changed()
         announcements = Watched(config.announcements) if config.announcements else None
-        started = reported = busy = time.monotonic()
+        started = reported = time.monotonic()
         looked = 0.0
         changed = False  # since the last report
         participant, renewal = b"", in_line.Renewal()
         while not stop.is_set():
             changed = proxy.run_once() or changed
             now = time.monotonic()
-            if not proxy.idle:
-                busy = now
             if now - looked < _LOOK_EVERY_S:  # requests' own deadlines are seen to by `run_once`
                 continue
             looked = now
@@ -311,9 +308,7 @@ class _Running:
                 self.following.renew()
             if announcements is not None and announcements.changed():
                 try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
-            idle = now - busy > _REPORT_IDLE_EVERY_S
-            every_s = _REPORT_IDLE_EVERY_S if idle else _REPORT_EVERY_S
-            if now - reported > (_REPORT_AFTER_CHANGE_S if changed else every_s):
+            if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
                 reported, changed = now, False
                 if not folder.exists():  # the pool's: its end is the pool's
                     log.warning("folder_gone path=%s", folder)

@@ -16,7 +16,7 @@ from fogft.model.spec import ServiceSpec
 from fogft.requests.decide import Pending
 from fogft.requests.pending import PendingRequests
 
-_TRACE_KEPT = 20_000  # lines until they are written, twice a second
+_TRACE_KEPT = 20_000  # lines until they are written, once a second
 
 
 class RequestTrace:
