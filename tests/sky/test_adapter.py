@@ -100,6 +100,9 @@ def test_a_gateways_machine_opens_its_ports_too(scene: Scene):
     assert scene.sky.task(NAME)["resources"]["ports"] == ["7448", "7470", "7471", "7472"]
     scene.cloud.launch(scene.order(replica(1)))
     assert scene.sky.task(cluster_name(replica(1)))["resources"]["ports"] == ["7448"]
+    pod = Placement("runpod", "CA", "CA-MTL-1", "cpu3c-2-8", spot=False)
+    with pytest.raises(CloudError, match="maps ports"):
+        scene.cloud.launch(scene.order(replica(2), pod, more_ports=(7470,)))
 
 
 def test_a_stopped_machine_that_is_gone_is_listed_no_more(scene: Scene):

@@ -23,7 +23,13 @@ from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.following import Following
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import ON_THE_MACHINE, UNDER_WAY, Entry, Journal, Stage
-from fogft.cloud.sky.naming import OWNER, cluster_name, label_value, replica_of
+from fogft.cloud.sky.naming import (
+    MAPPING_CLOUDS,
+    OWNER,
+    cluster_name,
+    label_value,
+    replica_of,
+)
 from fogft.cloud.sky.presence import Presence
 from fogft.cloud.sky.prices import Prices, disk_usd_per_hour
 from fogft.cloud.sky.provider import NotAllowedError, Provider
@@ -105,6 +111,12 @@ class SkyCloud:
 
     def launch(self, order: Launch) -> None:
         """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
+        cloud = order.placement.cloud
+        if order.more_ports and cloud in MAPPING_CLOUDS:
+            raise CloudError(
+                f"`{cloud}` maps ports, so a gateway there cannot be dialled",
+                "name another cloud in `fogft.gateway.resources`",
+            )
         group = self._firewall(order)
         instead = self._prices.instead(order.placement, order.limit_usd_per_hour)
         if order.is_there:
