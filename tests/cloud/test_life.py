@@ -19,8 +19,10 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, ReplicaId
 from tests.cloud.waiting import wait_for
 
+HELLO = b"\x16\x03hello"  # as TLS begins, or it is not passed on
 
-def echo(endpoint: str, data: bytes = b"hello") -> bytes:
+
+def echo(endpoint: str, data: bytes = HELLO) -> bytes:
     host, port = endpoint.split(":")
     with socket.create_connection((host, int(port)), timeout=30) as connection:
         connection.sendall(data)
@@ -38,7 +40,7 @@ def test_a_machine_is_listed_runs_and_answers(local):
     machine = local.wait(id, MachinePhase.RUNNING)
     assert (machine.placement.location, machine.spec_hash) == ("local/us-west-1/a", "abc")
     assert (machine.usd_per_hour, machine.notice, machine.failure) == (0.07, False, None)
-    assert echo(machine.endpoint) == b"hello"
+    assert echo(machine.endpoint) == HELLO
 
 
 def test_the_server_gets_its_place_its_files_and_marks_in_its_environment(local, tmp_path):
@@ -187,7 +189,7 @@ def test_connections_wait_for_a_server_that_is_still_starting(local):
         thread.start()
     for thread in threads:
         thread.join()
-    assert results == [b"hello"] * 3
+    assert results == [HELLO] * 3
 
 
 def test_without_a_relay_the_server_listens_at_the_endpoint(local):
