@@ -32,22 +32,23 @@ def test_a_version_that_crashes_is_rolled_back_and_the_next_one_taken_with_an_up
     """Under load: a bad file is given up, the good version serves on, a mended file is taken.
 
     All that runs was started by another version of fogft: `status` says so, and the `up` that
-    takes the mended file replaces it all.
+    takes the mended file replaces it all. Versions of the stateful service never mix: the new one
+    adds ten where the old one adds one, so that each answer shows who computed it.
     """
     before = pool.folder / "before"
     for name in ("fogft", "templates"):
         shutil.copytree(ROOT / name, before / name, ignore=shutil.ignore_patterns("__pycache__"))
     init = before / "fogft" / "__init__.py"
     init.write_text(init.read_text().replace(fogft.__version__, "0.0.9"))
-    pool.write(replicas=2)
+    write(pool, "old 1")
     ours = pool.environ.get("PYTHONPATH", "")
     pool.environ["PYTHONPATH"] = f"{before}{os.pathsep}{ours}"
     pool.up()
     pool.wait(lambda: (pool.folder / "home" / "pools" / "e2e" / "good.yaml").exists())
-    old, good = replicas(pool), pool.file.read_text()
-    client = pool.client(300, 10)
+    old = replicas(pool)
+    client, counting = pool.client(300, 10), Counting(pool)
 
-    pool.file.write_text(good.replace("/plan_service.py", "/no_such_service.py"))
+    write(pool, "bad 100", plan="no_such_service.py")
     said = pool.fogft("up", str(pool.file), "--yes", ok=False)
     assert "new before old" in said
     assert "error: `e2e` was not updated: replica " in said
@@ -67,7 +68,7 @@ def test_a_version_that_crashes_is_rolled_back_and_the_next_one_taken_with_an_up
     assert versions(status) == {"0.0.9"}
     pool.environ["PYTHONPATH"] = ours
     assert "runs fogft 0.0.9" in pool.fogft("status", ok=False)
-    pool.file.write_text(good.replace("plan_service.py 0.005", "plan_service.py 0.006"))
+    write(pool, "new 10")
     first = subprocess.Popen(
         [sys.executable, "-m", "fogft", "up", str(pool.file), "--yes"],
         env=pool.environ, cwd=pool.folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -85,6 +86,7 @@ def test_a_version_that_crashes_is_rolled_back_and_the_next_one_taken_with_an_up
     result = client.finish()
     assert result["requests"] > 100
     assert flawless(result), result
+    never_mixed(counting.finish())
 
 
 def versions(status: dict[str, Any]) -> set[str]:
@@ -119,23 +121,26 @@ def test_old_goes_before_new_where_the_budget_has_no_room_for_both(pool):
     assert flawless(result), result
 
 
-def test_versions_of_a_stateful_service_never_mix(pool):
-    """The new version adds ten where the old one adds one: each answer shows who computed it."""
-    write_counter(pool, "old", 1)
-    pool.up()
-    client = subprocess.Popen(
-        [sys.executable, f"{NODES}/count_client.py"],
-        env=pool.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert client.stderr is not None
-    assert any(line.startswith("asking") for line in client.stderr)
-    write_counter(pool, "new", 10)
-    pool.fogft("up", str(pool.file), "--yes", limit_s=200)
-    assert pool.status()["update"] is None
-    client.send_signal(signal.SIGINT)
-    out, err = client.communicate(timeout=100)
-    assert client.returncode == 0, err
-    answers = json.loads(out)
+class Counting:
+    """A running count_client.py."""
+
+    def __init__(self, pool) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, f"{NODES}/count_client.py"],
+            env=pool.environ, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self._process.stderr is not None
+        assert any(line.startswith("asking") for line in self._process.stderr)
+
+    def finish(self) -> list[str | None]:
+        self._process.send_signal(signal.SIGINT)
+        out, err = self._process.communicate(timeout=100)
+        assert self._process.returncode == 0, err
+        return json.loads(out)
+
+
+def never_mixed(answers: list[str | None]) -> None:
+    """Check that no answer is missing, and that one version computed after the other."""
     assert None not in answers, "a request was lost"
     said = [(word, int(total)) for word, total in map(str.split, answers)]
     versions = [version for version, _ in said]
@@ -147,14 +152,17 @@ def test_versions_of_a_stateful_service_never_mix(pool):
         assert total == before, (version, total)
 
 
-def write_counter(pool, version: str, factor: int) -> None:
+def write(pool, count: str, plan: str = "plan_service.py") -> None:
+    """Write a pool file with two services, one of which has state; `count` is its arguments."""
+    python = f"{sys.executable} {NODES}"
     pool.file.write_text(
         "name: e2e\n"
-        "resources: {infra: local}\n"
-        f"run: exec {sys.executable} {NODES}/count_service.py {version} {factor}\n"
+        "resources: {any_of: [{infra: local/us-west-1}, {infra: local/us-west-2}]}\n"
+        f"run: {python}/count_service.py {count} & exec {python}/{plan} 0.005\n"
         "fogft:\n"
         "  replicas: 2\n"
         "  services:\n"
+        "    - {name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 10.0}\n"
         "    - name: /count\n"
         "      type: std_srvs/srv/SetBool\n"
         "      timeout_s: 10.0\n"
