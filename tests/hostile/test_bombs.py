@@ -107,7 +107,7 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
             session.put(keys(0)[SERVICE], bomb[:-1], attachment=header)
 
         took_s = []
-        for number in range(1000, 1000 + by_day(20, at_night=50)):
+        for number in range(1000, 1000 + by_day(10, at_night=50)):
             throw()
             took_s.append(round_trip_s(good, owner, number, 1))
             time.sleep(0.05)

@@ -92,7 +92,7 @@ def test_scrapers_that_say_nothing_keep_no_other_out_and_few_threads() -> None:
     scrape.at("127.0.0.1:0")
     host, _, port = scrape.endpoint.rpartition(":")
     try:
-        with standing(scrape.endpoint, 100) as silent:
+        with standing(scrape.endpoint, 20) as silent:
             assert silent[0].recv(1) == b""  # at once, for newer ones came
             with socket.create_connection((host, int(port)), 30.0) as one:
                 one.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")

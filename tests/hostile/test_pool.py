@@ -32,7 +32,7 @@ __all__ = ["pool"]
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
 
 ROOT, SITE = Path(__file__).parents[2], Path(__file__).parent / "site"
-FRAMES = 500  # of the hostile robot, at each replica, while another lies
+FRAMES = 200  # of the hostile robot, at each replica, while another lies
 DEADLINE_S = 10.0  # of a request, where the pool's file names none
 
 
