@@ -12,9 +12,11 @@ import itertools
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import replace
 
 from fogft.errors import FogftError
-from fogft.simulation.model import MAX_CORRELATION, MarketModel
+from fogft.simulation.model import MAX_CORRELATION, MarketModel, rates
 from fogft.simulation.timeline import Timeline
 
 
@@ -45,6 +47,22 @@ def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
         correlation_world=min(cloud, max(0.0, world or 0.0)),
         together=_together(timelines),
     )
+
+
+def feasible(model: MarketModel) -> MarketModel:
+    """Return a model that a market can have: its correlations are lowered together where needed."""
+    for percent in range(100, 0, -1):
+        share = percent / 100
+        lower = replace(
+            model,
+            correlation_region=share * model.correlation_region,
+            correlation_cloud=share * model.correlation_cloud,
+            correlation_world=share * model.correlation_world,
+        )
+        with suppress(FogftError):
+            rates(lower)
+            return lower
+    return replace(model, correlation_region=0.0, correlation_cloud=0.0, correlation_world=0.0)
 
 
 def of_zones(timelines: Mapping[str, Timeline]) -> dict[str, tuple[float, float]]:

@@ -22,6 +22,7 @@ from fogft.model.choices import Assumption
 from fogft.simulation.timeline import UNLIMITED, Timeline, of_changes
 
 MAX_CORRELATION = 0.95
+SLOW = 4.0
 HINT = "write `KEY=VALUE,...`, such as `mttf_s=54000,mttr_s=3600,correlation=0.22,boot_s=240`"
 
 
@@ -40,6 +41,7 @@ class Timing:
     on_demand_mttf_s: float = Assumption.on_demand_uptime_s
     on_demand_refused: float = 0.0  # share of the orders of on-demand machines
     launch_fails: float = 0.0  # share of the machines that are accepted and never serve
+    slow_setup: float = 0.0  # share of the machines whose boot takes `SLOW` times as long
     spot_quota: float = 0.0  # the most spot machines of a region; 0: any number
 
 
@@ -104,7 +106,7 @@ def rates(model: MarketModel) -> Rates:
 
 
 _POSITIVE = ("mttf_s", "mttr_s", "regime_s")
-_SHARES = ("together", "on_demand_refused", "launch_fails")
+_SHARES = ("together", "on_demand_refused", "launch_fails", "slow_setup")
 _FRACTIONS = ("correlation_region", "correlation_cloud", "correlation_world")
 MARKET_KEYS = ("correlation", *(f.name for f in fields(MarketModel)))
 TIMING_KEYS = tuple(f.name for f in fields(Timing))

@@ -31,7 +31,7 @@ from fogft.simulation.comparison import (
 )
 from fogft.simulation.market import FindOffers, remembered
 from fogft.simulation.meter import DAY_S
-from fogft.simulation.model import MARKET_KEYS, MarketModel, Timing, applied, read_values
+from fogft.simulation.model import MARKET_KEYS, SLOW, MarketModel, Timing, applied, read_values
 from fogft.simulation.timeline import PER_USD
 from fogft.simulation.traces import located, read
 from fogft.simulation.world import World
@@ -121,7 +121,8 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
         )
     notes = []
     limit_s = scenario.spec.health.start_limit_s
-    if 1.25 * scenario.timing.boot_s > limit_s:
+    longest_s = 1.25 * scenario.timing.boot_s * (SLOW if scenario.timing.slow_setup else 1.0)
+    if longest_s > limit_s:
         notes.append(
             f"some boots take longer than `health.start_limit_s` ({limit_s:g} s): such launches "
             "count as failed"
@@ -198,7 +199,15 @@ def simulate(
             )
         told_by_traces = sorted(set(values) & set(MARKET_KEYS))
         if fit:
-            market = fitting.fit(lines)
+            seen = fitting.fit(lines)
+            market = fitting.feasible(seen)
+            if market != seen:
+                notes.append(
+                    "the generator has no market as correlated as the traces: correlation "
+                    f"{market.correlation_region:.2f} within a region in place of "
+                    f"{seen.correlation_region:.2f}, {market.correlation_cloud:.2f} between "
+                    f"regions in place of {seen.correlation_cloud:.2f}"
+                )
             notes.append(
                 f"under `availability` write `spot_uptime_s: {market.mttf_s:.0f}` and "
                 f"`no_room: {1 - market.availability:.3f}`, as the traces show"

@@ -22,6 +22,7 @@ from fogft.model.replica import LinkReport, Machine, MachinePhase, Offer, Placem
 from fogft.planning.placement import crowding
 from fogft.simulation.market import Change, Market, changes, remembered, rounded_up
 from fogft.simulation.meter import Meter
+from fogft.simulation.model import SLOW
 from fogft.simulation.timeline import PER_USD
 
 EPOCH = 1_704_067_200.0  # a Monday, 00:00 UTC: simulated time is a time of day as well
@@ -227,6 +228,8 @@ class World:
         vm = self.vms[order.id] = Vm(order, self.now)
         self.meter.launches += self.meter.counts(self.now)
         boot_s = timing.boot_s * self._chance.uniform(0.75, 1.25)
+        if self._happens(timing.slow_setup):
+            boot_s *= SLOW
         fails = self._happens(timing.launch_fails)
         self.after(
             max(boot_s - timing.answer_s, 0.0),

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 
 import pytest
 
 from fogft.errors import FogftError
 from fogft.simulation import fitting, model
-from fogft.simulation.model import MarketModel, Timing, generate
+from fogft.simulation.model import MarketModel, Timing, generate, rates
 from fogft.simulation.timeline import of_samples
 from tests.needs import needs
 from tests.simulation.markets import INDEPENDENT
@@ -69,6 +70,18 @@ def test_correlation_of_what_is_known():
     assert fitting.correlation(waves, waves) == pytest.approx(1.0)
     assert fitting.correlation(waves, of_samples([0, 0, 1, 1] * 2, 60)) == pytest.approx(-1.0)
     assert fitting.correlation(waves, of_samples([1] * 8, 60)) is None
+
+
+def test_correlations_that_no_market_has_are_lowered_together():
+    usual = MarketModel()
+    assert fitting.feasible(usual) == usual
+    seen = replace(usual, correlation_region=0.95, correlation_cloud=0.06)
+    with pytest.raises(FogftError, match="no market has correlations"):
+        rates(seen)
+    found = fitting.feasible(seen)
+    assert rates(found).strikes > 0
+    assert 0.5 < found.correlation_region < 0.95
+    assert found.correlation_cloud == pytest.approx(0.06 * found.correlation_region / 0.95)
 
 
 def test_traces_that_never_change_cannot_be_fitted():
