@@ -102,7 +102,7 @@ def export(
 def _files(paths: PoolPaths, identity: Identity, root: Path) -> Iterator[tuple[str, str]]:
     """Yield name and content of what another machine needs; bytes as Latin-1."""
     kept = (
-        *(paths.spec, paths.good_spec, paths.intent, paths.trial, paths.discovered),
+        *(paths.spec, paths.good_spec, paths.intent, paths.trial, paths.discovered, paths.gateway),
         *(paths.history, paths.membership, paths.records, paths.manager_records),
         paths.announcements,
         *sorted(paths.credentials.iterdir()),
