@@ -8,6 +8,7 @@ Locks are flocks: they end with the process that holds them, whatever ends it.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import sys
@@ -173,7 +174,12 @@ class Lock:
         return self._try(fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def _try(self, how: int) -> bool:
-        descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        try:
+            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        except OSError as error:
+            if error.errno != errno.EROFS:
+                raise
+            descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)  # that will do
         try:
             fcntl.flock(descriptor, how)
         except BlockingIOError:

@@ -166,19 +166,21 @@ for write in disk.write_report, disk.write_json:
     except StateError:
         pass
 report, other = (disk.read_json(folder / name) for name in ("write_report", "write_json"))
-print(disk.unwritable(folder), report[0], other[0])
+with disk.locked(folder / "lock"):
+    held = disk.is_locked(folder / "lock")
+print(disk.unwritable(folder), report[0], other[0], held, disk.is_locked(folder / "lock"))
 """
 
 
 @needs("namespaces")
 def test_a_disk_that_takes_nothing_more_is_known_and_a_report_is_written_on_a_full_one(tmp_path):
-    """A shorter report takes the place of a longer one, whole; any other file stays as it is."""
+    """A shorter report takes the place of a longer one, whole; any other file stays as it is.
+
+    Who holds a lock is known in each case.
+    """
     words = ["unshare", "--mount", "bash", "-c", DISKS, "bash", str(tmp_path), sys.executable]
     done = subprocess.run([*words, TRIES], capture_output=True, text=True, timeout=100, check=False)
-    told = [line.split(" ") for line in done.stdout.splitlines()]
-    assert told == [
-        ["", "free", "free"],
-        ["full", "full", "free"],
-        ["", "free", "free"],
-        ["read-only", "free", "free"],
+    assert [line.split(" ") for line in done.stdout.splitlines()] == [
+        [why, reported, "free", "True", "False"]
+        for why, reported in (("", "free"), ("full", "full"), ("", "free"), ("read-only", "free"))
     ], done.stderr

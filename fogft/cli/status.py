@@ -115,7 +115,7 @@ def _remark(seen: Seen, folder: Path) -> None:
         )
     elif why := disk.unwritable(folder):
         output.warn(f"the disk of `{folder}` is {why}: nothing is launched")
-        output.hint("the manager resumes once there is space; requests need none")
+        output.hint("the manager resumes by itself once that is fixed; requests need no disk")
     elif seen.status.manager_version not in ("", __version__):
         output.warn(
             f"the pool runs fogft {seen.status.manager_version}, this command is {__version__}"
