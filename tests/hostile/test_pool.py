@@ -63,7 +63,7 @@ def test_hostile_parties_cost_a_pool_nothing_but_their_own_machine(
             attacked.enter_context(_attacked(pool, eve, one)) for one in pool.status()["replicas"]
         ]
         endpoint = next(one["endpoint"] for one in pool.status()["replicas"] if one["slot"] == 1)
-        attacked.enter_context(stranger(endpoint, "junk"))
+        attacked.enter_context(stranger(endpoint, "hello"))
         for number, lie in enumerate(("claims", "escapes"), 1):
             orders.write_text(lie)
             if lie == "claims":
