@@ -81,7 +81,7 @@ class Diagnosis:
         links = report["links"]
         up = sum(link["state"] == "up" for link in links)
         worst = max((status.level for status in services), default=Level.WARN)
-        left_s = _unmanaged(links)
+        age_s, left_s = _lease(links)
         if report["uplink_suspected"]:
             message = "all replicas fell silent together: the robot's uplink is suspected"
             worst = Level.ERROR
@@ -90,7 +90,7 @@ class Diagnosis:
         else:
             message = f"{up} of {len(links)} replicas are reachable"
             worst = max(worst, Level.OK if up == len(links) else Level.WARN)
-        if left_s is not None:
+        if left_s is not None and age_s >= UNMANAGED_AFTER_S:
             message += f"; no manager is running, and replicas shut down in {left_s / 3600:.1f} h"
             worst = max(worst, Level.WARN)
         credentials_s = report.get("credentials_left_s")
@@ -180,16 +180,11 @@ class Diagnosis:
         return Status(level, f"fogft {self._pool}: {what}", message, hardware, told)
 
 
-def _unmanaged(links: list[Mapping[str, Any]]) -> float | None:
-    """Return when the first replica ends because no manager is heard of; None if it is."""
-    leases = [
-        (float(one["lease_age_s"]), float(one["lease_left_s"]))
-        for one in links
-        if one.get("lease_age_s") is not None
-    ]
-    if not leases or min(age_s for age_s, _ in leases) < UNMANAGED_AFTER_S:
-        return None
-    return min(left_s for _, left_s in leases)
+def _lease(links: list[Mapping[str, Any]]) -> tuple[float, float | None]:
+    """Return how old the newest lease of a manager is, and when the first replica ends without."""
+    known = [one for one in links if one.get("lease_age_s") is not None]
+    age_s = min((float(one["lease_age_s"]) for one in known), default=0.0)
+    return age_s, min((float(one["lease_left_s"]) for one in known), default=None)
 
 
 def _ms(seconds: float | None) -> float | None:

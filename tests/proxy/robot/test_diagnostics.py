@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from fogft.proxy.robot.diagnostics import WINDOW_S, Diagnosis
+from fogft.proxy.robot.diagnostics import UNMANAGED_AFTER_S, WINDOW_S, Diagnosis
 from fogft.ros.port import Level
 
 
@@ -101,6 +101,17 @@ def test_counters_that_begin_anew_are_no_trouble():
     diagnosis = Diagnosis("arm", "r")
     look(diagnosis, report(link(0), silent=7))
     assert look(diagnosis, report(link(0), silent=0), 1.0)["service /plan"].level is Level.OK
+
+
+@pytest.mark.parametrize("managed", [True, False])
+def test_the_time_left_without_a_manager_is_told_and_warned_of_where_there_is_none(managed: bool):
+    """A manager signs a lease every minute; its replicas' leases end at different times."""
+    ages = (5.0, 300.0) if managed else (UNMANAGED_AFTER_S, 300.0)
+    links = [link(n, lease_age_s=age_s, lease_left_s=7200.0 - n) for n, age_s in enumerate(ages)]
+    told = look(Diagnosis("arm", "r"), report(*links))["pool"]
+    assert told.values["replicas end without a manager in_s"] == "7199"
+    assert told.level is (Level.OK if managed else Level.WARN)
+    assert ("no manager is running, and replicas shut down in 2.0 h" in told.message) is not managed
 
 
 @pytest.mark.parametrize(
