@@ -215,7 +215,7 @@ def check_name(name: str, depth: int = 2) -> None:
     """Check that a file name stays below its folder."""
     parts = PurePosixPath(name).parts
     safe = parts and all(part.strip(".") and "\0" not in part for part in parts)
-    if not safe or len(parts) > depth or name.startswith("/"):
+    if not safe or len(parts) > depth or name.startswith("/") or "/".join(parts) != name:
         raise ValueError(f"a file with an unexpected name: {name!r:.60}")
 
 

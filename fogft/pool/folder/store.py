@@ -10,13 +10,14 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Annotated, Protocol
 
 from fogft import disk
 from fogft.errors import PoolBusy, PoolNotFound, SpecError, StateError
 from fogft.model.intent import Intent
+from fogft.model.keys import only
 from fogft.model.membership import from_dict, to_dict
-from fogft.model.names import PoolUid
+from fogft.model.names import POOL_NAME_PATTERN, PoolUid
 from fogft.model.plain import Count, to_plain
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
@@ -33,6 +34,9 @@ _NO_IDENTITY = (
 )
 
 
+_Name = Annotated[str, only(POOL_NAME_PATTERN.fullmatch, "a pool's name")]
+
+
 @dataclass(frozen=True)
 class Identity:
     """The permanent identity of a pool.
@@ -41,9 +45,9 @@ class Identity:
         first_epoch: Managers on this machine take epochs above it; see `lease`.
     """
 
-    name: str
+    name: _Name
     uid: PoolUid
-    cloud: str
+    cloud: _Name  # parts of paths, like the name
     file: str
     created_at: float
     first_epoch: Count = 0
@@ -270,9 +274,9 @@ def read_identity(paths: PoolPaths) -> Identity:
 
 @dataclass(frozen=True)
 class _Told:
-    pool: str
+    pool: _Name
     uid: PoolUid
-    cloud: str
+    cloud: _Name
     file: str
     epoch: Count
 

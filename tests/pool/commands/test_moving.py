@@ -8,6 +8,7 @@ from fogft.errors import CredentialError, FogftError, PoolBusy
 from fogft.model.credentials import Role
 from fogft.pool.commands import joining, moving
 from fogft.pool.commands.composition import make_store
+from fogft.pool.credentials import bundle
 from fogft.pool.credentials.authority import create_authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.lease import read_epoch
@@ -75,6 +76,25 @@ def test_what_is_refused_leaves_the_file_and_no_pool(made, tmp_path):
         moving.import_(file, SECRET, new, NOW, pool_file=tmp_path / "nowhere.yaml")
     assert file.read_bytes() == sealed
     assert not PoolPaths.of("planner", new).identity.exists()
+
+
+@pytest.mark.parametrize("where", ["file", "name", "cloud"])
+def test_a_file_that_somebody_else_made_writes_nothing_elsewhere(made, tmp_path, where):
+    """Whoever is handed a file and its passphrase takes over a pool, and no other file."""
+    store, file = made
+    export(store, file)
+    outside = tmp_path / "outside"
+    label, content = bundle.open_sealed(file.read_bytes(), SECRET, NOW)
+    if where == "file":
+        content["files"] = {"pool//etc/x": "x"}
+    else:
+        content["identity"][where] = str(outside)
+        content["files"] = {"cloud/a": "x", "pool/b": "x"}
+    file.write_bytes(bundle.seal(label, content, SECRET))
+    (tmp_path / "pool.yaml").write_text("")
+    with pytest.raises(FogftError):
+        moving.import_(file, SECRET, tmp_path / "new", NOW, pool_file=tmp_path / "pool.yaml")
+    assert not outside.exists()
 
 
 def test_a_join_bundle_moves_no_pool(made, tmp_path):
