@@ -61,6 +61,11 @@ def test_one_that_is_lost_is_missed_at_once_and_no_replica_dials_its_address(poo
     pool.sky.preempt(next(name for name in pool.sky.records if "-1999-" in name))
     pool.until(lambda: "1999.2" in ordered(pool))
     assert pool.scene.now - lost_at < 10
+    pool.sky.boots = False
+    asked = len(pool.sky.asked("refresh"))
+    pool.tick(60)
+    assert len(pool.sky.asked("refresh")) == asked, "one that boots is left alone"
+    pool.sky.boots = True
     pool.until(lambda: pool.ready() == ["0.2"])
     assert ordered(pool) == ["1999.1", "0.1", "1999.2", "0.2"]
     assert pool.store.the_spec.dial_in != before

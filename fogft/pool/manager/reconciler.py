@@ -294,13 +294,15 @@ class Reconciler:
         if self._gateway is None or not (spec.gateway.launch or observed.gateway):
             return None
         step = self._gateway.look(spec, intent, observed, history)
-        for machine in observed.gateway if self._gateway.just_seen(observed.now) else ():
-            record = history.record(machine.id.slot, machine.id.generation)
-            if record is not None and record.first_ready_at is None:
-                self._remember.add(EventKind.READY, machine.id)
         cloud = self._refreshing
-        if cloud is not None and self._gateway.is_doubted(observed.now):
-            for machine in observed.gateway:
+        is_seen = self._gateway.just_seen(observed.now)
+        is_doubted = cloud is not None and self._gateway.is_doubted(observed.now)
+        for machine in observed.gateway:
+            record = history.record(machine.id.slot, machine.id.generation)
+            was_up = record is not None and record.first_ready_at is not None
+            if is_seen and not was_up:
+                self._remember.add(EventKind.READY, machine.id)
+            elif is_doubted and was_up and cloud is not None:  # one that boots is left alone
                 ask = functools.partial(cloud.refresh, machine.id)
                 self._refreshes.start(machine.id, None, ask)
         for id, reason in step.ends:
