@@ -8,8 +8,9 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,38 @@ import yaml
 
 from fogft.pool.commands import status as seen
 from fogft.pool.folder.paths import PoolPaths
+from tests.link import forked
 
 NODES = Path(__file__).parent / "nodes"
+_OURS = (sys.executable,)
+_PATHS = ("LD_LIBRARY_PATH", "PYTHONPATH")  # who changes them means another fogft, or other types
+
+
+def run(
+    words: Sequence[str],
+    environ: Mapping[str, str],
+    folder: Path,
+    limit_s: float,
+    python: Sequence[str] = _OURS,
+) -> subprocess.CompletedProcess[str]:
+    """Run a command in an environment and a folder, forked from what has imported it if it can."""
+    if python is not _OURS or any(environ.get(name) != os.environ.get(name) for name in _PATHS):
+        return subprocess.run(
+            [*python, "-m", "fogft", *words],
+            env=environ, cwd=folder, capture_output=True, text=True, timeout=limit_s, check=False,
+        )  # fmt: skip
+    with tempfile.TemporaryDirectory() as scratch, tempfile.TemporaryFile("w+") as errors:
+        out, ended = Path(scratch, "out"), Path(scratch, "ended")
+        given = json.dumps([words, dict(environ), str(folder), str(out), str(ended)])
+        process = forked.Forked("tests.e2e.command", [given], errors.fileno())
+        process.stdin.close()
+        process.stdout.close()
+        if not process.wait(limit_s):
+            process.kill()
+            raise subprocess.TimeoutExpired(words, limit_s)
+        errors.seek(0)
+        code = int(ended.read_text()) if ended.exists() else 1
+        return subprocess.CompletedProcess(words, code, out.read_text(), errors.read())
 
 
 class Pool:
@@ -62,11 +93,7 @@ class Pool:
 
     def fogft(self, *words: str, ok: bool = True, limit_s: float = 120) -> str:
         """Run a command; return its standard output."""
-        done = subprocess.run(
-            [sys.executable, "-m", "fogft", *words],
-            env=self.environ, cwd=self.folder, capture_output=True, text=True, timeout=limit_s,
-            check=False,
-        )  # fmt: skip
+        done = run(words, self.environ, self.folder, limit_s)
         if ok:
             assert done.returncode == 0, f"fogft {' '.join(words)}\n{done.stdout}\n{done.stderr}"
         return done.stdout if ok else done.stdout + done.stderr
@@ -161,7 +188,7 @@ class Machine:
         role: str,
         name: str,
         domain: int | None = None,
-        python: Sequence[str] = (sys.executable,),
+        python: Sequence[str] = _OURS,
     ) -> None:
         self._fogft = [*python, "-m", "fogft"]
         self.environ = {**pool.environ, "FOGFT_HOME": str(pool.folder / name)}
@@ -172,10 +199,7 @@ class Machine:
         secret.write_text("a passphrase that unknown\n")
         given = ("--passphrase-file", str(secret))
         bundle = pool.fogft("credentials", "issue", role, name, *given).strip()
-        joined = subprocess.run(
-            [*self._fogft, "join", bundle, *given],
-            env=self.environ, cwd=pool.folder, capture_output=True, text=True, check=False,
-        )  # fmt: skip
+        joined = run(("join", bundle, *given), self.environ, pool.folder, 120, python)
         assert joined.returncode == 0, joined.stderr
         self.config = Path(joined.stdout.strip())
         self.command = {"robot": "proxy", "replica": "serve"}.get(role, role)

@@ -69,8 +69,9 @@ class Forked:
         """Return 0 if it has ended; how is not known."""
         return 0 if select.select([self._ended], [], [], 0)[0] else None
 
-    def wait(self) -> None:
-        select.select([self._ended], [], [])
+    def wait(self, limit_s: float | None = None) -> bool:
+        """Wait until it has ended, or for so long; return whether it has."""
+        return bool(select.select([self._ended], [], [], limit_s)[0])
 
 
 def start(module: str, *arguments: str, stderr: int = 2) -> Forked | subprocess.Popen[str]:
