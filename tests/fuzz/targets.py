@@ -344,7 +344,7 @@ def targets() -> dict[str, Target]:
         "bundle's files": Target(
             lambda data: joining.read_content(_object(data)),
             (CredentialError, RecordError),
-            (b'{"files": {"a/b": "c"}}',),
+            (b'{"files": {"credentials/ca.crt": "c", "proxy.yaml": "{status: s}"}}',),
         ),
     }
 

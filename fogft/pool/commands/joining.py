@@ -13,6 +13,7 @@ Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`
 from __future__ import annotations
 
 import contextlib
+import re
 import secrets
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -21,9 +22,10 @@ from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
 from fogft import disk
-from fogft.errors import CredentialError, FogftError
+from fogft.errors import CredentialError, FogftError, SpecError
 from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
+from fogft.model.keys import only
 from fogft.model.membership import Found, to_dict
 from fogft.model.names import Endpoint
 from fogft.model.plain import from_plain
@@ -36,8 +38,15 @@ from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
 from fogft.pool.manager import configuration
+from fogft.poolfile import yaml_tree
+from fogft.poolfile.tree import plain
 
 _USED_LIMIT = 10_000
+# And nothing else: what else lies in its folder may be a command that a proxy starts.
+_BROUGHT = re.compile(
+    r"(credentials/)?(ca\.crt|(robot|gateway|replica|rendezvous)\.(key|crt))"
+    r"|(proxy|gateway|replica|rendezvous)\.yaml|membership\.json|announcements\.json"
+)
 # All others: `proxy`.
 _COMMANDS = {Role.REPLICA: "serve", Role.RENDEZVOUS: "rendezvous", Role.GATEWAY: "gateway"}
 _FLAT = (Role.REPLICA, Role.RENDEZVOUS)  # their credentials lie beside their configuration
@@ -221,18 +230,34 @@ def check_name(name: str, depth: int = 2) -> None:
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a bundle: files by checked names, and the rendezvous."""
+    """The content of a bundle: files that are known to be needed, and the rendezvous."""
 
-    files: Mapping[Annotated[str, check_name], str]
+    files: Mapping[Annotated[str, only(_BROUGHT.fullmatch, "a file of a bundle")], str]
     rendezvous: tuple[Endpoint, ...] = ()
 
 
 def read_content(content: dict[str, Any]) -> Content:
     """Return the content of a bundle."""
     try:
-        return from_plain(Content, content)
-    except ValueError as error:
+        made = from_plain(Content, content)
+        for name, text in made.files.items():
+            if name.endswith(".yaml"):
+                _check_paths(plain(yaml_tree.tree(text, name)))
+    except (ValueError, SpecError) as error:
         raise CredentialError(f"the bundle's content is invalid: {error}") from error
+    return made
+
+
+def _check_paths(config: Any) -> None:
+    """Check that a proxy will read and write nothing outside its folder. Raises ValueError."""
+    keys = ("membership", "status", "lock", "records", "announcements")
+    held = config if isinstance(config, dict) else {}
+    credentials = held.get("credentials")
+    paths = [held.get(key) for key in keys]
+    paths += credentials.values() if isinstance(credentials, dict) else ()
+    for path in paths:
+        if isinstance(path, str):
+            check_name(path)
 
 
 def destroy(file: Path) -> None:

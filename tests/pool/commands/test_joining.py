@@ -219,23 +219,34 @@ def test_made_passphrases_differ_and_are_long_enough() -> None:
 @pytest.mark.parametrize("named", ["a:1", ["a"], [1], ["a:1", None], [["a:1"]]])
 def test_a_bundle_names_no_odd_rendezvous(named: object, tmp_path: Path) -> None:
     path = tmp_path / "evil.join"
-    content = {"files": {"x": "y"}, "rendezvous": named}
+    content = {"files": {"proxy.yaml": "{}"}, "rendezvous": named}
     path.write_bytes(bundle.seal(LABEL, content, PASSPHRASE))
     with pytest.raises(CredentialError, match=r"content is invalid: rendezvous"):
         joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
 
 
 @pytest.mark.parametrize(
-    "name", ["../x", "/etc/x", "a/b/c", "", ".", "..", "a/..", "x\0y", "./../x"]
+    "name", ["../x", "/etc/x", "a/b/c", "", ".", "..", "x\0y", "manager.json", "proxy.yaml\n"]
 )
 def test_a_bundle_can_write_nowhere_else(name: str, tmp_path: Path) -> None:
     """Even one that was sealed with the right passphrase by somebody hostile."""
     path = tmp_path / "evil.join"
     path.write_bytes(bundle.seal(LABEL, {"files": {name: "x"}}, PASSPHRASE))
     before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(CredentialError, match="unexpected name"):
+    with pytest.raises(CredentialError, match="is not a file of a bundle"):
         joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
     assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "config", ["status: /home/ada/.bashrc", "lock: ../x", "credentials: {key: /etc/shadow}"]
+)
+def test_what_a_bundle_sets_up_writes_nowhere_else(config: str, tmp_path: Path) -> None:
+    """Nor does the proxy that the machine is told to start, which writes its status."""
+    path = tmp_path / "evil.join"
+    path.write_bytes(bundle.seal(LABEL, {"files": {"proxy.yaml": config}}, PASSPHRASE))
+    with pytest.raises(CredentialError, match="unexpected name"):
+        joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
 
 
 @settings(max_examples=by_day(60, at_night=2000))
