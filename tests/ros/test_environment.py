@@ -111,6 +111,7 @@ def test_the_profile_has_both_transports() -> None:
     assert sorted(kinds) == ["SHM", "UDPv4"]
     assert len(used) == 2
     assert set(used) <= set(named)
+    assert int(root.findtext(f".//{space}port_queue_capacity", "512")) > 1000  # a burst
 
 
 def test_a_child_gets_rid_of_the_wheels_hook() -> None:
