@@ -98,14 +98,6 @@ class Pool:
             assert done.returncode == 0, f"fogft {' '.join(words)}\n{done.stdout}\n{done.stderr}"
         return done.stdout if ok else done.stdout + done.stderr
 
-    def start(self, *words: str) -> subprocess.Popen[bytes]:
-        """Start a command and do not wait for it; what it prints is dropped."""
-        command = [sys.executable, "-m", "fogft", *words]
-        quiet = subprocess.DEVNULL
-        return subprocess.Popen(
-            command, env=self.environ, cwd=self.folder, stdout=quiet, stderr=quiet
-        )
-
     def status(self) -> dict[str, Any]:
         """Return what `fogft status --json` says, without a process: tests look often."""
         [folder] = (self.home / "pools").iterdir()
