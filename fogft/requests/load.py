@@ -192,13 +192,18 @@ class ReplicaLoad:
     def heard(self, request: bytes, load: Load, now: float) -> None:
         """Take its reported load, plus what was sent within the last round trip."""
         since = now - (self._rtt_s or 0.0)
-        seen = [id for id, (begun, _) in self._at_work.items() if begun <= since and id != request]
+        seen = len(self._at_work) - (request in self._at_work)
+        for id, (begun, _) in reversed(self._at_work.items()):  # the newest first: they are few
+            if begun <= since:
+                break
+            seen -= id != request
         there = load.waiting + load.running
-        self._others, self._others_until = max(0, there - len(seen)), now + _WORD_HOLDS_S
+        self._others, self._others_until = max(0, there - seen), now + _WORD_HOLDS_S
         self._slots = load.slots
         self.service_s = load.service_s
-        for lost in seen[: max(0, len(seen) - there)]:  # their ends were
-            del self._at_work[lost]
+        if seen > there:  # the ends of some were lost
+            for lost in [id for id in self._at_work if id != request][: seen - there]:
+                del self._at_work[lost]
 
     def answered(self, request: bytes, load: Load | None, now: float) -> None:
         """Note that it has ended an attempt."""
