@@ -40,7 +40,7 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
-_TOGETHER_S = 0.001  # answers that follow each other so closely leave in one message
+_TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
 
 
 class Job:
