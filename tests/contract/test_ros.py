@@ -72,10 +72,10 @@ def _rclpy(domain: int) -> World:
 def _zenoh(router: Router) -> World:
     from fogft.rmw_zenoh.node import RmwZenohNode
 
-    hashes = {SET_BOOL: "RIHS01_" + "ab" * 32}
+    hashes = {SET_BOOL: ["RIHS01_" + "ab" * 32]}
     return World(
         lambda: RmwZenohNode(
-            "contract", 7, hashes_of=lambda t: [hashes[t]] * (t in hashes), environ=router.environ
+            "contract", 7, hashes_of=lambda t: hashes.get(t, []), environ=router.environ
         ),
         lambda: time.sleep(0.005),
         loads_types=False,
