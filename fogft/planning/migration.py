@@ -5,7 +5,7 @@ A replica moves when
 
 * it is on demand and should be spot, or the other way round; or
 * its new place would leave the pool better spread over clouds, regions or zones, and is not known
-  to lose more than its own; or
+  to lose more than its own by a loss in four hours, which regions that go as a whole outweigh; or
 * the spread stays as it is, and its score falls by `gain`.
 
 It has then been ready for `stay_s`, and the new place neither backs off nor has it refused within
@@ -134,7 +134,7 @@ def _is_better(
         return Move(replica, Reason(cause, location=offer.placement.location), (-1.0,))
     here = [count[domain] for domain in placement.domains]
     losses, losses_there = (buyer.losses_per_hour(p) for p in (placement, offer.placement))
-    if there < here and (at_most or losses_there <= max(losses, UNKNOWN)):
+    if there < here and (at_most or losses_there <= losses + UNKNOWN):
         why = Reason(Cause.BETTER_SPREAD, location=offer.placement.location)
         return Move(replica, why, (0.0, *there))
     better = gain(
