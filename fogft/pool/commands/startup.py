@@ -28,7 +28,7 @@ from fogft.pool.commands.preview import Preview, check_same
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import Identity, PoolStore, read_identity, write_identity
-from fogft.pool.manager import process_control
+from fogft.pool.manager import process_control, proxy_supervisor, shutdown
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 
 MANAGER_LIMIT_S = 20.0
@@ -69,11 +69,20 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
 
 def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Identity:
     paths = store.paths
-    uid = secrets.token_hex(8)
     # Of an `up` that was cut short, or a pool whose identity was lost: what its client proxy would
     # go on to tell is not of this pool.
-    for lock in (paths.manager_lock, paths.standby_lock, paths.proxy_lock):
-        process_control.end_holder(lock)
+    proxy_supervisor.forbid_restart(paths)
+    ended: list[str] = []
+    with (
+        shutdown.without_manager(paths, ended.append),
+        shutdown.without_client_proxy(paths, ended.append),
+    ):
+        return _create_anew(store, spec, source, file, cloud)
+
+
+def _create_anew(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Identity:
+    paths = store.paths
+    uid = secrets.token_hex(8)
     old = (
         *(paths.history, paths.membership, paths.lease, paths.records, paths.manager_records),
         *(paths.good_spec, paths.trial, paths.discovered, paths.status, paths.proxy_status),
