@@ -8,6 +8,7 @@ name=$1 address=$2 image=$3 host_root=$4 user=$5 key=$6 first=$7
 shift 7
 disk=$image/vm/$name
 mkdir -p "$disk/upper" "$disk/work" "$disk/root"
+ip link del "v$name" 2>/dev/null || :  # of one that was stopped
 ip netns add "$name"
 ip link add "v$name" type veth peer name eth0 netns "$name"
 ip link set "v$name" master br0 up
