@@ -195,7 +195,7 @@ class Graph:
         """
         tokens = self._all()
         nodes = {(t.node, t.namespace) for t in tokens if (t.kind, t.service) == (CLIENT, service)}
-        return ClientNode(*nodes.pop(), unique=True) if len(nodes) == 1 else None
+        return ClientNode(*nodes.pop()) if len(nodes) == 1 else None
 
     def servers(self, service: str) -> list[str]:
         """Return the full name of each node that offers a service."""

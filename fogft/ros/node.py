@@ -218,10 +218,7 @@ class SerialisedNode:
             find, topic = self._node.get_subscriptions_info_by_topic, f"rr{service}Reply"
         ends = self._endpoints(find, topic)
         nodes = {bytes(end.endpoint_gid)[:16]: (end.node_name, end.node_namespace) for end in ends}
-        if client not in nodes:
-            return None
-        processes = {end[: spdp.PREFIX_BYTES] for end in nodes if nodes[end] == nodes[client]}
-        return ClientNode(*nodes[client], unique=len(processes) == 1)
+        return ClientNode(*nodes[client]) if client in nodes else None
 
     def identity(self, handle: bytes) -> bytes:
         """Return what tells a request, of its handle, to each process that received it."""

@@ -25,11 +25,10 @@ class NotFoundYet(RosError):
 
 
 class ClientNode(NamedTuple):
-    """The node of a client; `unique` where no other process has a node of that name."""
+    """The node of a client."""
 
     name: str
     namespace: str
-    unique: bool
 
 
 class RosServer(Protocol):

@@ -38,7 +38,7 @@ class End:
 
 class Graph:
     def __init__(self) -> None:
-        self.nodes = {CLIENT: ClientNode("arm", "/left", unique=True)}
+        self.nodes = {CLIENT: ClientNode("arm", "/left")}
         self.services = ["/left/arm/get_parameter_types"]
         self.ends: dict[str, Any] = {}
 
@@ -65,10 +65,11 @@ def test_a_node_with_parameters_answers_probes():
     for on_response in end.asked:
         on_response(b"")
     assert len(answers) == 3
-    assert probes.unique("/detect", CLIENT)
-    graph.nodes[CLIENT] = graph.nodes[CLIENT]._replace(unique=False)
-    assert not probes.unique("/detect", CLIENT)
-    assert not probes.unique("/detect", b"?" * 16)
+    successor, other = b"s" * 16, b"o" * 16
+    graph.nodes[successor] = graph.nodes[CLIENT]
+    assert probes.answers("/detect", successor)
+    assert probes.same_node(CLIENT, successor)
+    assert not probes.same_node(CLIENT, other)
 
 
 def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
@@ -109,7 +110,7 @@ def test_of_many_nodes_the_first_are_let_go():
     probes = NodeProbes(graph)
     for n in range(KEPT + 10):
         client = n.to_bytes(16, "big")
-        graph.nodes[client] = ClientNode(f"n{n}", "/", unique=True)
+        graph.nodes[client] = ClientNode(f"n{n}", "/")
         graph.services = [f"/n{n}/get_parameter_types"]
         assert probes.answers("/detect", client)
     assert sum(end.closed for end in graph.ends.values()) == 10

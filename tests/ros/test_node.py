@@ -67,7 +67,7 @@ def test_a_requests_handle_tells_whose_client_asked(ros_domain: int) -> None:
             client.call(TRUE, lambda _: None)
             wait_for(lambda n=n: len(handles) > n, "the request")
         for name, handle in zip(("one", "two"), handles, strict=True):
-            expected = ClientNode(name, "/", unique=True)
+            expected = ClientNode(name, "/")
             wait_for(
                 lambda handle=handle, expected=expected: (
                     offers.node_of("/flag", handle[:16]) == expected

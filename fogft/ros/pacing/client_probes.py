@@ -52,7 +52,7 @@ class NodeProbes:
         found = self._graph.node_of(service, client)
         if found is None:
             return False
-        name, namespace, _ = found
+        name, namespace = found
         asked = f"{namespace.rstrip('/')}/{name}/{_SERVICE}"
         if asked not in self._graph.services_of(name, namespace):
             return False
@@ -72,14 +72,9 @@ class NodeProbes:
             self._by_client[client] = end
         return True
 
-    def unique(self, service: str, client: bytes) -> bool:
-        """Whether no other process has a node of the same name.
-
-        A node that was killed and started again answers what its predecessor was asked, which
-        discovery lists until its lease ends.
-        """
-        found = self._graph.node_of(service, client)
-        return found is not None and found.unique
+    def same_node(self, client: bytes, other: bytes) -> bool:
+        """Whether two clients' nodes have one name: one was started again as the other."""
+        return self._by_client.get(client) is self._by_client.get(other)
 
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
         """Try to send a probe; `on_answer` is called from the take loop, or never."""

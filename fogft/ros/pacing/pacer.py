@@ -188,11 +188,11 @@ class Pacer:
     def _answered(self, id: bytes) -> None:
         now = self._clock()
         with self._wake:
-            silent = self._pace.client(id, now).silent(now)
-        if silent and not self._probes.unique(self._service, id):
-            return  # or all that its killed predecessor left open would push out its responses
-        with self._wake:
-            self._pace.client(id, now).answered_probe(now)
+            client = self._pace.client(id, now)
+            later = self._pace.asked_after(client) if client.silent(now) else ()
+            if any(self._probes.same_node(id, other) for other in later):
+                return  # or what a killed node left open would push out its successor's responses
+            client.answered_probe(now)
             self._wake.notify()
 
     def close(self) -> None:
