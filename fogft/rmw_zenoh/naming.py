@@ -19,7 +19,6 @@ import threading
 from dataclasses import dataclass
 
 from fogft.model import ros_names
-from fogft.ros.port import ClientNode
 
 ROOT = "@ros2_lv"
 NODE, SERVER, CLIENT = "NN", "SS", "SC"
@@ -187,26 +186,25 @@ class Graph:
         wanted = (kind, name, type_name)
         return sorted(t.hash for t in self._all() if (t.kind, t.service, t.type) == wanted)
 
-    def node_of(self, service: str, client: bytes) -> ClientNode | None:
-        """Return the node that calls a service, if there is exactly one.
+    def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
+        """Return the full name of the service `what` of the node that calls a service.
 
-        Of several, `client` (a GID) does not tell which: it is a hash of the token in a way of
-        `rmw_zenoh`'s own.
+        None where that is not one node, or has none. Of several, `client` (a GID) does not tell
+        which: it is a hash of the token in a way of `rmw_zenoh`'s own.
         """
         tokens = self._all()
         nodes = {(t.node, t.namespace) for t in tokens if (t.kind, t.service) == (CLIENT, service)}
-        return ClientNode(*nodes.pop()) if len(nodes) == 1 else None
+        if len(nodes) != 1:
+            return None
+        node, namespace = nodes.pop()
+        name = f"{namespace.rstrip('/')}/{node}/{what}"
+        return name if self.servers(name) else None
 
     def servers(self, service: str) -> list[str]:
         """Return the full name of each node that offers a service."""
         wanted = (SERVER, service)
         found = [t for t in self._all() if (t.kind, t.service) == wanted]
         return [f"{token.namespace.rstrip('/')}/{token.node}" for token in found]
-
-    def services_of(self, name: str, namespace: str) -> list[str]:
-        """Return the names of a node's services."""
-        node = (SERVER, name, namespace)
-        return [t.service for t in self._all() if (t.kind, t.node, t.namespace) == node]
 
     def hash_of(self, type_name: str) -> str:
         """Return the hash of a type in any node's token; empty if unknown."""

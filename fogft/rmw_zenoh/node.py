@@ -92,11 +92,7 @@ class RmwZenohNode:
     def _start(self) -> None:
         self._id = str(self._session.zid())
         graph = self.graph = Graph(self._id)
-        self.node_of, self.services_of, self.offered = (
-            graph.node_of,
-            graph.services_of,
-            graph.offered,
-        )
+        self.same_node_serves, self.offered = graph.same_node_serves, graph.offered
         live = self._session.liveliness()
         node = Token(self._domain, self._id, "0", "0", NODE, self._name)
         self._declared = live.declare_token(str(node))

@@ -25,7 +25,7 @@ from fogft.ros import cyclone, spdp, topic_ends, vendors
 from fogft.ros.entities import Client, Server
 from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
 from fogft.ros.pacing.client_probes import NodeProbes
-from fogft.ros.port import ClientNode, OnBurst
+from fogft.ros.port import OnBurst
 from fogft.ros.serialised import ClientEnd, ServiceEnd, self_test
 from fogft.ros.topic_ends import Publisher, Subscription
 from fogft.ros.types import load_message_type, load_service_type, shape
@@ -203,11 +203,14 @@ class SerialisedNode:
                     found.setdefault(service, kinds[0])
         return found
 
-    def node_of(self, service: str, client: bytes) -> ClientNode | None:
-        """Return the node that a client of a service belongs to.
+    def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
+        """Return the full name of the service `what` of the node that a client belongs to.
+
+        None while it is not discovered, and where there is none. A node's name may be told three
+        seconds later than its services: where its process has but one of these, that is it.
 
         Args:
-            service: Its absolute name.
+            service: What the client calls, an absolute name.
             client: The first 16 bytes of a request's handle: the reader of its responses, or
                 under CycloneDDS what stands for the writer of its requests.
         """
@@ -216,9 +219,27 @@ class SerialisedNode:
             find, topic = self._node.get_publishers_info_by_topic, f"rq{service}Request"
         else:
             find, topic = self._node.get_subscriptions_info_by_topic, f"rr{service}Reply"
-        ends = self._endpoints(find, topic)
-        nodes = {bytes(end.endpoint_gid)[:16]: (end.node_name, end.node_namespace) for end in ends}
-        return ClientNode(*nodes[client]) if client in nodes else None
+        for end in self._endpoints(find, topic):
+            if bytes(end.endpoint_gid)[:16] != client:
+                continue
+            if end.node_name.startswith("_"):  # not known yet
+                topics = self._request_topics(what)
+            else:
+                topics = [f"rq{end.node_namespace.rstrip('/')}/{end.node_name}/{what}Request"]
+            found = [topic for topic in topics if self._reads(client[: spdp.PREFIX_BYTES], topic)]
+            return found[0][len("rq") : -len("Request")] if len(found) == 1 else None
+        return None
+
+    def _request_topics(self, what: str) -> list[str]:
+        """Return the topics of requests to services of this last name, of all nodes."""
+        with contextlib.suppress(Exception):  # rclpy's InvalidHandle
+            known = self._node.get_topic_names_and_types(no_demangle=True)
+            return [topic for topic, _ in known if topic.endswith(f"/{what}Request")]
+        return []
+
+    def _reads(self, process: bytes, topic: str) -> bool:
+        readers = self._endpoints(self._node.get_subscriptions_info_by_topic, topic)
+        return any(bytes(one.endpoint_gid).startswith(process) for one in readers)
 
     def identity(self, handle: bytes) -> bytes:
         """Return what tells a request, of its handle, to each process that received it."""
@@ -275,10 +296,6 @@ class SerialisedNode:
         with contextlib.suppress(Exception):  # rclpy's InvalidHandle
             return list(find(topic, no_mangle=True))
         return []
-
-    def services_of(self, name: str, namespace: str) -> list[str]:
-        """Return the names of a node's discovered services; empty if it is gone."""
-        return [service for service, _ in self._services_of(name, namespace)]
 
     def _services_of(self, name: str, namespace: str) -> Any:
         try:

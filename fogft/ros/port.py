@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from fogft.errors import RosError
 
@@ -22,13 +22,6 @@ OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where 
 
 class NotFoundYet(RosError):
     """The client is not discovered yet; sending again may help."""
-
-
-class ClientNode(NamedTuple):
-    """The node of a client."""
-
-    name: str
-    namespace: str
 
 
 class RosServer(Protocol):

@@ -212,7 +212,7 @@ def test_a_burst_of_a_plain_client_loses_no_answer(
     client = PlainClient(peer, answers_probes=True)
     with contextlib.closing(client):
         node = make()
-        wait_for(lambda: node.services_of("robot", "/"), "the client's node")
+        wait_for(lambda: node.graph.servers("/robot/get_parameter_types"), "the client's node")
         echo(node)
         wait_for(lambda: any("/SS/" in t and "grasp" in t for t in tokens(peer)), "the service")
         for number in range(64):

@@ -10,7 +10,6 @@ import pytest
 
 from fogft.errors import RosError
 from fogft.ros.pacing.client_probes import KEPT, NodeProbes
-from fogft.ros.port import ClientNode
 
 CLIENT = b"c" * 16
 
@@ -38,16 +37,13 @@ class End:
 
 class Graph:
     def __init__(self) -> None:
-        self.nodes = {CLIENT: ClientNode("arm", "/left")}
-        self.services = ["/left/arm/get_parameter_types"]
+        self.nodes = {CLIENT: "/left/arm"}
         self.ends: dict[str, Any] = {}
 
-    def node_of(self, service: str, client: bytes) -> ClientNode | None:
-        assert service == "/detect"
-        return self.nodes.get(client)
-
-    def services_of(self, name: str, namespace: str) -> list[str]:
-        return self.services
+    def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
+        assert (what, service) == ("get_parameter_types", "/detect")
+        node = self.nodes.get(client)
+        return node and f"{node}/{what}"
 
     def client(self, name: str, type_name: str) -> End:
         self.ends[name] = End()
@@ -88,7 +84,7 @@ def _missing() -> End:
 
 def test_a_node_without_parameters_answers_none():
     graph = Graph()
-    graph.services = ["/left/arm/move"]
+    graph.nodes = {}
     assert NodeProbes(graph).answers("/detect", CLIENT) is False
     assert not graph.ends
 
@@ -110,7 +106,6 @@ def test_of_many_nodes_the_first_are_let_go():
     probes = NodeProbes(graph)
     for n in range(KEPT + 10):
         client = n.to_bytes(16, "big")
-        graph.nodes[client] = ClientNode(f"n{n}", "/")
-        graph.services = [f"/n{n}/get_parameter_types"]
+        graph.nodes[client] = f"/n{n}"
         assert probes.answers("/detect", client)
     assert sum(end.closed for end in graph.ends.values()) == 10

@@ -17,7 +17,6 @@ import pytest
 
 from fogft.errors import RosError
 from fogft.ros import cyclone
-from fogft.ros.port import ClientNode
 from tests.needs import needs
 
 from .conftest import LIMIT_S, SET_BOOL, wait_for
@@ -61,19 +60,21 @@ def test_a_requests_handle_tells_whose_client_asked(ros_domain: int) -> None:
         closing(SerialisedNode("two", ros_domain)) as two,
     ):
         offers.serve("/flag", SET_BOOL, lambda _, handle: handles.append(handle))
-        for n, node in enumerate((one, two)):
+        for n, (name, node) in enumerate({"one": one, "two": two}.items()):
+            node.serve(f"/{name}/turn", SET_BOOL, lambda _, handle: None)
             client = node.client("/flag", SET_BOOL)
             wait_for(client.available, "discovery")
             client.call(TRUE, lambda _: None)
             wait_for(lambda n=n: len(handles) > n, "the request")
         for name, handle in zip(("one", "two"), handles, strict=True):
-            expected = ClientNode(name, "/")
             wait_for(
-                lambda handle=handle, expected=expected: (
-                    offers.node_of("/flag", handle[:16]) == expected
+                lambda handle=handle, name=name: (
+                    offers.same_node_serves("turn", "/flag", handle[:16]) == f"/{name}/turn"
                 ),
                 name,
             )
+            assert offers.same_node_serves("turns", "/flag", handle[:16]) is None
+        assert offers.same_node_serves("turn", "/flag", bytes(16)) is None
 
 
 TELLS = """

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 from fogft.errors import RosError
-from fogft.ros.port import ClientNode, RosClient
+from fogft.ros.port import RosClient
 
 _SERVICE, _TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTypes"
 _OF_NO_PARAMETER = b"\x00\x01\x00\x00" + bytes(4)  # a list of names, which is empty
@@ -28,11 +28,11 @@ class Graph(Protocol):
     def client(self, name: str, type_name: str) -> RosClient:
         """Create a client of a service."""
 
-    def node_of(self, service: str, client: bytes) -> ClientNode | None:
-        """Return the node that a client of a service belongs to."""
+    def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
+        """Return the full name of the service `what` of the node that a client belongs to.
 
-    def services_of(self, name: str, namespace: str) -> Sequence[str]:
-        """Return the names of a node's services."""
+        None while it is not discovered, and where there is none.
+        """
 
 
 class NodeProbes:
@@ -45,16 +45,9 @@ class NodeProbes:
         self._lock = threading.Lock()
 
     def answers(self, service: str, client: bytes) -> bool:
-        """Whether the node of a service's client answers probes, as far as discovered.
-
-        It finds a node, and each of its services, one after another.
-        """
-        found = self._graph.node_of(service, client)
-        if found is None:
-            return False
-        name, namespace = found
-        asked = f"{namespace.rstrip('/')}/{name}/{_SERVICE}"
-        if asked not in self._graph.services_of(name, namespace):
+        """Whether the node of a service's client answers probes, as far as discovered."""
+        asked = self._graph.same_node_serves(_SERVICE, service, client)
+        if asked is None:
             return False
         with self._lock:
             end = self._by_name.get(asked)
