@@ -9,8 +9,8 @@ DAY_S = 86_400.0
 
 
 @dataclass
-class Day:
-    """Sums over a day, from the beginning of what is measured."""
+class Sums:
+    """Sums over a day, from the beginning of what is measured, or over all of it."""
 
     seconds: float = 0.0
     wanted_s: float = 0.0
@@ -18,6 +18,16 @@ class Day:
     under_s: float = 0.0
     ready_s: float = 0.0
     usd: float = 0.0
+
+    def add(self, seconds: float, ready: int, wanted: int, usd_per_hour: float) -> None:
+        """Account for a span without changes."""
+        self.seconds += seconds
+        self.ready_s += seconds * ready
+        self.usd += seconds / 3600.0 * usd_per_hour
+        if wanted:
+            self.wanted_s += seconds
+            self.under_s += seconds if ready < wanted else 0.0
+            self.up_s += seconds if ready else 0.0
 
 
 @dataclass(frozen=True)
@@ -34,7 +44,7 @@ class Outcome:
     preemptions: int  # machines that were taken away or failed
     outages: int  # how often the pool stopped to answer, and how long the longest was
     longest_outage_s: float
-    days: tuple[Day, ...] = ()
+    days: tuple[Sums, ...] = ()
 
 
 @dataclass
@@ -42,19 +52,14 @@ class Meter:
     """Measures from `begin_s` on; `curve` is the number of serving replicas over time."""
 
     begin_s: float
-    seconds: float = 0.0
-    wanted_s: float = 0.0
-    up_s: float = 0.0
-    under_s: float = 0.0
-    ready_s: float = 0.0
-    usd: float = 0.0
+    sums: Sums = field(default_factory=Sums)
     launches: int = 0
     refusals: int = 0
     preemptions: int = 0
     outages: int = 0
     longest_outage_s: float = 0.0
     curve: list[tuple[float, int]] = field(default_factory=list)
-    days: list[Day] = field(default_factory=list)
+    days: list[Sums] = field(default_factory=list)
     _down_s: float = 0.0
     _pending: tuple[float, int, int, float] = (0.0, -1, 0, 0.0)  # unlike any other
 
@@ -81,13 +86,7 @@ class Meter:
         seconds, ready, wanted, usd_per_hour = self._pending
         self._pending = (0.0, ready, wanted, usd_per_hour)
         self._add_to_days(seconds, ready, wanted, usd_per_hour)
-        self.seconds += seconds
-        self.ready_s += seconds * ready
-        self.usd += seconds / 3600.0 * usd_per_hour
-        if wanted:
-            self.wanted_s += seconds
-            self.under_s += seconds if ready < wanted else 0.0
-            self.up_s += seconds if ready else 0.0
+        self.sums.add(seconds, ready, wanted, usd_per_hour)
         if ready or not wanted:
             self._down_s = 0.0
         elif seconds:
@@ -96,19 +95,13 @@ class Meter:
             self.longest_outage_s = max(self.longest_outage_s, self._down_s)
 
     def _add_to_days(self, seconds: float, ready: int, wanted: int, usd_per_hour: float) -> None:
-        at = self.seconds
+        at = self.sums.seconds
         end = at + seconds
         while at < end:
             index = int(at // DAY_S)
             part_s = min(end, (index + 1) * DAY_S) - at
-            self.days += [Day() for _ in range(len(self.days), index + 1)]
-            day = self.days[index]
-            day.seconds += part_s
-            day.wanted_s += part_s * bool(wanted)
-            day.up_s += part_s * bool(wanted and ready)
-            day.under_s += part_s * bool(ready < wanted)
-            day.ready_s += part_s * ready
-            day.usd += part_s / 3600.0 * usd_per_hour
+            self.days += [Sums() for _ in range(len(self.days), index + 1)]
+            self.days[index].add(part_s, ready, wanted, usd_per_hour)
             at += part_s
 
     def counts(self, now_s: float) -> bool:
@@ -118,12 +111,13 @@ class Meter:
     def outcome(self) -> Outcome:
         """Return the figures so far."""
         self._add_pending()
+        sums = self.sums
         return Outcome(
-            seconds=self.seconds,
-            available=self.up_s / self.wanted_s if self.wanted_s else 1.0,
-            under_target=self.under_s / self.wanted_s if self.wanted_s else 0.0,
-            mean_ready=self.ready_s / self.seconds,
-            usd_per_hour=self.usd / (self.seconds / 3600.0),
+            seconds=sums.seconds,
+            available=sums.up_s / sums.wanted_s if sums.wanted_s else 1.0,
+            under_target=sums.under_s / sums.wanted_s if sums.wanted_s else 0.0,
+            mean_ready=sums.ready_s / sums.seconds,
+            usd_per_hour=sums.usd / (sums.seconds / 3600.0),
             launches=self.launches,
             refusals=self.refusals,
             preemptions=self.preemptions,
