@@ -56,6 +56,9 @@ def proxy(
             "--standby", help="Wait while another proxy runs, and take over when it ends."
         ),
     ] = False,
+    spare: Annotated[
+        bool, typer.Option("--spare", help="The same; where one waits already, wait behind it.")
+    ] = False,
 ) -> None:
     """Run a client proxy: the robot's side of a pool.
 
@@ -63,7 +66,7 @@ def proxy(
     """
     from fogft.proxy.robot import process
 
-    process.run(config, metrics=metrics, standby=standby)
+    process.run(config, metrics=metrics, standby=standby, spare=spare)
 
 
 def serve(
@@ -192,7 +195,7 @@ def install(
     rendezvous: Rendezvous = None,
     system: System = False,
 ) -> None:
-    """Install and start units for the manager and two client proxies.
+    """Install and start units for the manager and three client proxies.
 
     Units get the current environment, so source ROS 2 first. Running processes hand over.
     """

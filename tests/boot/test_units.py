@@ -47,7 +47,7 @@ BEHIND_A_GATEWAY = f"""\
   rendezvous: ['{MEETING}']
   topology: {{gateways: [{{name: east, endpoint: '{GATEWAY}'}}], default_gateways: [east]}}
 """
-PARTS = tuple(f"fogft-e2e-{part}.service" for part in ("manager", "proxy-a", "proxy-b"))
+PARTS = tuple(f"fogft-e2e-{part}.service" for part in ("manager", "proxy-a", "proxy-b", "proxy-c"))
 
 
 class Robot:
@@ -126,7 +126,7 @@ class Robot:
         return wait(found, lambda: self.systemctl("status", "fogft-*", "--no-pager", "-n30"), 240)
 
     def serving(self) -> str:
-        """Return which of the two units serves."""
+        """Return which of the units serves."""
         pid = json.loads(self.read("proxy-status.json"))["pid"]
         return next((unit for unit in PARTS if self.pid(unit) == pid), "")
 
@@ -231,8 +231,7 @@ def test_a_pool_goes_on_whatever_dies_and_after_each_boot(robot: Robot) -> None:
         serving = robot.serving()
         before = robot.pids()[serving]
         robot.signal(how, before)
-        other = PARTS[1:][serving == PARTS[1]]
-        robot.serves(other)
+        robot.serves(*{*PARTS[1:]} - {serving})
         robot.pids(without=before)
         robot.answers()
 

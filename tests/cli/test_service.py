@@ -45,7 +45,9 @@ def units(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_units_are_written_started_shown_and_removed(home, units, tmp_path, monkeypatch, capsys):
     systemd = Systemd(tmp_path / "bin", monkeypatch)
     assert main.run(["service", "install"]) == 0
-    names = [f"fogft-planner-{part}.service" for part in ("manager", "proxy-a", "proxy-b")]
+    names = [
+        f"fogft-planner-{part}.service" for part in ("manager", "proxy-a", "proxy-b", "proxy-c")
+    ]
     assert capsys.readouterr().out.split() == [str(units / name) for name in names]
     assert systemd.asked.read_text().splitlines() == [
         "--user daemon-reload",

@@ -71,7 +71,7 @@ def test_a_slow_service_is_never_taken_for_a_dead_one_and_replicas_without_a_man
     assert {(r["slot"], r["generation"]) for r in after["replicas"]} == before
     assert all(r["phase"] == "ready" for r in after["replicas"])
     os.kill(after["manager_pid"], signal.SIGTERM)  # one that is killed would be started again
-    pool.wait(lambda: len(pool.processes()) <= 2)  # the client proxy and the next one live on
+    pool.wait(lambda: len(pool.processes()) <= 3)  # the client proxies live on
     assert after["proxy_pid"] in pool.processes()
 
 
@@ -115,7 +115,7 @@ def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     assert flawless(client.finish())
 
     status_says_what_is_true_now(pool)
-    manager, proxy, _ = robot_side(pool)  # the next one is in line
+    manager, proxy, *_ = robot_side(pool)  # the next one is in line
     for pid in (manager, proxy):
         os.kill(pid, signal.SIGKILL)
     pool.fogft("down")
@@ -153,13 +153,16 @@ def status_says_what_is_true_now(pool: Pool) -> None:
 
 
 def robot_side(pool: Pool) -> list[int]:
-    """Return the processes of the robot's side: the manager, the client proxy, and its standby."""
+    """Return the processes of the robot's side: the manager and the client proxies."""
     [folder] = (pool.folder / "home" / "pools").iterdir()
     paths = PoolPaths(folder)
-    standby = pool.wait(lambda: lock_holder(paths.standby_lock))
+    waiting = [
+        pool.wait(lambda: lock_holder(lock))  # noqa: B023
+        for lock in (paths.standby_lock, paths.spare_lock)
+    ]
     manager, proxy = lock_holder(paths.manager_lock), pool.status()["proxy_pid"]
     assert manager is not None
-    return [manager, proxy, standby]
+    return [manager, proxy, *waiting]
 
 
 def answers(pool: Pool) -> bool:

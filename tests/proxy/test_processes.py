@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from fogft import disk
 from fogft.ros import environment
 from tests.cloud.fake_metadata import serving
 from tests.freezing import freeze
@@ -211,7 +212,8 @@ def test_deadly_requests_and_notices_cost_no_others_answer(parts, call):
         requests_that_kill_the_service_harm_only_themselves(robot, caller)
         a_machine_that_is_told_of_its_end_gets_no_more_requests(robot, caller, told, metadata)
     a_machines_sigterm_is_a_notice(robot, caller, ended)
-    a_proxy_ends_when_its_folder_is_gone(parts, robot)
+    line = killed_proxies_are_replaced_by_copies_of_the_spare(parts, robot, caller)
+    proxies_end_when_their_folder_is_gone(parts, line)
 
 
 def requests_that_kill_the_service_harm_only_themselves(robot, caller):
@@ -266,10 +268,29 @@ def a_machines_sigterm_is_a_notice(robot, caller, ended):
     assert ended.process.wait(LIMIT_S) == 0
 
 
-def a_proxy_ends_when_its_folder_is_gone(parts, robot):
+def killed_proxies_are_replaced_by_copies_of_the_spare(parts, robot, caller):
+    """One after the other, with one start for all; return who is in line at the end."""
+    works = robot.config.with_suffix(".lock")
+    stands_by = disk.standby_lock(works)
+    locks = works, stands_by, disk.standby_lock(stands_by)
+    parts.start("proxy", robot.config, {}, "--spare")
+
+    def line() -> list[int]:
+        found = [disk.holder(lock) for lock in locks]
+        return [pid for pid in found if pid] if len({*found, None}) == len(locks) + 1 else []
+
+    for _ in range(3):
+        os.kill(wait_for(line, "three in line")[0], signal.SIGKILL)
+        caller.wait()
+        caller.ask(20)
+        assert caller.all_answered()
+    return wait_for(line, "three in line")
+
+
+def proxies_end_when_their_folder_is_gone(parts, line):
     """Who removes a pool's folder by hand leaves no process behind."""
     gone = parts.folder.rename(parts.folder.with_name("gone"))
-    assert robot.process.wait(LIMIT_S) == 0
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in line), "their end")
     gone.rename(parts.folder)
 
 

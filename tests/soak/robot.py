@@ -39,20 +39,22 @@ TIMEOUT_S = 120.0  # of the service: longer than the longest suspend
 LATE_S = 1.0
 LONG_S = 60.0
 SOON_S = 0.5
+UNDER_WAY_S = 0.2  # a request, where nothing is amiss
 TAKEN_S = 1.0  # what was asked so long before a kill may have been under way
+PARTS = ("manager", "proxy", "standby", "spare")
 DISK = "size=24m,mode=700"
 MAY_LOSE_S = {
     # What a killed proxy had taken, and what was asked while no service was there to be asked.
     "kill proxy": SOON_S,
-    # The next standby has not finished starting 1 s after the first took over.
-    "kill proxy twice": float("inf"),
+    "kill proxy twice": SOON_S,
+    "kill manager, proxies": SOON_S,
     "kill all": float("inf"),
     # A client keeps its last ten requests for a service that takes none, as for any other service.
     "freeze proxy": float("inf"),
     # DDS takes those for gone of whom it has not heard for 20 s, until it hears of them again: a
     # plain service and its client lose one or two requests as well.
     "long suspend": LONG_S + LONGEST_S + 1.0,
-}  # asked until so long after the fault began
+}  # asked until so long after the fault began, or struck again
 
 
 class World:
@@ -81,6 +83,7 @@ class World:
         self.ends = folder / "ends.jsonl"
         self.client: Client | None = None
         self._versions = 0
+        self.during = Time("", 0.0)
 
     def up(self) -> None:
         self.pool.fogft("up", str(self.pool.file), "--yes", limit_s=LIMIT_S)
@@ -103,12 +106,12 @@ class World:
         self.up()
 
     def pid(self, what: str) -> int:
-        """Return the process of the `manager`, the `proxy` or the `standby`."""
+        """Return the process of the `manager`, the `proxy`, the `standby` or the `spare`."""
         lock = getattr(self.paths, f"{what}_lock")
         return int(self.wait(lambda: lock_holder(lock), what))
 
     def parts(self) -> list[int]:
-        return [self.pid(what) for what in ("manager", "proxy", "standby")]
+        return [self.pid(what) for what in PARTS]
 
     def whole(self) -> bool:
         """Whether all is as it was at the beginning, by what `fogft status` says."""
@@ -119,6 +122,7 @@ class World:
             and told["answers"] is True
             and told["manager_alive"]
             and lock_holder(self.paths.standby_lock) is not None
+            and lock_holder(self.paths.spare_lock) is not None
         )
 
     def answered(self, asked: float) -> bool:
@@ -152,10 +156,14 @@ Damage = Callable[[World, Fault], contextlib.AbstractContextManager[None]]
 
 
 def _kill(*which: str) -> Damage:
+    """Kill these at once: none of them has the time to react."""
+
     @contextlib.contextmanager
     def damage(world: World, fault: Fault) -> Iterator[None]:
-        for pid in [world.pid(what) for what in which]:
-            os.kill(pid, signal.SIGKILL)
+        pids = [world.pid(what) for what in which]
+        for number in (signal.SIGSTOP, signal.SIGKILL):
+            for pid in pids:
+                os.kill(pid, number)
         yield
 
     return damage
@@ -163,12 +171,9 @@ def _kill(*which: str) -> Damage:
 
 @contextlib.contextmanager
 def _kill_all(world: World, fault: Fault) -> Iterator[None]:
-    """Kill manager and client proxies at once, which only a person or systemd mends."""
-    pids = world.parts()
-    for number in (signal.SIGSTOP, signal.SIGKILL):
-        for pid in pids:
-            os.kill(pid, number)
-    yield
+    """Kill all that is on the robot, which only a person or systemd mends."""
+    with _kill(*PARTS)(world, fault):
+        yield
     world.up()
 
 
@@ -178,6 +183,7 @@ def _kill_twice(world: World, fault: Fault) -> Iterator[None]:
     os.kill(first, signal.SIGKILL)
     world.wait(lambda: lock_holder(world.paths.proxy_lock) not in (first, None), "taken over")
     time.sleep(1.0)
+    world.during.again.append(time.monotonic())
     os.kill(world.pid("proxy"), signal.SIGKILL)
     yield
 
@@ -278,6 +284,7 @@ DAMAGES: dict[str, Damage] = {
     "kill standby": _kill("standby"),
     "kill manager, standby": _kill("manager", "standby"),
     "kill proxy twice": _kill_twice,
+    "kill manager, proxies": _kill("manager", "proxy", "standby"),
     "kill all": _kill_all,
     "end proxy": _terminate,
     "freeze manager": _freeze("manager"),
@@ -303,6 +310,12 @@ class Time:
     kind: str
     began: float
     whole: float = float("inf")
+    again: list[float] = field(default_factory=list)  # damaged again
+
+    def since(self, asked: float) -> float:
+        """Return how long after the damage a request was asked, the last that it may have met."""
+        met = [at for at in self.again if asked > at - UNDER_WAY_S]
+        return asked - max(met, default=self.began)
 
 
 @dataclass
@@ -311,7 +324,7 @@ class Row:
 
     times: int = 0
     took: list[float] = field(default_factory=list)
-    lost: list[float] = field(default_factory=list)  # each: asked so long after the fault began
+    lost: list[float] = field(default_factory=list)  # each: asked so long after the fault struck
     wrong: int = 0
     gap_s: float = 0.0
     whole_s: float = 0.0
@@ -333,7 +346,7 @@ def table(times: Sequence[Time], ends: Sequence[Sequence[float | None]]) -> dict
         found = [t for t in times if t.began - TAKEN_S * (at is None) <= asked <= t.whole]
         row = rows[found[0].kind] if found else rows["none"]
         if at is None:
-            row.lost.append(asked - found[0].began if found else 0.0)
+            row.lost.append(found[0].since(asked) if found else 0.0)
         else:
             row.took.append(at - asked)
             row.wrong += not right
@@ -348,7 +361,7 @@ def faults_found(rows: Mapping[str, Row], kinds: Sequence[str], trouble: str) ->
         least_s = MAY_LOSE_S.get(kind, float("-inf"))
         if bad := [s for s in row.lost if s > least_s]:
             told = ", ".join(f"{s:.2f}" for s in bad[:10])
-            found.append(f"{kind}: {len(bad)} lost, asked so many s after it began: {told}")
+            found.append(f"{kind}: {len(bad)} lost, asked so many s after it struck: {told}")
         if row.wrong:
             found.append(f"{kind}: {row.wrong} wrong")
     return found
@@ -385,6 +398,7 @@ def run(world: World, kinds: Sequence[str], seed: int, lasts_s: float, times: li
         launched += [time.monotonic()] * cost
         print(f"{fault.kind}, {fault.lasts_s} s", file=sys.stderr, flush=True)
         times.append(Time(fault.kind, time.monotonic()))
+        world.during = times[-1]
         with DAMAGES[fault.kind](world, fault):
             time.sleep(fault.lasts_s)
         world.wait(world.whole, f"whole after {fault.kind}")

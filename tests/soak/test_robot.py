@@ -6,7 +6,7 @@ import pytest
 
 from tests.soak.robot import DAMAGES, MAY_LOSE_S, Time, faults_found, show, table
 
-TIMES = [Time("kill proxy", 10.0, 14.0), Time("full disk", 20.0, 25.0)]
+TIMES = [Time("kill proxy", 10.0, 14.0, [12.0]), Time("full disk", 20.0, 25.0)]
 GOOD = [[at / 2, at / 2 + 0.1, True] for at in range(60)]
 
 
@@ -32,9 +32,12 @@ def test_requests_are_counted_by_the_fault_that_there_was():
     [
         (lost(10.4), []),
         (lost(9.2), []),  # a killed proxy had taken it
-        (lost(10.6), ["kill proxy: 1 lost, asked so many s after it began: 0.60"]),
-        (lost(22.0), ["full disk: 1 lost, asked so many s after it began: 2.00"]),
-        (lost(17.0), ["none: 1 lost, asked so many s after it began: 0.00"]),
+        (lost(12.4), []),
+        (lost(11.9), []),
+        (lost(12.6), ["kill proxy: 1 lost, asked so many s after it struck: 0.60"]),
+        (lost(10.6), ["kill proxy: 1 lost, asked so many s after it struck: 0.60"]),
+        (lost(22.0), ["full disk: 1 lost, asked so many s after it struck: 2.00"]),
+        (lost(17.0), ["none: 1 lost, asked so many s after it struck: 0.00"]),
         ([12.2, 12.3, False], ["kill proxy: 1 wrong"]),
     ],
 )

@@ -1,6 +1,6 @@
 """systemd units for the parts of a pool on this machine: written, started, removed.
 
-The manager and two client proxies, one of which stands by; or a gateway or a rendezvous with a
+The manager and three client proxies, two of which wait in line; or a gateway or a rendezvous with a
 configuration file. systemd restarts what dies or hangs; what ends well stays ended.
 
 Owns: the units' text and names, their environment, and the calls of systemctl.
@@ -76,14 +76,17 @@ def services(*, system: bool, environ: Mapping[str, str] = os.environ) -> Servic
 
 def names_of(pool: str) -> dict[str, str]:
     """Return the names of the units of a pool, by part."""
-    return {part: f"fogft-{pool}-{part}.service" for part in ("manager", "proxy-a", "proxy-b")}
+    return {
+        part: f"fogft-{pool}-{part}.service"
+        for part in ("manager", "proxy-a", "proxy-b", "proxy-c")
+    }
 
 
 def of_pool(paths: PoolPaths, *, system: bool) -> list[Unit]:
     """Return the units of a pool's manager and client proxies."""
     pool, environment = paths.folder.name, paths.folder / "service.env"
     manager = ("manager", "--no-proxy", pool)
-    proxy = ("proxy", "--standby", "--config", str(paths.proxy_config))
+    proxy = ("proxy", "--spare", "--config", str(paths.proxy_config))
     return [
         _unit(
             *(name, manager if part == "manager" else proxy, paths.identity, environment),
@@ -160,8 +163,8 @@ def install(where: Services, units: Sequence[Unit]) -> list[str]:
 
 
 def yield_to(paths: PoolPaths) -> None:
-    """End the manager and the standby not started by systemd; its own replace them."""
-    for lock in (paths.manager_lock, paths.standby_lock):
+    """End the manager, the spare and the standby not started by systemd; its own replace them."""
+    for lock in (paths.manager_lock, paths.spare_lock, paths.standby_lock):
         process_control.end_holder(lock)
 
 
@@ -179,7 +182,7 @@ def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(old, signal.SIGTERM)
         gone.wait(HANDOVER_LIMIT_S)
-    # The second one found no place before, and may have given up.
+    # Others found no place before, and may have given up.
     names = [unit.name for unit in units]
     where.systemctl("reset-failed", *names)
     where.systemctl("start", "--no-block", *names)

@@ -108,6 +108,11 @@ class PoolPaths:
         return disk.standby_lock(self.proxy_lock)
 
     @property
+    def spare_lock(self) -> Path:
+        """Held by the spare, which takes the place of the holder of `standby_lock`."""
+        return disk.standby_lock(self.standby_lock)
+
+    @property
     def costs(self) -> Path:
         """The folder with the cost files of all pools, kept after a pool ends."""
         return self.folder.parent.parent / "costs"

@@ -1,8 +1,9 @@
-"""Keep a client proxy and its standby running.
+"""Keep a client proxy, its standby and a spare running.
 
 The death of one is no reason to touch a replica, and its life needs no manager: each is started
-in a session of its own and lives on when the manager goes. The one in line takes over by itself,
-in the instant in which the first ends; here both are started, and adopted where they run already.
+in a session of its own and lives on when the manager goes. Who is in line takes over by itself, in
+the instant in which the one before it ends, and the spare leaves another (`proxy.robot.standby`);
+here they are started where the line has no end, and adopted where they run already.
 
 Owns: starting them again, with backoff, and killing what hangs; and `manager.json`, by which a
 client proxy starts a manager again that was killed (`fogft.proxy.robot.manager_restart`).
@@ -34,7 +35,8 @@ BACKOFF_S = 1.0
 BACKOFF_LIMIT_S = 30.0
 STEADY_S = 5.0  # one that ran so long is no failure
 HANGS_AFTER_S = 10.0
-START_LIMIT_S = 20.0  # one that has neither place by then will not get one
+START_LIMIT_S = 20.0  # one that has no place by then will not get one
+MOVING_UP_S = 1.0  # while others run
 
 
 class _Child(NamedTuple):
@@ -65,14 +67,17 @@ class ProxySupervisor:
         self._alone = command is not None
         self._command = command or (
             *(sys.executable, "-m", "fogft"),
-            *("proxy", "--standby", "--config", str(paths.proxy_config)),
+            *("proxy", "--spare", "--config", str(paths.proxy_config)),
         )
         self._tell_ended = ended
         self._children: list[_Child] = []
         self._watched: set[int] = set()
         self._ending: set[int] = set()
-        locks = paths.proxy_lock, paths.standby_lock
+        locks = paths.proxy_lock, paths.standby_lock, paths.spare_lock
         self._hanging = {lock: Hanging(HANGS_AFTER_S, clock) for lock in locks}
+        self._places = locks[:1] if self._alone else locks
+        self._sessions: set[int] = set()  # of what was started, and its copies
+        self._complete_at = float("-inf")
         self._next_at = 0.0
         self._failures = 0
         self._last_end = ""
@@ -89,28 +94,27 @@ class ProxySupervisor:
             self._children.remove(child)
             self._ended(child.process.returncode, now - child.started_at)
         self._end_hanging()
-        working = self._holder(self._paths.proxy_lock)
-        waiting = self._holder(self._paths.standby_lock)
-        if working is None:  # the one in line is about to take over; the next one is due
-            working = waiting
-        if waiting == working:  # it has just taken over
-            waiting = None
-        if working and working != self._serving:
+        line = [self._holder(lock) for lock in self._places]
+        serving = line[0]
+        if serving and serving != self._serving:
             self.replacements += self._serving != 0
-            self._serving = working
+            self._serving = serving
         if outdated:
-            self._hand_over(working, waiting)
-        placed = {working, waiting}
+            self._end_outdated(line)
         for child in self._children:
-            if child.process.pid not in placed and now - child.started_at < START_LIMIT_S:
+            if child.process.pid not in line and now - child.started_at < START_LIMIT_S:
                 return True
-        complete = waiting is not None or self._alone
-        if (working is not None and complete) or now < self._next_at:
-            return working is not None
+        running = any(pid is not None for pid in line)
+        if line[-1] is not None:
+            self._complete_at = now
+        moving_up = running and now - self._complete_at <= MOVING_UP_S
+        if line[-1] is not None or moving_up or now < self._next_at:
+            return running
         process = detached(self._command, self._paths.proxy_log)
         self._children.append(_Child(process, now))
+        self._sessions.add(process.pid)
         self._watch(process.pid)
-        log.info("proxy_started pid=%d standby=%s", process.pid, working is not None)
+        log.info("proxy_started pid=%d others=%s", process.pid, running)
         return True
 
     def _end_hanging(self) -> None:
@@ -119,16 +123,19 @@ class ProxySupervisor:
             if hanging.end(pid):
                 log.error("proxy_hangs pid=%d", pid)
 
-    def _hand_over(self, working: int | None, waiting: int | None) -> None:
-        """End what is not ours, the one that works only once one of ours can take its place."""
-        ours = {child.process.pid for child in self._children}
-        in_line = waiting in ours
-        last = working if in_line or self._alone else waiting
-        if last and last not in ours and last not in self._ending:
-            self._ending.add(last)
-            log.info("proxy_outdated pid=%d", last)
+    def _end_outdated(self, line: Sequence[int | None]) -> None:
+        """End the last in line that is not ours; others only once one of ours is behind them."""
+        for pid in reversed(line):
+            if not pid:
+                return
             with contextlib.suppress(ProcessLookupError):
-                os.kill(last, signal.SIGTERM)
+                if os.getsid(pid) in self._sessions:
+                    continue
+                if pid not in self._ending:
+                    self._ending.add(pid)
+                    log.info("proxy_outdated pid=%d", pid)
+                    os.kill(pid, signal.SIGTERM)
+            return
 
     def _holder(self, lock: Path) -> int | None:
         """Return who holds a lock, 0 for somebody unknown, None for nobody; hear of its end."""

@@ -96,13 +96,13 @@ def without_manager(
 
 @contextlib.contextmanager
 def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Iterator[None]:
-    """End a pool's client proxy and its standby; none can start inside this context."""
-    # Its place in line stays free until the proxy has gone: it would wait for us to take over.
-    process_control.end_holder(paths.standby_lock)
-    with (
-        _taken(done, "client proxy", paths.proxy_lock),
-        _taken(lambda _: None, "standby client proxy", paths.standby_lock),
-    ):
+    """End a pool's client proxies; none can start inside this context."""
+    with contextlib.ExitStack() as kept:
+        kept.enter_context(_taken(lambda _: None, "spare client proxy", paths.spare_lock))
+        # Its place in line stays free until the proxy has gone: it would wait for us to take over.
+        process_control.end_holder(paths.standby_lock)
+        kept.enter_context(_taken(done, "client proxy", paths.proxy_lock))
+        kept.enter_context(_taken(lambda _: None, "standby client proxy", paths.standby_lock))
         yield
 
 

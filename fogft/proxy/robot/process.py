@@ -61,15 +61,19 @@ _REPORT_AFTER_CHANGE_S = 0.05
 _LOOK_EVERY_S = 0.1  # at files, and what else needs no haste
 
 
-def run(config_path: Path, *, metrics: str | None = None, standby: bool = False) -> None:
+def run(
+    config_path: Path, *, metrics: str | None = None, standby: bool = False, spare: bool = False
+) -> None:
     """Run until a signal ends it.
 
     Args:
         metrics: ``host:port`` to answer Prometheus at, instead of the file's.
         standby: Where one runs already, wait until it ends, and take its place at once.
+        spare: The same, and where one stands by already, wait to stand by.
 
     Raises:
-        PoolBusy: This pool's client proxy runs already, with `standby` another standby too.
+        PoolBusy: This pool's client proxy runs already, with `standby` another standby too,
+            with `spare` another spare.
         FogftError: The configuration, the credentials or ROS cannot be used.
     """
     begin_start()
@@ -81,9 +85,10 @@ def run(config_path: Path, *, metrics: str | None = None, standby: bool = False)
     middleware.prepare(config.rmw)
     early = None
     if not lock.acquire(wait=False):
-        if not standby:
+        if not (standby or spare):
             raise PoolBusy(f"the client proxy of pool `{config.pool}` is already running")
-        early = in_line.wait(config, lock, stop, _node_name("fogft_proxy", config.pool))
+        name = _node_name("fogft_proxy", config.pool)
+        early = in_line.wait(config, lock, stop, name, spare=spare)
         if stop.is_set():
             return
         config = _same(config, read_client(config_path, metrics), config_path)

@@ -2,7 +2,9 @@
 
 The standby has loaded everything and its DDS participant is known, but it offers nothing and no
 node of it is seen. It waits for the lock: the kernel gives it in the instant in which the holder
-ends, whatever ends it.
+ends, whatever ends it. Behind it a spare waits for its place, which has loaded the code and has no
+thread of ROS's or Zenoh's yet: so it can leave a copy of itself (a fork) as the next spare, and
+proxies that are killed one after another cost no start.
 
 A holder that is told to end lets the standby take over while it still serves. For a second
 both serve: each request goes to both, under one id, so that a replica runs it once and the caller
@@ -45,76 +47,109 @@ log = logging.getLogger(__name__)
 LOOK_S = 0.2
 BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
 RENEWED_AFTER_S = 0.5  # a pause, a standby has joined anew and is known
+COPIES = 10  # of copies, at most so many within a time: they may be ending by themselves
+COPIES_WITHIN_S = 60.0
 KNOWN_AFTER_S = 1.0  # once it offers them and knows the callers: until they know its services
 ORDER_LIMIT_S = 20.0  # what was ordered is answered by then, or not at all
 ANEW_LIMIT_S = 2.0  # without a standby: who asks now is answered only afterwards
 FINISH_LIMIT_S = 130.0  # in all less than systemd and `fogft service install` wait
 _PACED_S = 0.5  # until responses that are spread for their client are out
 # What a client proxy imports only when it needs it.
-_NEEDED = ("fogft.link.zenoh.robot.dialer", "fogft.proxy.robot.process", "fogft.ros.messages")
+_NEEDED = (
+    "fogft.link.zenoh.robot.dialer",
+    "fogft.proxy.robot.process",
+    "fogft.ros.messages",
+    "fogft.ros.node",
+)
 
 
 def wait(
-    config: ClientProxyConfig, lock: disk.Lock, stop: threading.Event, node: str
+    config: ClientProxyConfig, lock: disk.Lock, stop: threading.Event, node: str, *, spare: bool
 ) -> EarlyJoin | None:
     """Prepare as much as possible, then wait for the lock; return the prepared ROS node.
 
     Returns early, without the lock, when `stop` is set or the pool's folder is gone.
 
+    Args:
+        spare: Where one stands by already, wait for its place first.
+
     Raises:
         PoolBusy: Another one is next in line already.
         FogftError: ROS cannot be used.
     """
-    early = _prepare(config, node)
+    for module in _NEEDED:
+        importlib.import_module(module)
+    Signer(config.credentials.certificate, config.credentials.key)  # loads `cryptography`
     place = disk.Lock(disk.standby_lock(config.lock))
-    if not place.acquire(wait=False):  # whoever holds it is ready to take over
-        if early is not None:
-            early.close()
+    if spare:
+        _wait_as_spare(config, place, stop)
+    elif not place.acquire(wait=False):  # whoever holds it is ready to take over
         raise PoolBusy(f"the client proxy of pool `{config.pool}` already has a standby")
+    if stop.is_set():
+        return None
+    middleware.load_types([service.type for service in config.services])
+    early = middleware.join_early(config.rmw, node, config.domain_id)
     log.info("standby_ready pool=%s", config.pool)
-    ours, watchdog, pauses = _taken(lock), Watchdog(), Pauses()
-    notify("READY=1")
-    taken = False
-    while not taken:
-        taken = ours.wait(LOOK_S)
-        watchdog.work()
+    pauses = Pauses()
+
+    def look() -> None:
+        nonlocal early
         if early is not None and pauses.was_long():
             early.close()
             early = middleware.join_early(config.rmw, node, config.domain_id)
         if early is not None:
             early.look()
-        if stop.is_set() or not config.lock.parent.exists():
-            stop.set()
-            if early is not None:
-                early.close()
-            break
+
+    if not _take(lock, config, stop, look) and early is not None:
+        early.close()
     place.release()
     return early
 
 
-def _prepare(config: ClientProxyConfig, node: str) -> EarlyJoin | None:
-    for module in _NEEDED:
-        importlib.import_module(module)
-    Signer(config.credentials.certificate, config.credentials.key)  # loads `cryptography`
-    middleware.load_types([service.type for service in config.services])
-    return middleware.join_early(config.rmw, node, config.domain_id)
+def _wait_as_spare(config: ClientProxyConfig, place: disk.Lock, stop: threading.Event) -> None:
+    """Wait for the standby's place; leave a copy of this process that waits for it in turn."""
+    spare, copied = disk.Lock(disk.standby_lock(disk.standby_lock(config.lock))), list[float]()
+    while True:
+        if not spare.acquire(wait=False):
+            raise PoolBusy(f"the standby of pool `{config.pool}` already has a spare")
+        log.info("spare_ready pool=%s pid=%d", config.pool, os.getpid())
+        taken = _take(place, config, stop)
+        spare.release()
+        copied = [at for at in copied if at > time.monotonic() - COPIES_WITHIN_S]
+        # systemd counts only on what it has started.
+        if not taken or len(copied) >= COPIES or "NOTIFY_SOCKET" in os.environ or os.fork():
+            return
+        copied.append(time.monotonic())
+        place.release()  # the one that we are a copy of has it
 
 
-def _taken(lock: disk.Lock) -> threading.Event:
-    """Return an event that is set once we have the lock."""
-    taken = threading.Event()
+def _take(
+    lock: disk.Lock,
+    config: ClientProxyConfig,
+    stop: threading.Event,
+    look: Callable[[], None] = lambda: None,
+) -> bool:
+    """Wait for a lock; return whether we have it, or are to stop."""
 
     def take() -> None:
-        while not taken.is_set():
+        taken = False
+        while not taken:
             try:
-                if lock.acquire(wait=True):
-                    taken.set()
+                taken = lock.acquire(wait=True)
             except OSError as error:  # no descriptor, or the folder is gone
                 log.error("lock_failed reason=%r", str(error))
                 time.sleep(LOOK_S)
 
-    threading.Thread(target=take, name="standby", daemon=True).start()
-    return taken
+    taking, watchdog = threading.Thread(target=take, name="standby", daemon=True), Watchdog()
+    taking.start()
+    notify("READY=1")
+    while taking.is_alive() and not stop.is_set():
+        taking.join(LOOK_S)
+        watchdog.work()
+        look()
+        if not config.lock.parent.exists():
+            stop.set()
+    return not stop.is_set()
 
 
 def request_ids(key: Path, identity: Callable[[Any], Any]) -> Callable[[str, Any], bytes]:

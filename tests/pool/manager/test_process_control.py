@@ -180,7 +180,7 @@ def test_a_running_proxy_is_adopted(tmp_path: Path) -> None:
     held.release()
 
 
-def test_the_next_standby_is_started_while_the_last_one_takes_over(tmp_path: Path) -> None:
+def test_a_line_without_a_spare_gets_one(tmp_path: Path) -> None:
     """The one that takes over may be killed as well, a second later."""
     paths, ended = PoolPaths(tmp_path), threading.Event()
     held = disk.Lock(paths.standby_lock)
@@ -214,7 +214,7 @@ def test_a_proxy_that_was_replaced_is_counted(tmp_path: Path) -> None:
         proxy.supervisor.look()
 
 
-@pytest.mark.parametrize("which", ["proxy_lock", "standby_lock"])
+@pytest.mark.parametrize("which", ["proxy_lock", "standby_lock", "spare_lock"])
 def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
     """Stopped, it holds its place for ever, and nobody can take over; one that works is let be."""
     proxy = Proxy(tmp_path, "pass")
