@@ -51,22 +51,29 @@ def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> No
         StateError: It cannot be written; the old file is as it was.
     """
     data = content.encode() if isinstance(content, str) else content
+    os.close(_replaced(path, data, durable=durable))
+
+
+def _replaced(path: Path, data: bytes, *, durable: bool) -> int:
+    """Replace a file; return the new one, open."""
     temporary = ""
     try:
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(descriptor, "wb") as file:
+        with os.fdopen(descriptor, "wb", closefd=False) as file:
             file.write(data)
-            file.flush()
-            if durable:
-                os.fsync(file.fileno())
+        if durable:
+            os.fsync(descriptor)
         os.replace(temporary, path)
     except OSError as error:
-        with contextlib.suppress(OSError):
-            os.unlink(temporary)
+        if temporary:
+            os.close(descriptor)
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
         raise StateError(
             f"`{path}` cannot be written: {error.strerror}",
             "check the disk's free space and the folder's owner",
         ) from error
+    return descriptor
 
 
 def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
@@ -75,26 +82,44 @@ def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
     write_whole(path, to_json(value) if durable else json.dumps(value), durable=durable)
 
 
-def write_report(path: Path, value: Any) -> None:
-    """Replace a JSON file that says how things are now; on a full disk, write over it in place.
+class Report:
+    """A JSON file that says how things are now, also where nothing else can be written.
 
-    Then whoever reads it at that very moment may find it damaged.
+    Without room or a descriptor, or where the folder became read-only, the last one is written
+    over in place: it stays open. Whoever reads it at that very moment may find it damaged.
     """
-    data = json.dumps(value).encode()
-    try:
-        write_whole(path, data, durable=False)
-    except StateError:
-        if not _written_over(path, data):
-            raise
 
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._open: int | None = None
 
-def _written_over(path: Path, data: bytes) -> bool:
-    """Write over a file, with spaces up to its end; return whether that needs no more room."""
-    with contextlib.suppress(OSError), path.open("r+b", buffering=0) as file:
-        old = os.fstat(file.fileno())
-        if len(data) <= old.st_blocks * 512:
-            return file.write(data.ljust(old.st_size)) >= len(data)
-    return False
+    def write(self, value: Any) -> None:
+        """Replace the file. Raises StateError."""
+        data = json.dumps(value).encode()
+        try:
+            new = _replaced(self._path, data, durable=False)
+        except StateError:
+            if not self._written_over(data):
+                raise
+        else:
+            self.close()
+            self._open = new
+
+    def _written_over(self, data: bytes) -> bool:
+        """Write over the file, with spaces up to its end; return whether there was room for it."""
+        with contextlib.suppress(OSError):
+            if self._open is None:
+                self._open = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
+            old = os.fstat(self._open)
+            if os.path.samestat(old, self._path.stat()) and len(data) <= old.st_blocks * 512:
+                return os.pwrite(self._open, data.ljust(old.st_size), 0) >= len(data)
+        return False
+
+    def close(self) -> None:
+        """Close the last one. Repeatable."""
+        if self._open is not None:
+            os.close(self._open)
+            self._open = None
 
 
 def to_json(value: Any) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pathlib
+import resource
 import signal
 import stat
 import subprocess
@@ -160,16 +161,34 @@ from pathlib import Path
 from fogft import disk
 from fogft.errors import StateError
 folder, state = Path(sys.argv[1]), sys.argv[2]
-for write in disk.write_report, disk.write_json:
+writes = {"report": disk.Report(folder / "report").write}
+writes["other"] = lambda value: disk.write_json(folder / "other", value)
+for write in writes.values():
     try:
-        write(folder / write.__name__, [state] if state == "full" else [state, "more"])
+        write([state] if state == "full" else [state, "more"])
     except StateError:
         pass
-report, other = (disk.read_json(folder / name) for name in ("write_report", "write_json"))
+report, other = (disk.read_json(folder / name) for name in writes)
 with disk.locked(folder / "lock"):
     held = disk.is_locked(folder / "lock")
 print(disk.unwritable(folder), report[0], other[0], held, disk.is_locked(folder / "lock"))
 """
+
+
+def test_a_report_is_written_where_no_descriptor_is_left(tmp_path):
+    report = disk.Report(tmp_path / "report")
+    report.write(["before"])
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+    try:
+        report.write(["now"])
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert disk.read_json(tmp_path / "report") == ["now"]
+    (tmp_path / "report").unlink()
+    report.write(["later"])
+    assert disk.read_json(tmp_path / "report") == ["later"]
+    report.close()
 
 
 @needs("namespaces")

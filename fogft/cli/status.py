@@ -101,6 +101,10 @@ def _watch(paths: PoolPaths, *, as_json: bool) -> None:
 
 
 def _remark(seen: Seen, folder: Path) -> None:
+    if seen.status.proxy_alive and not seen.links_known:
+        told = "nothing" if seen.report_age_s is None else f"nothing for {age(seen.report_age_s)}"
+        output.warn(f"the client proxy runs but has reported {told}: whether it answers is unknown")
+        output.hint(f"it is starting, hangs or cannot write to `{folder}`; see `fogft doctor`")
     if seen.status.ended and not seen.manager_alive:
         output.hint(
             f"restart it with `fogft up {seen.status.file}`, or remove it with `fogft down`"

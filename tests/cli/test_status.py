@@ -151,14 +151,17 @@ def test_a_replica_that_has_served_is_not_starting(home, capsys):
     assert [row[:2] for row in rows] == [["1.12", "starting"], ["2.12", "unready"]]
 
 
-def test_a_client_proxy_that_hangs_is_not_believed(home, capsys):
+def test_a_client_proxy_that_hangs_is_not_believed(home, capsys, monkeypatch):
     """It lives, but its report is old: whether it answers is not known, and `--check` fails."""
+    monkeypatch.setattr(status, "CHECK_LIMIT_S", 0.0)
     paths = lay_down(home)
     report(paths, age_s=12)
     with alive(paths):
-        assert main.run(["status"]) == 0
-        assert "planner  answering?  ? of 3 ready" in (out := capsys.readouterr().out)
-        assert "links seen 12 s ago" in out
+        assert main.run(["status", "--check"]) == 1
+        assert "planner  answering?  ? of 3 ready" in (said := capsys.readouterr()).out
+        assert "links seen 12 s ago" in said.out
+    assert "has reported nothing for 12 s: whether it answers is unknown" in said.err
+    assert f"cannot write to `{paths.folder}`" in said.err
 
 
 def test_a_check_asks_each_link_anew(home, capsys, monkeypatch):

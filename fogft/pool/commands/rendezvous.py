@@ -47,6 +47,7 @@ def run(config: RendezvousConfig) -> None:
 class _Rendezvous:
     def __init__(self, config: RendezvousConfig) -> None:
         self._config = config
+        self._status = disk.Report(config.status) if config.status else None
         verify = Verifier(config.credentials.ca)
         self._records = RecordSet(config.pool_uid, verify)
         cache.restore(config.records, self._records, config.credentials.ca)
@@ -94,8 +95,8 @@ class _Rendezvous:
                 self._news = False
             report = {"pid": os.getpid(), "endpoint": self._server.endpoint}
             report.update(self._server.report())
-            if self._config.status is not None and str(report) != self._reported:
-                disk.write_report(self._config.status, {**report, "written_at": time.time()})
+            if self._status is not None and str(report) != self._reported:
+                self._status.write({**report, "written_at": time.time()})
                 self._reported = str(report)
             self._trouble = ""
         except StateError as error:

@@ -95,6 +95,7 @@ class Manager:
         published = store.membership()
         first = max(self._identity.first_epoch, published.epoch if published else 0)
         self._lease = Lease.take(self._paths, at_least=first)
+        self._report = disk.Report(self._paths.status)
         self._wake = threading.Event()
         self._proxy = ProxySupervisor(
             self._paths, time.monotonic, proxy_command, ended=self._wake.set
@@ -338,7 +339,7 @@ class Manager:
             log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
         self._told = seen
         self._tally.seen(seen.replicas, tick.observed.now)
-        disk.write_report(self._paths.status, seen.to_json())
+        self._report.write(seen.to_json())
 
     # -- waiting ----------------------------------------------------------------------------
 

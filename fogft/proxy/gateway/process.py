@@ -82,6 +82,7 @@ class _Gateway:
 
         self._handshakes = HandshakeLog()
         self._config = config
+        self._status = disk.Report(config.status)
         self._incarnation = secrets.token_hex(8)
         self._draining = False
         self._forwarder = Forwarder()
@@ -215,8 +216,7 @@ class _Gateway:
             **self._told(),
             **self._following.report(),
         }
-        status = self._config.status
-        try_step(functools.partial(disk.write_report, status, report), status)
+        try_step(functools.partial(self._status.write, report), self._config.status)
 
     def close(self) -> None:
         """Refuse what is under way, and leave."""

@@ -231,6 +231,7 @@ class _Running:
         proxy.serve(self.seen.follow(config.services))
         proxy.pass_topics(config.topics, cast("SerialisedNode", joined.node))
         self.following = Following(config)
+        self.told = disk.Report(config.status)
         self.scrape = Scrape(lambda: proxies.of_client(proxy.report()), {"pool": config.pool})
         self.scrape.at(config.metrics)
         self.spans = wanted("fogft-robot", config.pool)
@@ -369,7 +370,7 @@ class _Running:
             **self.following.report(self.dialer.newer()),
             "callers": self.callers(),
         }
-        disk.write_report(self.config.status, report)
+        self.told.write(report)
 
 
 _troubles: dict[Path, str] = {}
