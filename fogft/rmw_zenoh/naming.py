@@ -189,16 +189,17 @@ class Graph:
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
         """Return the full name of the service `what` of the node that calls a service.
 
-        None where that is not one node, or has none. Of several, `client` (a GID) does not tell
-        which: it is a hash of the token in a way of `rmw_zenoh`'s own.
+        None while no client is discovered, empty where it has none, and where the clients are of
+        several nodes: `client` (a GID) does not tell which, it is a hash of the token in a way of
+        `rmw_zenoh`'s own.
         """
         tokens = self._all()
         nodes = {(t.node, t.namespace) for t in tokens if (t.kind, t.service) == (CLIENT, service)}
         if len(nodes) != 1:
-            return None
+            return "" if nodes else None
         node, namespace = nodes.pop()
         name = f"{namespace.rstrip('/')}/{node}/{what}"
-        return name if self.servers(name) else None
+        return name if self.servers(name) else ""
 
     def servers(self, service: str) -> list[str]:
         """Return the full name of each node that offers a service."""

@@ -206,8 +206,9 @@ class SerialisedNode:
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
         """Return the full name of the service `what` of the node that a client belongs to.
 
-        None while it is not discovered, and where there is none. A node's name may be told three
-        seconds later than its services: where its process has but one of these, that is it.
+        None while it is not discovered, empty where there is none: a process's ends are discovered
+        in the order of their making, and a node's own services come before its clients. Its name
+        may be told three seconds later: where its process has but one such service, that is it.
 
         Args:
             service: What the client calls, an absolute name.
@@ -227,7 +228,9 @@ class SerialisedNode:
             else:
                 topics = [f"rq{end.node_namespace.rstrip('/')}/{end.node_name}/{what}Request"]
             found = [topic for topic in topics if self._reads(client[: spdp.PREFIX_BYTES], topic)]
-            return found[0][len("rq") : -len("Request")] if len(found) == 1 else None
+            if len(found) > 1:
+                return None
+            return found[0][len("rq") : -len("Request")] if found else ""
         return None
 
     def _request_topics(self, what: str) -> list[str]:

@@ -43,7 +43,7 @@ class Graph:
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
         assert (what, service) == ("get_parameter_types", "/detect")
         node = self.nodes.get(client)
-        return node and f"{node}/{what}"
+        return node and f"{node}/{what}"  # empty where it has no parameters
 
     def client(self, name: str, type_name: str) -> End:
         self.ends[name] = End()
@@ -71,9 +71,9 @@ def test_a_node_with_parameters_answers_probes():
 def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
     graph = Graph()
     probes = NodeProbes(graph)
-    assert not probes.answers("/detect", b"?" * 16)
+    assert probes.answers("/detect", b"?" * 16) is None
     graph.client = lambda name, type_name: _missing()
-    assert not probes.answers("/detect", CLIENT)
+    assert probes.answers("/detect", CLIENT) is None
 
 
 def _missing() -> End:
@@ -84,7 +84,7 @@ def _missing() -> End:
 
 def test_a_node_without_parameters_answers_none():
     graph = Graph()
-    graph.nodes = {}
+    graph.nodes = {CLIENT: ""}
     assert NodeProbes(graph).answers("/detect", CLIENT) is False
     assert not graph.ends
 

@@ -333,14 +333,14 @@ def test_one_clients_burst_does_not_hold_up_another():
 
 
 def test_a_client_whose_node_is_found_late_is_not_paced_by_time():
-    """Discovery tells of a node before it tells that the node has a service to probe."""
+    """The way to what would answer a probe is told after whose client it is."""
     now, sent, probed, looks = [0.0], [], threading.Event(), [0]
 
     class Node:
         def answers(self, service, client):
             looks[0] += 1
             now[0] += 0.05
-            return looks[0] > 10
+            return True if looks[0] > 10 else None
 
         def send(self, client, on_answer):
             probed.set()
@@ -352,6 +352,29 @@ def test_a_client_whose_node_is_found_late_is_not_paced_by_time():
         pacer.respond(handle(1, number), b"")
     assert probed.wait(30)
     assert len(sent) <= QUEUE
+    pacer.close()
+
+
+def test_a_client_whose_node_has_nothing_to_probe_is_paced_by_time_at_once():
+    """Discovery tells that with its first request: nobody waits for what will never be there."""
+    now, sent, known = [0.0], threading.Semaphore(0), threading.Event()
+
+    class Node:
+        def answers(self, service, client):
+            known.set()
+            return False
+
+    pacer = Pacer(lambda *_: sent.release(), Node(), "/s", clock=lambda: now[0])
+    for number in range(2 * WINDOW):
+        pacer.requested(handle(1, number), together=True)
+    assert known.wait(30)
+    for number in range(2 * WINDOW):
+        pacer.respond(handle(1, number), b"")
+    for tick in range(WINDOW + 1):
+        now[0] = tick * 1.001 * EVERY_S
+        for _ in range(1 if tick else WINDOW):
+            assert sent.acquire(timeout=30), "a response as time passes"
+        assert not sent.acquire(blocking=False)
     pacer.close()
 
 

@@ -31,7 +31,7 @@ class Graph(Protocol):
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
         """Return the full name of the service `what` of the node that a client belongs to.
 
-        None while it is not discovered, and where there is none.
+        None while it is not discovered, empty where there is none.
         """
 
 
@@ -44,11 +44,11 @@ class NodeProbes:
         self._by_client: dict[bytes, RosClient] = {}
         self._lock = threading.Lock()
 
-    def answers(self, service: str, client: bytes) -> bool:
-        """Whether the node of a service's client answers probes, as far as discovered."""
+    def answers(self, service: str, client: bytes) -> bool | None:
+        """Whether the node of a service's client answers probes; None while it is not known."""
         asked = self._graph.same_node_serves(_SERVICE, service, client)
-        if asked is None:
-            return False
+        if not asked:
+            return None if asked is None else False
         with self._lock:
             end = self._by_name.get(asked)
             if end is None:
@@ -59,7 +59,7 @@ class NodeProbes:
                 except RosError:
                     return False
             if not end.available():
-                return False
+                return None
             if len(self._by_client) >= 4 * KEPT:  # long gone
                 self._by_client.pop(next(iter(self._by_client)))
             self._by_client[client] = end

@@ -180,7 +180,7 @@ class Pacer:
         answers = self._probes.answers(self._service, id)
         now = self._clock()
         with self._wake:
-            if not answers and now < self._asked.get(id, now):
+            if answers is None and now < self._asked.get(id, now):
                 return
             self._asked.pop(id, None)
             self._pace.client(id, now).probing = Probing.YES if answers else Probing.NO
