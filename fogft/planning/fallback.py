@@ -5,9 +5,10 @@ Where a group has `fallback`, on-demand machines in slots of their own stand in.
 the moment that a spot replica is lost, is noticed or is refused, beside the order of
 another spot machine, and end once enough others have been ready for `SETTLED_S`.
 
-Once all are lost, one more than is wanted boots until the first of them serves. While an
-on-demand machine serves, which nobody takes away, spot is asked for alone, and another one
-stands in only once that was refused. Nor is a slot short whose first machine is still booting.
+Once all are lost, as many more than are wanted boot as `max_surge` allows, until the first of
+them serves. While an on-demand machine serves, which nobody takes away, spot is asked for alone,
+and another one stands in only once that was refused. Nor is a slot short whose first machine is
+still booting.
 
 Owns: who stands in, and how many are missing.
 Not here: where they are bought (`buying`) and the two steps of an ending (`endings`).
@@ -27,9 +28,8 @@ from fogft.planning.observed.history import History
 SETTLED_S = 20.0
 # Under a cap that has no room for both, a stand-in makes way for a spot machine after so long.
 STAYS_S = 600.0
-# Where spot machines are lost so often, one of a group is on demand: losses come in clusters, and
-# without one all that are left may go at once.
-OFTEN = 2
+# Where as many spot machines as are wanted were lost within so long, one is on demand: losses come
+# in clusters, and without one all that are left may go at once.
 OFTEN_S = 2700.0
 
 
@@ -41,13 +41,13 @@ def stand_ins(machines: Classification) -> list[Assessment]:
 def held(group: Group, wanted: int, history: History, now: float) -> int:
     """Return how many stand-ins replace spot machines, for which no search is made then.
 
-    One, where each spot machine beside it would be lost `OFTEN` within `OFTEN_S`. None in place of
-    a lone one: that would be to give up spot machines.
+    One, where as many were lost within `OFTEN_S` as are wanted. None in place of a lone one: that
+    would be to give up spot machines.
     """
-    spot = wanted - group.on_demand.base - 1
-    if not group.on_demand.fallback or spot < 1:
+    spot = wanted - group.on_demand.base
+    if not group.on_demand.fallback or spot < 2:
         return 0
-    return int(len(losses_of_late(history, now)) >= OFTEN * spot)
+    return int(len(losses_of_late(history, now)) >= spot)
 
 
 def losses_of_late(history: History, now: float) -> list[float]:
@@ -75,6 +75,7 @@ def missing(
     standing_in: Sequence[Assessment],
     history: History,
     *,
+    surge: int,
     safe: bool,
 ) -> int:
     """Return how many more stand-ins are needed.
@@ -84,6 +85,7 @@ def missing(
         here: The group's machines, without its stand-ins.
         standing_in: Its stand-ins, booting ones included.
         history: Of all launches.
+        surge: So many more boot while nobody serves.
         safe: See `is_safe`.
     """
     kept = (*here.good, *here.replaced)
@@ -91,7 +93,7 @@ def missing(
         s.ever_ready or is_first(s.slot, s.id.generation, history, safe=safe) for s in kept
     )
     ever_served = any(map(history.served, history.generations))
-    racing = _racing(wanted, standing_in) if ever_served and not covered else 0
+    racing = _racing(wanted, surge, standing_in) if ever_served and not covered else 0
     return wanted + racing - covered - len(standing_in)
 
 
@@ -101,6 +103,7 @@ def spare(
     standing_in: Sequence[Assessment],
     now: float,
     *,
+    surge: int,
     held: int = 0,
 ) -> int:
     """Return how many stand-ins are no longer needed, given enough others that have settled.
@@ -110,13 +113,13 @@ def spare(
     settled_s = 0.0 if held and any(s.serving for s in standing_in) else SETTLED_S
     settled = sum(has_served(s, settled_s, now) for s in (*here.good, *here.replaced))
     kept = sum(not s.unwanted for s in standing_in)
-    racing = 0 if settled else _racing(wanted, standing_in)
+    racing = 0 if settled else _racing(wanted, surge, standing_in)
     return kept - max(0, wanted + racing - settled)
 
 
-def _racing(wanted: int, standing_in: Sequence[Assessment]) -> int:
-    """Return 1 where none stands in yet: of machines that boot at once the fastest decides."""
-    return int(wanted > 1 and not any(s.serving for s in standing_in))
+def _racing(wanted: int, surge: int, standing_in: Sequence[Assessment]) -> int:
+    """Return how many more boot where none serves yet: of many at once the fastest decides."""
+    return surge if wanted > 1 and not any(s.serving for s in standing_in) else 0
 
 
 def has_served(replica: Assessment, for_s: float, now: float) -> bool:

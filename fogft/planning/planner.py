@@ -192,7 +192,14 @@ def plan_once(
         if fallback.is_first(need.slot, buyer.next_generation(need.slot), history, safe=safe)
     }
     stand_ins_missing = partial(
-        _stand_ins_missing, sized.groups, counts, others, standing_in, history=history, safe=safe
+        _stand_ins_missing,
+        sized.groups,
+        counts,
+        others,
+        standing_in,
+        history=history,
+        surge=spec.max_surge,
+        safe=safe,
     )
     short = stand_ins_missing(begun)
     kept_free = _urgent_first(buyer, short, room)
@@ -226,7 +233,9 @@ def plan_once(
                 held=staying,
                 first=first if makes_room else None,
                 standing_in=mine,
-                spare=fallback.spare(count, here, mine, observed.now, held=kept),
+                spare=fallback.spare(
+                    count, here, mine, observed.now, surge=spec.max_surge, held=kept
+                ),
             )
         )
     going = [
@@ -296,6 +305,7 @@ def _stand_ins_missing(
     begun: Collection[int],
     *,
     history: History,
+    surge: int,
     safe: bool,
 ) -> list[Need]:
     """Return the stand-ins called for, where some slots get their first machine now."""
@@ -307,7 +317,8 @@ def _stand_ins_missing(
         here = [s for s in standing_in if group_of(groups, s.slot) is group and not s.unwanted]
         mine = others.part(groups, group)
         first = sum(group_of(groups, slot) is group for slot in begun)
-        for _ in range(fallback.missing(count - first, mine, here, history, safe=safe)):
+        wanted = count - first
+        for _ in range(fallback.missing(wanted, mine, here, history, surge=surge, safe=safe)):
             need = stand_in(group, used)
             used.add(need.slot)
             needs.append(need)

@@ -10,7 +10,7 @@ from fogft.model.choices import OnDemandSpec, Spread
 from fogft.model.groups import STAND_INS
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
-from fogft.planning.fallback import OFTEN, OFTEN_S, SETTLED_S
+from fogft.planning.fallback import OFTEN_S, SETTLED_S
 from fogft.planning.observed.history import Event, EventKind
 from tests.planning.pool_worlds import NOW, PLACES, World, replica, spec
 
@@ -44,19 +44,22 @@ def test_at_a_notice_a_stand_in_is_ordered_beside_another_spot_machine():
     assert ordered(world(spot(0), spot(1, state="noticed"))) == [(1, True), (STAND_INS, False)]
 
 
-def test_when_all_are_lost_one_stand_in_more_than_is_wanted_boots_until_the_first_serves():
+@pytest.mark.parametrize("surge", [1, 3])
+def test_when_all_are_lost_more_stand_ins_than_are_wanted_boot_until_the_first_serves(surge):
     """As many as the surge allows; spot machines are asked for beside those that serve."""
-    both = spot(0, state="noticed"), spot(1, state="noticed")
-    slots = [STAND_INS, STAND_INS + 1, STAND_INS + 2]
-    assert ordered(world(*both)) == [(slot, False) for slot in slots]
-    at = {"at": replace(PLACES[3], spot=False), "price": 0.3, "of": MIXED}
+    of = replace(MIXED, max_surge=surge)
+    both = [replica(slot, of=of, state="noticed") for slot in (0, 1)]
+    slots = [STAND_INS + number for number in range(2 + surge)]
+    assert ordered(world(*both, of=of)) == [(slot, False) for slot in slots]
+    at = {"at": replace(PLACES[3], spot=False), "price": 0.3, "of": of}
     serving = replica(slots[0], **at)
     booting = [replica(slot, state="provisioning", **at) for slot in slots[1:]]
-    alone = world(*both, replica(slots[0], state="provisioning", **at), *booting).plan()
+    first = replica(slots[0], state="provisioning", **at)
+    alone = world(*both, first, *booting, of=of).plan()
     assert not alone.launches
     assert not alone.terminations
-    later = world(*both, serving, *booting).plan()
-    assert [end.id.slot for end in later.terminations] == [slots[2]]
+    later = world(*both, serving, *booting, of=of).plan()
+    assert {end.id.slot for end in later.terminations} == {*slots[2:]}
 
 
 def test_while_an_on_demand_machine_serves_spot_is_asked_first():
@@ -178,18 +181,22 @@ def test_of_equal_places_no_name_is_preferred():
     assert {launch.offer.placement.zone for [launch] in pools} == set("abcd")
 
 
-@pytest.mark.parametrize(("losses", "is_held"), [(OFTEN - 1, False), (OFTEN, True)])
-def test_where_spot_machines_are_lost_too_often_a_stand_in_is_held_in_place_of_one(losses, is_held):
+@pytest.mark.parametrize("wanted", [2, 4])
+@pytest.mark.parametrize("is_held", [False, True])
+def test_where_as_many_as_are_wanted_were_lost_a_stand_in_is_held_in_place_of_one(wanted, is_held):
+    losses = wanted if is_held else wanted - 1
     gone = [
-        Event(NOW - 900 * age_of, kind, 7, age_of + 1, PLACES[2].location)
+        Event(NOW - 600 * age_of, kind, 7, age_of + 1, PLACES[2].location)
         for age_of in range(losses)
         for kind in (EventKind.LAUNCH, EventKind.GONE)
     ]
-    asked = world(spot(0, age_s=9000.0), stand_in(age_s=9000.0))
+    of = replace(MIXED, replicas=wanted)
+    spots = [replica(slot, of=of, age_s=9000.0) for slot in range(wanted - 1)]
+    asked = world(*spots, stand_in(age_s=9000.0), of=of)
     asked = replace(asked, events=(*gone, *asked.events))
-    assert ordered(asked) == [(1, True)] * (not is_held)
+    assert ordered(asked) == [(wanted - 1, True)] * (not is_held)
     later = replace(asked, now=NOW + OFTEN_S)
-    assert ordered(later) == [(1, True)]
+    assert ordered(later) == [(wanted - 1, True)]
 
 
 @pytest.mark.parametrize(("stands_in_for_s", "goes"), [(300.0, False), (900.0, True)])
