@@ -10,7 +10,6 @@ import json
 import os
 import pkgutil
 import sys
-from pathlib import Path
 
 from fogft.cli.main import run
 
@@ -24,8 +23,8 @@ gc.freeze()
 
 
 def main() -> None:
-    """Run the words that are given, in that environment and folder, and note what they return."""
-    words, environ, folder, out, ended = json.loads(sys.argv[1])
+    """Run the words that are given, in that environment and folder."""
+    words, environ, folder, out = json.loads(sys.argv[1])
     os.environ.clear()
     os.environ.update(environ)
     os.chdir(folder)
@@ -33,5 +32,4 @@ def main() -> None:
         os.dup2(file.fileno(), sys.stdout.fileno())
     code = run(words)
     sys.stdout.flush()
-    Path(ended).write_text(str(code))
-    os._exit(0)  # what it has imported need not be taken down
+    os._exit(code)  # what it has imported need not be taken down

@@ -39,16 +39,17 @@ def run(
             env=environ, cwd=folder, capture_output=True, text=True, timeout=limit_s, check=False,
         )  # fmt: skip
     with tempfile.TemporaryDirectory() as scratch, tempfile.TemporaryFile("w+") as errors:
-        out, ended = Path(scratch, "out"), Path(scratch, "ended")
-        given = json.dumps([words, dict(environ), str(folder), str(out), str(ended)])
+        out = Path(scratch, "out")
+        given = json.dumps([words, dict(environ), str(folder), str(out)])
         process = forked.Forked("tests.e2e.command", [given], errors.fileno())
         process.stdin.close()
         process.stdout.close()
-        if not process.wait(limit_s):
+        try:
+            code = process.wait(limit_s)
+        except subprocess.TimeoutExpired:
             process.kill()
-            raise subprocess.TimeoutExpired(words, limit_s)
+            raise
         errors.seek(0)
-        code = int(ended.read_text()) if ended.exists() else 1
         return subprocess.CompletedProcess(words, code, out.read_text(), errors.read())
 
 

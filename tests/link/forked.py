@@ -41,37 +41,50 @@ class Forked:
         pid: Its process id.
         stdin: Its standard input.
         stdout: Its standard output.
+        returncode: Its exit status, or negative the signal that ended it, once `poll` or `wait`
+            has seen its end.
     """
 
     def __init__(self, module: str, arguments: Sequence[str], stderr: int) -> None:
         theirs_in, ours_in = os.pipe()
         ours_out, theirs_out = os.pipe()
+        self._ended, theirs_ended = os.pipe()
+        weakref.finalize(self, os.close, self._ended)
         with _ONE_AT_A_TIME:
             forks = _forks(module)
             order = json.dumps(arguments).encode()
-            socket.send_fds(forks, [order], [theirs_in, theirs_out, stderr])
+            socket.send_fds(forks, [order], [theirs_in, theirs_out, stderr, theirs_ended])
             self.pid = int(forks.recv(32))
-        self._ended = os.pidfd_open(self.pid)
-        weakref.finalize(self, os.close, self._ended)
-        os.close(theirs_in)
-        os.close(theirs_out)
+        for number in (theirs_in, theirs_out, theirs_ended):
+            os.close(number)
+        self.returncode: int | None = None
         self.stdin: IO[str] = open(ours_in, "w")  # noqa: SIM115 - closed by `kill`
         self.stdout: IO[str] = open(ours_out)  # noqa: SIM115
 
     def send_signal(self, number: int) -> None:
-        with contextlib.suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._ended, number)
+        if self.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self.pid, number)
+
+    def terminate(self) -> None:
+        self.send_signal(signal.SIGTERM)
 
     def kill(self) -> None:
         self.send_signal(signal.SIGKILL)
 
     def poll(self) -> int | None:
-        """Return 0 if it has ended; how is not known."""
-        return 0 if select.select([self._ended], [], [], 0)[0] else None
+        """Return its exit status if it has ended."""
+        if self.returncode is None and select.select([self._ended], [], [], 0)[0]:
+            self.returncode = int(os.read(self._ended, 32))
+        return self.returncode
 
-    def wait(self, limit_s: float | None = None) -> bool:
-        """Wait until it has ended, or for so long; return whether it has."""
-        return bool(select.select([self._ended], [], [], limit_s)[0])
+    def wait(self, timeout: float | None = None) -> int:
+        """Wait until it has ended; return its exit status."""
+        if self.returncode is None and not select.select([self._ended], [], [], timeout)[0]:
+            raise subprocess.TimeoutExpired(f"process {self.pid}", timeout or 0.0)
+        self.poll()
+        assert self.returncode is not None
+        return self.returncode
 
 
 def start(module: str, *arguments: str, stderr: int = 2) -> Forked | subprocess.Popen[str]:
@@ -106,10 +119,30 @@ def _forks(module: str) -> socket.socket:
     return ours
 
 
-def _reap(*_: object) -> None:
-    with contextlib.suppress(ChildProcessError):
-        while os.waitpid(-1, os.WNOHANG)[0]:
-            pass
+class _Children:
+    """What was forked: each end is written to whoever ordered it."""
+
+    def __init__(self) -> None:
+        self._told: dict[int, int] = {}
+        self._codes: dict[int, int] = {}
+
+    def add(self, pid: int, told: int) -> None:
+        self._told[pid] = told
+        self._tell()
+
+    def reap(self, *_: object) -> None:
+        with contextlib.suppress(ChildProcessError):
+            while (found := os.waitpid(-1, os.WNOHANG))[0]:
+                self._codes[found[0]] = os.waitstatus_to_exitcode(found[1])
+        self._tell()
+
+    def _tell(self) -> None:
+        for pid in self._told.keys() & self._codes.keys():
+            file, code = self._told.pop(pid, -1), self._codes.pop(pid, 0)
+            if file >= 0:  # else a signal has come between
+                with contextlib.suppress(BrokenPipeError):
+                    os.write(file, str(code).encode())
+                os.close(file)
 
 
 def main() -> None:
@@ -117,14 +150,17 @@ def main() -> None:
     name, orders = sys.argv[1], socket.socket(fileno=int(sys.argv[2]))
     module = importlib.import_module(name)
     assert len(os.listdir("/proc/self/task")) == 1, "threads do not survive a fork"
-    signal.signal(signal.SIGCHLD, _reap)
+    children = _Children()
+    signal.signal(signal.SIGCHLD, children.reap)
     while True:
-        order, files, _, _ = socket.recv_fds(orders, 1 << 16, 3)
+        order, files, _, _ = socket.recv_fds(orders, 1 << 16, 4)
         if not order:
             break
+        *files, ended = files
         if not (pid := os.fork()):
             signal.signal(signal.SIGCHLD, signal.SIG_DFL)
             orders.close()
+            os.close(ended)
             for number, file in enumerate(files):
                 os.dup2(file, number)
                 os.close(file)
@@ -135,6 +171,7 @@ def main() -> None:
         for file in files:
             os.close(file)
         orders.send(str(pid).encode())
+        children.add(pid, ended)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     with contextlib.suppress(ChildProcessError):
         while True:

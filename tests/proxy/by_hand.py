@@ -16,12 +16,15 @@ from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Topology
 from fogft.pool.credentials import authority
 from tests import certificate_names
+from tests.link import forked
 from tests.ports import free_port
 
 UID = "0123456789abcdef"
 LIMIT_S = 60.0
 ROOT = Path(__file__).parents[2]
 SERVICE = ROOT / "tests/e2e/nodes/plan_service.py"
+READ_EARLY = {"LD_PRELOAD", "LD_LIBRARY_PATH", "PYTHONPATH"}  # before what is forked has them
+Process = subprocess.Popen[bytes] | forked.Forked
 SERVICES = "[{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 45.0}]"
 
 
@@ -57,7 +60,7 @@ class Parts:
         self.folder = folder
         self.tree = ROOT
         self._domain = domain
-        self._processes: list[subprocess.Popen[bytes]] = []
+        self._processes: list[Process] = []
         self._version = 0
         authority.create_authority(folder / "ca", UID)
 
@@ -76,14 +79,23 @@ class Parts:
 
     def start(
         self, command: str, config: Path, environ: Mapping[str, str] = {}, *options: str
-    ) -> subprocess.Popen[bytes]:
+    ) -> Process:
+        """Start a part; forked from what has imported it, if it is of this tree."""
         path = os.pathsep.join(filter(None, [str(self.tree), os.environ.get("PYTHONPATH")]))
+        words = [command, "--config", str(config), *options]
+        env = {**os.environ, "PYTHONPATH": path, **environ}
+        process: Process
         with config.with_suffix(".log").open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "fogft", command, "--config", str(config), *options],
-                cwd=self.tree, stdout=log, stderr=log,
-                env={**os.environ, "PYTHONPATH": path, **environ},
-            )  # fmt: skip
+            if self.tree == ROOT and not environ.keys() & READ_EARLY:
+                given = json.dumps([words, env, str(ROOT)])
+                process = forked.Forked("tests.proxy.part", [given], log.fileno())
+                process.stdin.close()
+                process.stdout.close()
+            else:
+                process = subprocess.Popen(
+                    [sys.executable, "-m", "fogft", *words],
+                    cwd=self.tree, stdout=log, stderr=log, env=env,
+                )  # fmt: skip
         self._processes.append(process)
         return process
 
@@ -184,7 +196,7 @@ class Robot:
         self.process.wait()
         self._status.unlink()
 
-    def start_standby(self) -> subprocess.Popen[bytes]:
+    def start_standby(self) -> Process:
         """Start another one that takes over, and wait until it could."""
         log = self.config.with_suffix(".log")
         ready = log.read_text().count("standby_ready")
