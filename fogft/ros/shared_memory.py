@@ -1,4 +1,4 @@
-"""Remove shared memory that killed ROS processes left in /dev/shm, never any in use.
+"""Deal with shared memory that killed ROS processes left in /dev/shm.
 
 Fast DDS makes, for each participant, a *segment* (random name) and, for each port of a
 domain, a *port* (its number as the name), with lock files beside them::
@@ -12,6 +12,10 @@ lock files is locked (which also tells of processes that /proc hides: another co
 it is this user's, and nothing touched it for `SETTLED_S`. A port's name is used again by
 the next process, so a port goes under its own mutex, as Fast DDS does it.
 
+That process removes its predecessor's port and makes a new one. Fast DDS goes on writing to the
+removed one for two seconds, and what went there comes up to three seconds later still, all at
+once: more than a client keeps. A port that is marked as broken it opens anew immediately.
+
 Names begin with ``fastrtps`` before Fast DDS 3. The ROS wheels' tracing library leaves
 ``lttng-ust-wait-*``; the same rules hold. Needs neither rclpy nor Fast DDS.
 """
@@ -23,14 +27,22 @@ import ctypes
 import fcntl
 import os
 import re
+import struct
+import threading
 import time
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 SETTLED_S = 2.0
 FOLDER = Path("/dev/shm")
 
 _TURN_LIMIT_S = 5.0
+_IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
+_REMOVED = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+) \(deleted\)")
+# A port begins, in Fast DDS 2.14 and 3.2, with: its number, how many read it, two limits in ms (one
+# a third of the other), how many messages it holds, how many wait; flags, the lowest "not broken".
+_PORT, _HEAD_BYTES = struct.Struct("=7I"), 1024
 _SEGMENT = re.compile(r"fast(?:dds|rtps)_[0-9a-f]{16}")
 _OURS = re.compile(
     r"(?:sem\.)?(?P<group>fast(?:dds|rtps)_(?:port\d+|[0-9a-f]+)|fast_datasharing_[^/]+?"
@@ -119,6 +131,44 @@ def make_private() -> None:
         if _SEGMENT.fullmatch(name):
             with contextlib.suppress(OSError):  # another user's, or gone
                 (FOLDER / name).chmod(0o600)
+
+
+@lru_cache(maxsize=1)
+def watch_ports() -> None:
+    """From now on have this process open anew each port that another process removes."""
+    with contextlib.suppress(AttributeError):  # no Linux
+        libc = ctypes.CDLL(None)
+        watch = libc.inotify_init1(os.O_CLOEXEC)
+        if libc.inotify_add_watch(watch, bytes(FOLDER), _IN_DELETE) >= 0:  # else no more are had
+            threading.Thread(target=_reopen, args=(watch,), name="ros-ports", daemon=True).start()
+
+
+def _reopen(watch: int) -> None:
+    while events := os.read(watch, _EVENTS_BYTES):
+        if b"_port" in events:
+            reopen_ports()
+
+
+def reopen_ports() -> int:
+    """Mark ports that this process has open and that were removed as broken; return how many."""
+    broken = 0
+    with contextlib.suppress(OSError), open("/proc/self/mem", "r+b", buffering=0) as memory:
+        for line in Path("/proc/self/maps").read_bytes().splitlines():
+            found = line.endswith(b")") and _REMOVED.fullmatch(line)
+            if found:
+                with contextlib.suppress(OSError):  # closed meanwhile
+                    broken += _mark_broken(memory.fileno(), int(found[1], 16), int(found[2]))
+    return broken
+
+
+def _mark_broken(memory: int, start: int, number: int) -> bool:
+    head = os.pread(memory, _HEAD_BYTES, start)
+    for at in range(0, len(head) - _PORT.size, 4):
+        port, _, limit_ms, wait_ms, _, _, flags = _PORT.unpack_from(head, at)
+        if port == number and wait_ms == limit_ms // 3 and flags & 1 and flags < 8:
+            os.pwrite(memory, bytes([flags & ~1]), start + at + _PORT.size - 4)
+            return True
+    return False
 
 
 def _mapped(process: str) -> set[str]:

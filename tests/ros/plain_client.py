@@ -2,7 +2,7 @@
 
 Default quality of service, rclpy's own executor: it sends COUNT requests of ``/burst`` at once,
 spends CALLBACK_S in each response's callback, and does so again ROUNDS times. It waits for a line
-on stdin, so that several begin at once, and prints how many of all were answered.
+on stdin, so that several begin at once, prints how many of all were answered, and waits again.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ def main() -> None:
         sys.exit("no service was found")
     print("ready", flush=True)
     sys.stdin.readline()
-    print(sum(answered(node, client, int(count), float(hold_s)) for _ in range(int(rounds))))
+    sums = (answered(node, client, int(count), float(hold_s)) for _ in range(int(rounds)))
+    print(sum(sums), flush=True)
+    sys.stdin.readline()
     node.destroy_node()
     rclpy.shutdown()
 

@@ -66,22 +66,29 @@ def call(ros_domain: int) -> Callable[..., list[int]]:
 
 def answers(domain: int, *clients: tuple[int, float, int]) -> list[int]:
     """Run clients beside each other; return how many answers each got."""
-    started = [
-        subprocess.Popen(
-            [sys.executable, PROGRAM, f"plain_{n}", *map(str, client)],
-            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
-        for n, client in enumerate(clients)
-    ]
-    assert all(one.stdout.readline() == "ready\n" for one in started)
+    started = [start(domain, f"plain_{n}", client) for n, client in enumerate(clients)]
     time.sleep(1.0)
     for one in started:
-        one.stdin.write("\n")
-        one.stdin.flush()
+        begin(one)
     return [int(one.communicate(timeout=120)[0]) for one in started]
+
+
+def start(domain: int, name: str, client: tuple[int, float, int]) -> Any:
+    """Start a client; return its process once it has found the service."""
+    process = subprocess.Popen(
+        [sys.executable, PROGRAM, name, *map(str, client)],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def begin(client: Any) -> None:
+    client.stdin.write("\n")
+    client.stdin.flush()
 
 
 @pytest.mark.parametrize(
@@ -105,3 +112,15 @@ def test_two_clients_of_one_service_lose_none(
     """They share its topic of responses: a burst of one fills the other's queue, too."""
     assert sum(call((50, 0.0, 10), (10, 0.005, 20))) == arrived[0]
     assert arrived[0] > 0.9 * 700
+
+
+def test_the_successors_of_killed_clients_lose_none(arrived: list[int], ros_domain: int) -> None:
+    """Each has the shared-memory port of the one before, which DDS writes to for seconds."""
+    answered = 0
+    for n in range(4):
+        client = start(ros_domain, f"killed_{n}", (50, 0.0, 1))
+        begin(client)
+        answered += int(client.stdout.readline())
+        client.kill()
+        client.wait()
+    assert answered == arrived[0] > 100

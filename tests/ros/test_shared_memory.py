@@ -226,12 +226,8 @@ def test_a_live_node_survives_and_a_killed_one_is_swept(
     make_node: Callable[[int], Any], ros_domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Sweeping under a live pair costs nothing; after SIGKILL nothing of the dead one is left."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", NODE, str(ros_domain)], stdout=subprocess.PIPE, text=True
-    )
+    process = _other_node(ros_domain)
     try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "up\n"
         theirs = _names_of(process.pid)
         assert theirs
         _judge_only(theirs, monkeypatch)
@@ -249,6 +245,57 @@ def test_a_live_node_survives_and_a_killed_one_is_swept(
     left = theirs & set(os.listdir(shared_memory.FOLDER)) - shared_memory.names_in_use()
     assert left == set()
     assert theirs - _names_of(os.getpid())
+
+
+def _other_node(domain: int) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", NODE, str(domain)], stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "up\n"
+    return process
+
+
+CALLER = """
+import sys, rclpy
+from fogft.ros import shared_memory
+from std_srvs.srv import SetBool
+rclpy.init()
+node = rclpy.create_node("caller")
+client = node.create_client(SetBool, "/left")
+client.wait_for_service()
+rclpy.spin_until_future_complete(node, client.call_async(SetBool.Request(data=True)))
+for _ in sys.stdin:
+    print(shared_memory.reopen_ports(), flush=True)
+"""
+
+
+@pytest.mark.ros
+@needs("fastdds")
+def test_a_port_that_a_successor_removed_is_known_by_its_bytes(ros_domain: int) -> None:
+    """They are Fast DDS's own: nothing of them is documented."""
+    environ = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
+    command, pipe = [sys.executable, "-c", CALLER], subprocess.PIPE
+    killed = _other_node(ros_domain)
+    caller = subprocess.Popen(command, env=environ, stdin=pipe, stdout=pipe, text=True)
+    try:
+        assert _broken(caller) == 0
+        killed.kill()
+        killed.wait()
+        killed = _other_node(ros_domain)
+        assert _broken(caller) > 0
+    finally:
+        for process in (killed, caller):
+            process.kill()
+            process.wait()
+
+
+def _broken(process: subprocess.Popen[str]) -> int:
+    assert process.stdin is not None
+    assert process.stdout is not None
+    process.stdin.write("\n")
+    process.stdin.flush()
+    return int(process.stdout.readline())
 
 
 def _judge_only(names: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
