@@ -37,6 +37,7 @@ Entity = Server | Client | Publisher | Subscription
 E = TypeVar("E", Server, Client, Publisher, Subscription)
 
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
+_KEPT = 5000  # Fast DDS keeps no more of any kind
 _NO_LIMIT = -1  # of rcl_wait: until something happens
 
 
@@ -89,6 +90,14 @@ class SerialisedNode:
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.VOLATILE,
         )
+        # What clients that were killed have not received is kept for them until their leases end.
+        # With KEEP_ALL no response to the others is accepted once there are so many.
+        self._served = QoSProfile(
+            history=HistoryPolicy.KEEP_LAST,
+            depth=_KEPT,
+            reliability=ReliabilityPolicy.RELIABLE,
+            durability=DurabilityPolicy.VOLATILE,
+        )
         self._context: Any = early.context if early is not None else new_context(domain_id)
         try:
             self._node = bare_node(name, self._context)
@@ -119,7 +128,7 @@ class SerialisedNode:
 
         def create() -> Server:
             service: Any = self._node.create_service(
-                service_type, name, lambda _, response: response, qos_profile=self._quality
+                service_type, name, lambda _, response: response, qos_profile=self._served
             )
             return Server(
                 *(service, ServiceEnd(service, service_type), on_request, self._withdraw),

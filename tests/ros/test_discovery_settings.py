@@ -67,7 +67,7 @@ def answered(start: Start, limit_s: float = 20, **options: str) -> int:
     ids=["a domain", "localhost only", "range", "static peers", "the user's transports"],
 )
 def test_a_burst_of_a_hundred_loses_none(start: Start, variables: dict[str, str]) -> None:
-    """KEEP_ALL at both ends, under every setting of discovery."""
+    """More than a default queue holds, under every setting of discovery."""
     serving(start, **variables)
     assert answered(start, **variables) == IN_FLIGHT
 

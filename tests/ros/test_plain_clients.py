@@ -22,6 +22,8 @@ import pytest
 from fogft.ros.messages import default_response
 from fogft.ros.node import SerialisedNode
 
+from .conftest import wait_for
+
 pytestmark = pytest.mark.ros
 
 TYPE = "std_srvs/srv/SetBool"
@@ -73,10 +75,10 @@ def answers(domain: int, *clients: tuple[int, float, int]) -> list[int]:
     return [int(one.communicate(timeout=120)[0]) for one in started]
 
 
-def start(domain: int, name: str, client: tuple[int, float, int]) -> Any:
+def start(domain: int, name: str, client: tuple[int, float, int], *service: str) -> Any:
     """Start a client; return its process once it has found the service."""
     process = subprocess.Popen(
-        [sys.executable, PROGRAM, name, *map(str, client)],
+        [sys.executable, PROGRAM, name, *map(str, client), *service],
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -116,11 +118,30 @@ def test_two_clients_of_one_service_lose_none(
 
 def test_the_successors_of_killed_clients_lose_none(arrived: list[int], ros_domain: int) -> None:
     """Each has the shared-memory port of the one before, which DDS writes to for seconds."""
-    answered = 0
-    for n in range(4):
-        client = start(ros_domain, f"killed_{n}", (50, 0.0, 1))
-        begin(client)
-        answered += int(client.stdout.readline())
-        client.kill()
-        client.wait()
+    answered = sum(answers_then_killed(ros_domain, 50) for _ in range(4))
     assert answered == arrived[0] > 100
+
+
+def answers_then_killed(domain: int, count: int, *service: str) -> int:
+    client = start(domain, "killed", (count, 0.0, 1), *service)
+    begin(client)
+    answered = int(client.stdout.readline())
+    client.kill()
+    client.wait()
+    return answered
+
+
+def test_what_is_kept_for_a_killed_client_is_in_nobodys_way(
+    make_node: Callable[[int], Any], ros_domain: int
+) -> None:
+    """DDS has room for 5 000 responses that some client has not received."""
+    response = default_response(TYPE)
+    server = make_node(ros_domain).serve("/kept", TYPE, lambda _, h: server.respond(h, response))
+    assert answers_then_killed(ros_domain, 1, "/kept") == 1
+    client = make_node(ros_domain).client("/kept", TYPE)
+    wait_for(client.available, "discovery")
+    answered: list[bytes] = []
+    for sent in range(100, 5301, 100):
+        for _ in range(100):
+            client.call(response, answered.append)
+        wait_for(lambda sent=sent: len(answered) == sent, "responses")
