@@ -15,7 +15,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.ros import spdp
-from fogft.ros.shared_memory import make_private, watch_ports
+from fogft.ros.shared_memory import make_private
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,6 @@ def new_context(domain_id: int | None) -> Any:
         domain_id=domain_id,
         signal_handler_options=SignalHandlerOptions.NO,
     )
-    watch_ports()
     return context
 
 

@@ -27,6 +27,7 @@ from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
 from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.port import OnBurst
 from fogft.ros.serialised import ClientEnd, ServiceEnd, self_test
+from fogft.ros.shared_memory import PortWatch
 from fogft.ros.topic_ends import Publisher, Subscription
 from fogft.ros.types import load_message_type, load_service_type, shape
 from fogft.ros.visible import VisibleNode
@@ -105,6 +106,7 @@ class SerialisedNode:
         except BaseException:
             self._context.try_shutdown()
             raise
+        self._ports = PortWatch()
         self._introduction: spdp.Introduction | None = None
         if early is not None:
             early.done()
@@ -419,6 +421,7 @@ class SerialisedNode:
             done.set()
         if self._introduction is not None:
             self._introduction.close()
+        self._ports.close()
         self._guard.destroy()
         self._node.destroy_node()
         self._context.try_shutdown()

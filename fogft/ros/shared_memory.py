@@ -31,7 +31,6 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 
 SETTLED_S = 2.0
@@ -133,20 +132,31 @@ def make_private() -> None:
                 (FOLDER / name).chmod(0o600)
 
 
-@lru_cache(maxsize=1)
-def watch_ports() -> None:
-    """From now on have this process open anew each port that another process removes."""
-    with contextlib.suppress(AttributeError):  # no Linux
-        libc = ctypes.CDLL(None)
-        watch = libc.inotify_init1(os.O_CLOEXEC)
-        if libc.inotify_add_watch(watch, bytes(FOLDER), _IN_DELETE) >= 0:  # else no more are had
-            threading.Thread(target=_reopen, args=(watch,), name="ros-ports", daemon=True).start()
+class PortWatch:
+    """Has this process open anew each port that another process removes, on a thread."""
 
+    def __init__(self) -> None:
+        self._libc, self._closed, self._id = ctypes.CDLL(None), False, -1
+        with contextlib.suppress(AttributeError):  # no Linux
+            self._watch = self._libc.inotify_init1(os.O_CLOEXEC)
+            self._id = self._libc.inotify_add_watch(self._watch, bytes(FOLDER), _IN_DELETE)
+        self._thread = threading.Thread(target=self._run, name="ros-ports", daemon=True)
+        self._thread.start()
 
-def _reopen(watch: int) -> None:
-    while events := os.read(watch, _EVENTS_BYTES):
-        if b"_port" in events:
-            reopen_ports()
+    def _run(self) -> None:
+        reopen_ports()
+        while self._id >= 0 and not self._closed:
+            if b"_port" in os.read(self._watch, _EVENTS_BYTES):
+                reopen_ports()
+        if self._id >= 0:
+            os.close(self._watch)
+
+    def close(self) -> None:
+        """Return once it has ended. Only once."""
+        self._closed = True
+        if self._id >= 0:
+            self._libc.inotify_rm_watch(self._watch, self._id)  # which is an event
+        self._thread.join()
 
 
 def reopen_ports() -> int:
