@@ -198,8 +198,11 @@ def vm(tmp_path: Path) -> Path:
 
 
 def shell(home: Path, script: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    """Run a script as SkyPilot does: its shell is interactive, and so knows of stopped children."""
+    file = home / "script"
+    file.write_text(script)
     return subprocess.run(
-        ["bash", "-c", script],
+        ["bash", "--norc", "-i", file],
         cwd=home,
         env={
             "HOME": str(home),
