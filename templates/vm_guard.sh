@@ -1,6 +1,8 @@
-# Run by a VM on AWS at its first boot, beside all that SkyPilot does: where no replica is seen for
+#!/bin/sh
+# Run by a VM on AWS at each boot, beside all that SkyPilot does: where no replica is seen for
 # so long, nobody may be left to end this machine, so it shuts itself down. SkyPilot's own `autostop`
 # begins only when the machine is wholly set up. What runs in a container is seen from here, too.
+[ "${1:-}" = stay ] || { setsid "$0" stay >/dev/null 2>&1 & exit; }  # a boot waits for its scripts
 alone=0
 while [ "$alone" -lt @ALONE_MINUTES@ ]; do
   sleep 60

@@ -119,7 +119,8 @@ def cost(pool: PoolArgument = None, as_json: AsJson = False, named: PoolOption =
     """Show what a pool has cost so far, by day (UTC) and replica.
 
     Charges each interval at its own price: machines, and on real clouds their disks, addresses
-    and egress. Without a name, shows all pools, including those that have ended.
+    and the egress of the file's `traffic`. Without a name, shows all pools, including those that
+    have ended.
     """
     from fogft.pool.folder.costs import read_all
     from fogft.pool.folder.paths import home

@@ -48,6 +48,7 @@ class ScriptedProvider:
     reachable: bool = True
     asked_regions: list[tuple[str, ...] | None] = field(default_factory=list)
     terminated: list[str] = field(default_factory=list)
+    end_when_down: list[str] = field(default_factory=list)
     prices: dict[tuple[str, str], float] = field(default_factory=dict)
     mighty: str = ""
     ends_at: float | None = None
@@ -74,6 +75,10 @@ class ScriptedProvider:
         for instance in instances:
             self.terminated.append(instance.key)
             self.found.pop(instance.key, None)
+
+    def end_when_shut_down(self, instance: Instance) -> None:
+        self._meet()
+        self.end_when_down.append(instance.key)
 
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
         self._meet()

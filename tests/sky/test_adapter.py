@@ -94,6 +94,17 @@ def test_a_machine_is_stopped_for_the_price_of_its_disk_and_started_under_its_id
     assert not scene.provider.found
 
 
+@pytest.mark.parametrize(("spot", "told"), [(False, ["i-2"]), (True, [])])
+def test_a_machine_on_demand_is_to_end_when_its_guard_shuts_it_down(
+    scene: Scene, spot: bool, told: list[str]
+):
+    """As soon as it exists: a spot machine does so anyway, this one would stop, and cost on."""
+    scene.cloud.launch(scene.order(place=replace(EAST, spot=spot)))
+    scene.sky.boot(NAME)
+    scene.work()
+    assert scene.provider.end_when_down == told
+
+
 def test_a_gateways_machine_opens_its_ports_too(scene: Scene):
     """A replica's opens the link's alone."""
     scene.cloud.launch(scene.order(more_ports=(7470, 7471, 7472)))

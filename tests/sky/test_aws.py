@@ -84,6 +84,20 @@ def test_a_machine_that_shut_itself_down_is_found_as_long_as_its_disk_costs(acco
 
 
 @needs("moto")
+def test_a_machine_that_is_to_end_when_it_shuts_down_does_not_merely_stop(account: None):
+    import boto3
+
+    mine = launch("us-east-1", labels(replica(0)))
+    aws = Aws()
+    (found,) = aws.instances(["us-east-1"])
+    aws.end_when_shut_down(found)
+    name = "instanceInitiatedShutdownBehavior"
+    ec2 = boto3.client("ec2", region_name="us-east-1")
+    told = ec2.describe_instance_attribute(InstanceId=mine, Attribute=name)
+    assert told["InstanceInitiatedShutdownBehavior"]["Value"] == "terminate"
+
+
+@needs("moto")
 def test_terminate_ends_these_and_is_repeatable(account: None):
     launch("us-east-1", labels(replica(0)))
     launch("us-east-1", labels(replica(1)))
@@ -178,7 +192,10 @@ def test_a_role_that_may_too_much_is_told(account: None):
     assert Aws().warning() == ""
     arn = iam.create_policy(PolicyName="AmazonEC2FullAccess", PolicyDocument=ANYTHING)
     iam.attach_role_policy(RoleName="skypilot-v1", PolicyArn=arn["Policy"]["Arn"])
-    assert "`AmazonEC2FullAccess`" in Aws().warning()
+    harmless = ANYTHING.replace("ec2:*", "ec2:Describe*")
+    iam.put_role_policy(RoleName="skypilot-v1", PolicyName="ours", PolicyDocument=harmless)
+    iam.put_role_policy(RoleName="skypilot-v1", PolicyName="inline", PolicyDocument=ANYTHING)
+    assert "has `AmazonEC2FullAccess`, `inline`: give" in Aws().warning()
 
 
 class Refusing:

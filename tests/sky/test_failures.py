@@ -25,6 +25,9 @@ UNAVAILABLE = "ResourcesUnavailableError"
         ("An error occurred (RequestExpired): Request has expired.", Cause.CREDENTIALS),
         ("(UnauthorizedOperation) You are not authorized", Cause.CREDENTIALS),
         ("google.auth.exceptions.RefreshError: ('invalid_grant'", Cause.CREDENTIALS),
+        ("Error when retrieving token from sso: Token has expired", Cause.CREDENTIALS),
+        ("The SSO session associated with this profile has expired", Cause.CREDENTIALS),
+        ("Error loading SSO Token: Token for lab does not exist", Cause.CREDENTIALS),
     ],
 )
 def test_the_codes_of_the_clouds(text: str, cause: Cause):
@@ -51,6 +54,8 @@ def test_words_are_one_short_line_without_colours():
     assert "\x1b" not in failure.words
     assert len(failure.words) < 330
     assert "QuotaExceeded" in failure.words
+    line = "D 11-26 01:06:41.088 PID=286 provisioner.py:361] no spot capacity"
+    assert classify("X", [line]).words == "no spot capacity"
 
 
 def test_a_permission_that_is_missing_is_named_however_long_the_caller_is_called():

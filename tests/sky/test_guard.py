@@ -37,7 +37,7 @@ def start(folder: Path, minutes: int) -> subprocess.Popen[bytes]:
     script = folder / "guard"
     # What other tests on this machine run is no replica of this one.
     script.write_text(text.replace("fogft[ ]serve", f"fogft[ ]serve-{folder.name}"))
-    return subprocess.Popen(["sh", script], env=machine(folder))
+    return subprocess.Popen(["sh", script, "stay"], env=machine(folder))
 
 
 def minutes(folder: Path) -> int:
@@ -80,12 +80,12 @@ def test_its_command_returns_at_once_and_is_plain_text_for_every_reader(tmp_path
     command = settings.guard()
     assert "\n" not in command
     assert not set(command) & set("'\"#:{}[]%@`!?,")
-    here = command.replace("/run/fogft-guard", str(tmp_path / "guard"))
+    here = command.replace(settings.EACH_BOOT, str(tmp_path / "boot"))
     environ = machine(tmp_path)
     done = subprocess.run(["sh", "-c", here], env=environ, timeout=LIMIT_S, check=True)
     assert done.returncode == 0
     until_minutes(tmp_path, 2)  # it runs on, though its shell is gone
-    text = (tmp_path / "guard").read_text()
+    text = (tmp_path / "boot/fogft-guard").read_text()
     assert f'"$alone" -lt {settings.ALONE_MINUTES} ' in text
     (tmp_path / "sleep").write_text("#!/bin/sh\nkill $PPID\n")  # its end
 

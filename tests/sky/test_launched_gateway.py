@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,8 @@ from tests.sky.pool_on_sky import UID, PoolOnSky
 
 def order(spec: PoolSpec, offer: Offer, generation: int) -> Launch:
     id = ReplicaId(UID, GATEWAY_SLOT, generation)
-    return Launch(id, "perception", offer.placement, offer.usd_per_hour, version(spec))
+    place = replace(offer.placement, spot=False)
+    return Launch(id, "perception", place, offer.usd_per_hour, version(spec))
 
 
 @pytest.fixture
@@ -58,13 +60,14 @@ def test_the_gateway_is_launched_first(pool: PoolOnSky):
 def test_one_that_is_lost_is_missed_at_once_and_no_replica_dials_its_address(pool: PoolOnSky):
     """A replica that is launched before there is another would never serve."""
     before, lost_at = pool.store.the_spec.dial_in, pool.scene.now
+    pool.sky.boots = False
     pool.sky.preempt(next(name for name in pool.sky.records if "-1999-" in name))
     pool.until(lambda: "1999.2" in ordered(pool))
     assert pool.scene.now - lost_at < 10
-    pool.sky.boots = False
     asked = len(pool.sky.asked("refresh"))
     pool.tick(60)
     assert len(pool.sky.asked("refresh")) == asked, "one that boots is left alone"
+    assert "0.2" not in ordered(pool)
     pool.sky.boots = True
     pool.until(lambda: pool.ready() == ["0.2"])
     assert ordered(pool) == ["1999.1", "0.1", "1999.2", "0.2"]

@@ -78,6 +78,10 @@ class Aws:
         for instance in instances:  # one by one: a single unknown key fails a whole call
             self._ask(instance.placement.region, functools.partial(_terminate, instance.key))
 
+    def end_when_shut_down(self, instance: Instance) -> None:
+        """See `Provider`."""
+        self._ask(instance.placement.region, functools.partial(_end_when_shut_down, instance.key))
+
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
         """See `Provider`. A security group in each VPC: SkyPilot decides which one a machine is in.
 
@@ -173,30 +177,23 @@ class Aws:
     def warning(self) -> str:
         """See `Provider`. Reads the policies of SkyPilot's role, where the account may."""
 
-        def policies(iam: Any) -> list[str] | None:
-            try:
-                found = iam.list_attached_role_policies(RoleName=ROLE)["AttachedPolicies"]
-            except iam.exceptions.NoSuchEntityException:
-                return None
-            return sorted(str(policy["PolicyName"]) for policy in found)
-
         try:
-            names = self._ask(_HOME, policies, "iam")
+            mighty = self._ask(_HOME, _mighty, "iam")
         except NotAllowedError as error:
             return f"cannot read the permissions of AWS role `{ROLE}`, which every VM has: {error}"
         except CloudUnreachable:
             return ""
-        if names is None:
+        if mighty is None:
             return (
                 f"AWS has no role `{ROLE}`: at the first launch SkyPilot creates one for every VM, "
                 "with full access to EC2 and S3. Create the one in docs/how-to/clouds.md first"
             )
-        mighty = [f"`{n}`" for n in names if n.endswith("FullAccess") or n in _MIGHTY]
         if not mighty:
             return ""
         return (
             f"AWS's role `{ROLE}`, which every VM has and your `run` can use, has "
-            f"{', '.join(mighty)}: give it only what docs/how-to/clouds.md lists"
+            f"{', '.join(f'`{name}`' for name in mighty)}: give it only what "
+            "docs/how-to/clouds.md lists"
         )
 
     def _client(self, service: str, region: str) -> Any:
@@ -244,6 +241,43 @@ def _moment(text: str) -> float:
 def _terminate(key: str, ec2: Any) -> None:
     with _unless("InvalidInstanceID.NotFound"):
         ec2.terminate_instances(InstanceIds=[key])
+
+
+def _end_when_shut_down(key: str, ec2: Any) -> None:
+    ec2.modify_instance_attribute(
+        InstanceId=key, Attribute="instanceInitiatedShutdownBehavior", Value="terminate"
+    )
+
+
+def _mighty(iam: Any) -> list[str] | None:
+    """Return the policies of SkyPilot's role that allow all of a service; None without the role.
+
+    An attached one is judged by its name, which AWS gives to its own.
+    """
+    try:
+        attached = iam.list_attached_role_policies(RoleName=ROLE)["AttachedPolicies"]
+    except iam.exceptions.NoSuchEntityException:
+        return None
+    names = [str(policy["PolicyName"]) for policy in attached]
+    mighty = {name for name in names if name.endswith("FullAccess") or name in _MIGHTY}
+    for name in iam.list_role_policies(RoleName=ROLE)["PolicyNames"]:
+        inline = iam.get_role_policy(RoleName=ROLE, PolicyName=name)["PolicyDocument"]
+        if any(map(_allows_all, _listed(inline.get("Statement")))):
+            mighty.add(str(name))
+    return sorted(mighty)
+
+
+def _allows_all(statement: Mapping[str, Any]) -> bool:
+    """Whether a statement of a policy allows every action of a service, on whatever there is."""
+    if statement.get("Effect") != "Allow" or statement.get("Condition"):
+        return False
+    everything = any(one == "*" or one.endswith(":*") for one in _listed(statement.get("Action")))
+    everywhere = "*" in _listed(statement.get("Resource"))
+    return everywhere and (everything or "NotAction" in statement)
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [] if value is None else [value]
 
 
 def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:

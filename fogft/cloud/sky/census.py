@@ -63,6 +63,13 @@ class Census:
         except NotAllowedError as error:
             raise CloudUnreachable(f"no permission to end {instance.key}: {error}") from error
 
+    def end_when_shut_down(self, instance: Instance) -> None:
+        """Have an instance end when it shuts itself down; else its disk would cost on."""
+        try:
+            self.providers[instance.placement.cloud].end_when_shut_down(instance)
+        except (CloudUnreachable, NotAllowedError) as error:
+            log.warning("stops_only replica=%s reason=%r", instance.id.short, str(error))
+
     def vouches(self, cloud: str) -> bool:
         """Whether a cloud's own list is available, as far as known."""
         return cloud in self.providers and cloud not in self._refused

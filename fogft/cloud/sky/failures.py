@@ -21,7 +21,8 @@ _CODES: tuple[tuple[Cause, str], ...] = (
         r"|AccessDenied|SignatureDoesNotMatch|OptInRequired|NoCredentialsError"
         r"|Unable to locate credentials|invalid_grant|RefreshError|PERMISSION_DENIED"
         r"|does not have .{0,60}permission|AuthorizationFailed|InvalidAuthenticationToken"
-        r"|NoCloudAccess|InvalidCloudCredentials|CloudUserIdentityError",
+        r"|NoCloudAccess|InvalidCloudCredentials|CloudUserIdentityError"
+        r"|SSO session associated|loading SSO Token|retrieving (?:token|credentials) from sso",
     ),
     (
         Cause.QUOTA,
@@ -69,12 +70,16 @@ _NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # who asked may ha
 _FOR_AWS = "Encoded authorization failure message"  # a thousand characters
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")
 _DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # what SkyPilot says of its own doing
+_LOGGED = re.compile(
+    r"^[A-Z] [\d-]+ [\d:.]+ (?:PID=\d+ )?\S+:\d+\] "
+)  # what begins its log's lines
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
 def plain(text: str) -> str:
-    """Return a text of SkyPilot's without colours, line breaks and encoded AWS messages."""
-    return " ".join(_COLOUR.sub("", text).partition(_FOR_AWS)[0].split())
+    """Return a text of SkyPilot's in one line, without colours, times and encoded AWS messages."""
+    line = " ".join(_COLOUR.sub("", text).partition(_FOR_AWS)[0].split())
+    return _LOGGED.sub("", line)
 
 
 def tail(log: str, lines: int = 20, width: int = 200) -> str:

@@ -65,7 +65,8 @@ class Entry:
     port: int = LINK_PORT  # the link's; 0 where the replica dials out
     # Types that may have come in place of the one ordered, and their prices (USD per hour).
     instead: Mapping[str, float] = field(default_factory=dict)
-    endpoint: str = ""  # `host:port`, on a cloud that maps ports; empty until it is known
+    # `host:port`, on a cloud that maps ports or of a machine on demand; empty until it is known
+    endpoint: str = ""
 
 
 class Journal:

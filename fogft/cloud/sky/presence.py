@@ -115,9 +115,8 @@ def of_instance(instance: Instance) -> Machine:
 
 
 def _endpoint(entry: Entry, ip: str) -> str | None:
-    if entry.placement.cloud in naming.MAPPING_CLOUDS and entry.port:
-        return entry.endpoint or None
-    return f"{ip}:{entry.port}" if ip else None
+    mapped = entry.placement.cloud in naming.MAPPING_CLOUDS and entry.port
+    return f"{ip}:{entry.port}" if ip and not mapped else entry.endpoint or None
 
 
 def _error(words: str) -> Reason:

@@ -53,6 +53,10 @@ class Provider(Protocol):
     def terminate(self, instances: Iterable[Instance]) -> None:
         """Ask for the end of instances. Those that are gone are no error."""
 
+    def end_when_shut_down(self, instance: Instance) -> None:
+        """Have a machine on demand end, and not merely stop, when it shuts itself down."""
+        return
+
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
         """See to what lets only some networks reach some ports; return its name for SkyPilot.
 

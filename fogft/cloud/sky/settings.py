@@ -35,6 +35,7 @@ ENDED_BY_FILES = frozenset({"nebius", "oci", "vast"})
 """Clouds whose VMs have no identity of their own: to end itself one needs its cloud's files."""
 GROUP = ("aws", "security_group_name")  # by patterns of clusters' names
 GUARD = ("aws", "post_provision_runcmd")  # handed to the machine with the order itself
+EACH_BOOT = "/var/lib/cloud/scripts/per-boot"
 ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60
 """A launch takes 15 minutes at most (`following.LAUNCH_LIMIT_S`), a set-up its own limit."""
 NO_REPORTS = "SKYPILOT_DISABLE_USAGE_COLLECTION"
@@ -46,11 +47,15 @@ def report_nothing() -> None:
 
 
 def guard() -> str:
-    """Return the guard's command: one line, for a shell, which returns at once."""
+    """Return the guard's command: one line, for a shell, which returns at once.
+
+    cloud-init runs it at the first boot, and what it leaves at each boot.
+    """
     text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(ALONE_MINUTES))
     packed = base64.b64encode(text.encode()).decode()
-    path = "/run/fogft-guard"
-    return f"echo {packed} | base64 -d > {path} && setsid sh {path} > /dev/null 2>&1 &"
+    script = f"{EACH_BOOT}/fogft-guard"
+    written = f"mkdir -p {EACH_BOOT} && echo {packed} | base64 -d > {script}"
+    return f"{written} && chmod 755 {script} && {script}"
 
 
 class Settings:
