@@ -11,6 +11,7 @@ Three servers, all inside a network namespace of the test's own:
     POST /notice?id=I&in_s=S            a preemption notice: taken in S seconds (AWS: 120)
     POST /rebalance?id=I                a rebalance recommendation
     POST /preempt?id=I                  taken now
+    POST /quota?region=R&code=C&vcpus=N  a quota of the account
     POST /deny?action=A                 A is not allowed any more; without A all is again
 
 With `ENFORCED` set, who launches may do what the policy of docs/how-to/clouds.md allows, and a VM
@@ -46,6 +47,8 @@ from moto.ec2.exceptions import EC2ClientError
 from moto.ec2.models import ec2_backends, elastic_network_interfaces, instances
 from moto.ec2.responses import spot_instances
 from moto.server import ThreadedMotoServer
+from moto.servicequotas.exceptions import NoSuchResource
+from moto.servicequotas.models import ServiceQuotasBackend
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parents[2]))
@@ -56,6 +59,7 @@ IMAGE = Path(os.environ["EMULATION"])
 HIDDEN = [folder for folder in os.environ.get("HIDDEN", "").split(":") if folder]
 SPOT = {"us-east-1": 0.019, "us-west-2": 0.024, "eu-west-1": 0.039}
 REGIONS = tuple(SPOT)
+EACH_BOOT = "for one in /var/lib/cloud/scripts/per-boot/*; do $one; done"  # as cloud-init does
 METADATA = "169.254.169.254"
 
 
@@ -65,6 +69,7 @@ class World:
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.full: set[str] = set()
+        self.quotas: dict[tuple[str, str], float] = {}
         self.vms: dict[str, subprocess.Popen[bytes]] = {}
         self.notices: dict[str, str] = {}
         self.rebalance: dict[str, str] = {}
@@ -83,7 +88,7 @@ class World:
         cloud_config = config_of(instance)
         account = cloud_config["users"][0]
         user, key = account["name"], account["ssh_authorized_keys"][0]
-        first = ":" if again else "\n".join(cloud_config.get("runcmd") or [])
+        first = EACH_BOOT if again else "\n".join(cloud_config.get("runcmd") or [])
         name = "f" + instance.id[-8:]
         with (IMAGE / f"{instance.id}.log").open("wb") as log:
             self.vms[instance.id] = subprocess.Popen(
@@ -98,7 +103,7 @@ class World:
         )
 
     def watch(self, instance: Any) -> None:
-        """Notice when a VM has shut itself down: a spot one has ended then, another is stopped."""
+        """Notice when a VM has shut itself down: then it has ended, or is stopped."""
         with self.lock:
             vm = self.vms.get(instance.id)
         if vm is None:
@@ -109,7 +114,8 @@ class World:
         if by_itself:
             self.say("shutdown", id=instance.id)
             spot = getattr(instance, "lifecycle", None) == "spot"
-            self.end(instance.id) if spot else instance.stop()
+            ends = spot or instance.instance_initiated_shutdown_behavior == "terminate"
+            self.end(instance.id) if ends else instance.stop()
 
     def kill(self, id: str, *, keeps_disk: bool = False) -> None:
         with self.lock:
@@ -219,6 +225,7 @@ def patch_moto() -> None:
 
     instances.InstanceBackend.run_instances = run_instances
     spot_instances.SpotInstances.describe_spot_price_history = price_history
+    ServiceQuotasBackend.get_service_quota = quota_of
     for name in ("terminate", "stop"):
         setattr(instances.Instance, name, killing(getattr(instances.Instance, name)))
     instances.Instance.start = starting(instances.Instance.start)
@@ -307,6 +314,14 @@ def price_history(self: Any) -> ActionResult:
     )
 
 
+def quota_of(self: Any, service_code: str, quota_code: str) -> dict[str, Any]:
+    """Answer with what a test has set; moto knows none of EC2's."""
+    value = WORLD.quotas.get((self.region_name, quota_code)) if service_code == "ec2" else None
+    if value is None:
+        raise NoSuchResource
+    return {"QuotaCode": quota_code, "Value": value}
+
+
 def killing(method: Any) -> Any:
     def wrapped(self: Any, *args: Any, **kw: Any) -> Any:
         WORLD.kill(self.id, keeps_disk=method.__name__ == "stop")
@@ -356,6 +371,8 @@ class Control(Answers, BaseHTTPRequestHandler):
             timer = threading.Timer(in_s, WORLD.preempt, [asked["id"]])
             timer.daemon = True
             timer.start()
+        elif url.path == "/quota":
+            WORLD.quotas[asked["region"], asked["code"]] = float(asked["vcpus"])
         elif url.path == "/deny":
             LAUNCHER.taken = {asked["action"]} if "action" in asked else set()
         elif url.path == "/rebalance":

@@ -20,7 +20,7 @@ mount --bind "$box" "$root/container"
 DEBIAN_FRONTEND=noninteractive chroot "$root" \
   apt-get install -qq -y --no-install-recommends docker.io debootstrap >/dev/null
 install -m755 "$here/runc_here.py" "$root/usr/local/sbin/runc-here"
-chroot "$root" debootstrap --variant=minbase --include=ca-certificates,curl,fuse,openssh-server,patch,procps,python3,python3-pip,python3-venv,rsync,wget \
+chroot "$root" debootstrap --variant=minbase --include=ca-certificates,curl,fuse,openssh-server,patch,procps,python3,python3-pip,python3-venv,rsync,sudo,wget \
   "$VERSION_CODENAME" /container "$mirror" >/dev/null
 
 cp /etc/resolv.conf "$box/etc/resolv.conf"
@@ -59,4 +59,4 @@ printf 'offline = true\n[pip]\nno-index = true\nfind-links = ["/opt/wheelhouse"]
 cp "$image/layer/etc/pip.conf" "$box/etc/pip.conf"
 : >"$box/etc/resolv.conf"
 umount -R -l "$root/container/proc" "$root/container/dev"
-rm -rf "$box"/var/cache/apt/archives/*.deb
+rm -rf "$box"/var/cache/apt/archives/*.deb "$box"/etc/apt/sources.list*  # apt has all it will need

@@ -62,7 +62,8 @@ def main(home: Path) -> None:
     header = ["Tag", "Region", "OS", "OSVersion", "ImageId", "CreationDate"]
     write(catalogue / "aws/images.csv", header, images)
     quotas = ["InstanceType", "OnDemandInstanceCode", "SpotInstanceCode"]
-    codes = [["m6i.large", "L-1216C47A", "L-34B43A08"]]
+    kinds = ("m6i.large", "m6i.xlarge", *(kind for kind, *_ in OTHERS))
+    codes = [[kind, "L-1216C47A", "L-34B43A08"] for kind in kinds]
     write(catalogue / "aws/instance_quota_mapping.csv", quotas, codes)
     write(catalogue / "common/metadata.csv", ["GPU", "MemoryGB"], [])
     text(

@@ -43,10 +43,10 @@ class Pool:
             "NO_COLOR": "1",
         }
 
-    def sky_api(self, word: str) -> None:
-        """Start or stop SkyPilot's API server. `up` starts it too, but within a limit."""
+    def stop_sky(self) -> None:
+        """Stop SkyPilot's API server, which commands have started where they needed it."""
         done = subprocess.run(
-            ["sky", "api", word], env=self.environ, text=True, stdin=subprocess.DEVNULL,
+            ["sky", "api", "stop"], env=self.environ, text=True, stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=UP_WITHIN_S, check=False,
         )  # fmt: skip
         assert done.returncode == 0, done.stdout
@@ -152,6 +152,13 @@ def reaches(host: str, port: int, source: str = "") -> bool:
         return one.connect_ex((host, port)) == 0
 
 
+def process_on(machine: dict[str, Any], word: str) -> str:
+    """Return, as it is seen from here, a process on a VM whose command line has some word."""
+    words = ["ip", "netns", "pids", f"f{machine['id'][-8:]}"]
+    pids = subprocess.run(words, check=True, capture_output=True, text=True).stdout.split()
+    return next(p for p in pids if word in Path(f"/proc/{p}/cmdline").read_text())
+
+
 def clusters() -> set[str]:
     """Return the clusters that SkyPilot has a record of."""
     from sky.client import sdk
@@ -171,8 +178,8 @@ def processes() -> list[str]:
     return found
 
 
-def kill_server() -> None:
-    """Kill SkyPilot's API server with all that it has started, as when a robot's power is cut."""
+def servers_of_sky() -> list[Any]:
+    """Return the processes of SkyPilot's API server, with all that it has started."""
     import psutil
 
     servers = [
@@ -181,7 +188,14 @@ def kill_server() -> None:
         if "sky.server.server" in " ".join(process.info["cmdline"] or ())
     ]
     assert servers
-    for process in [*servers, *(c for s in servers for c in s.children(recursive=True))]:
+    return [*servers, *(c for s in servers for c in s.children(recursive=True))]
+
+
+def kill_server() -> None:
+    """Kill SkyPilot's API server with all that it has started, as when a robot's power is cut."""
+    import psutil
+
+    for process in servers_of_sky():
         try:
             process.kill()
         except psutil.NoSuchProcess:

@@ -9,6 +9,7 @@ thing wrong.
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import urllib.error
 import urllib.parse
@@ -23,7 +24,7 @@ from fogft.errors import CloudUnreachable
 from fogft.model.reason import Cause
 from fogft.model.replica import Machine, MachinePhase, Offer, ReplicaId
 from tests.sky.emulated_aws.emulation import Steps, control, running, until
-from tests.sky.emulated_aws.pool import kill_server
+from tests.sky.emulated_aws.pool import kill_server, process_on
 from tests.sky.emulated_aws.under_contract import RESOURCES, adapter, stub_server
 
 UID = "00000000000000aa"
@@ -42,6 +43,11 @@ def get(endpoint: str, path: str = "/") -> str:
         return str(urllib.request.urlopen(f"http://{endpoint}{path}", timeout=3).read().decode())
     except (OSError, urllib.error.URLError):
         return ""
+
+
+def state_of(machine: dict[str, Any]) -> str:
+    listed = control("/instances", post=False)
+    return next(str(one["state"]) for one in listed if one["id"] == machine["id"])
 
 
 class Proof:
@@ -152,6 +158,12 @@ class Proof:
         after = self.machine(id)
         assert after is not None
         assert after.endpoint not in (None, before)
+        (mine,) = (i for i in running() if i["labels"]["fogft-slot"] == "100")
+        with step("the guard that each boot starts shuts it down, and it ends"):
+            guard = process_on(mine, "fogft-guard")
+            within = ["nsenter", "-t", guard, "-m", "-p", "-r", "-w"]
+            subprocess.run([*within, "shutdown"], check=True)
+            until("it has ended, not merely stopped", lambda: state_of(mine) == "terminated")
         self.cloud.terminate(id)
 
     def capacity_and_setup(self) -> None:

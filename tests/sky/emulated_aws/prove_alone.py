@@ -143,7 +143,6 @@ def main() -> int:
     for name in ("src/greet/package.xml", "build/COLCON_IGNORE", "build/greet/CMakeCache.txt"):
         (alone.folder / name).parent.mkdir(parents=True, exist_ok=True)
         (alone.folder / name).write_text("CMAKE_HOME_DIRECTORY:INTERNAL=/lab/src/greet\n")
-    alone.sky_api("start")
     with step("`up` with ROS 2 in the image and a replica that dials out, until it answers"):
         print(alone.fogft("up", str(alone.file), "--yes"))
     client = Client(alone.environ, 3600.0, 5.0, 15.0)
@@ -182,12 +181,11 @@ def main() -> int:
     assert [one["id"] for one in by_themselves] == [newborn["id"]], by_themselves
     told = [e for e in control("/log", post=False) if e["event"] in ("preempt", "refused")]
     assert not told, told
-    alone.sky_api("start")
     for pool in (alone, hangs, unborn):
         with step(f"`down` of `{pool.name}`, which finds nothing"):
             pool.down()
     assert not list((HOME / "pools").glob("*"))
-    alone.sky_api("stop")
+    alone.stop_sky()
     try:
         until("nothing of it runs here", lambda: not processes(), 60)
     except AssertionError:

@@ -83,7 +83,7 @@ def main() -> int:
         pool.keep_log()
     assert not running()
     assert not list((HOME / "pools").glob("*"))
-    pool.sky_api("stop")
+    pool.stop_sky()
     until("nothing of it runs here", lambda: not processes(), 60)
     table = "".join(f"{end - begin:7.1f} s  {name}\n" for name, begin, end in step.done)
     Path(pool.environ["RESULTS"], "gateway.txt").write_text(table)

@@ -65,7 +65,6 @@ def main() -> int:
     home = Path.home()
     folder = next((home / ".sky/catalogs").iterdir()) / "runpod"
     write(folder / "vms.csv", [*COLUMNS.rstrip(",").split(","), "Region", "AvailabilityZone"], ROWS)
-    text(home / ".sky/config.yaml", "allowed_clouds: [runpod]\n")
     text(home / ".runpod/config.toml", f'[default]\napi_key = "{KEY}"\n')
     stub_server()
     cloud = adapter(home / "mapped")

@@ -26,6 +26,7 @@ step = Steps()
 # What a launch can do without: each has a step of its own.
 OTHERWISE = {
     *("servicequotas:GetServiceQuota", "iam:ListAttachedRolePolicies"),
+    *("iam:ListRolePolicies", "iam:GetRolePolicy"),
     *("ec2:Describe*", "ec2:TerminateInstances", "ec2:DeleteSecurityGroup"),
     *("ec2:ModifyInstanceAttribute", "ec2:StopInstances", "ec2:StartInstances"),
 }
@@ -60,10 +61,11 @@ def main() -> int:
         (told,) = cloud.left_out()
         print(f"        {told}", flush=True)
         assert "not authorized to perform: servicequotas:GetServiceQuota" in told
-    control("/deny?action=iam:ListAttachedRolePolicies")
-    with step("without iam:ListAttachedRolePolicies `up` says that the role cannot be read"):
-        told = " ".join(cloud.exposures(["aws"], open_port=None))
-        assert "not authorized to perform: iam:ListAttachedRolePolicies" in told, told
+    for action in ("iam:ListAttachedRolePolicies", "iam:ListRolePolicies"):
+        control(f"/deny?action={action}")
+        with step(f"without {action} `up` says that the role cannot be read"):
+            told = " ".join(cloud.exposures(["aws"], open_port=None))
+            assert f"not authorized to perform: {action}" in told, told
     control("/deny")
     tried = [one for one in listed if one not in OTHERWISE]
     for slot, action in enumerate(tried):

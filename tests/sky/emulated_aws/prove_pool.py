@@ -110,15 +110,16 @@ class Proof:
         self.down()
 
     def nothing_without_a_yes(self) -> None:
-        with step("SkyPilot's API server starts"):
-            self.pool.sky_api("start")
-        with step("`up` asks, and nobody says yes"):
+        control("/quota?region=eu-west-1&code=L-34B43A08&vcpus=0")  # as in most new accounts
+        with step("`up` starts SkyPilot's API server and asks, and nobody says yes"):
             said = self.pool.fogft("up", str(self.pool.file), status=1)
         print(said)
         assert "`aws` can be used" in said
         assert "live, " in said
+        assert "spot in `aws/eu-west-1` is left out: the quota L-34B43A08 allows 0 vCPUs" in said
         assert "cannot ask for confirmation: there is no terminal" in said
         assert not running()
+        control("/quota?region=eu-west-1&code=L-34B43A08&vcpus=64")
         assert not HOME.exists() or not list((HOME / "pools").glob("*"))
 
     def up(self) -> None:
@@ -224,7 +225,7 @@ class Proof:
         assert not clusters()
         assert not list((HOME / "pools").glob("*"))
         self.skypilots = timetable.skypilots(self.machines)  # its server remembers, while it runs
-        self.pool.sky_api("stop")
+        self.pool.stop_sky()
         until("nothing of it runs here", lambda: not processes(), 60)
 
 

@@ -1,4 +1,4 @@
-"""A registry of container images that has one, made of a folder: `docker pull` and no more.
+"""A registry of container images that begins with one, made of a folder.
 
 usage: registry.py FOLDER ADDRESS PORT [NAME=VALUE...]
     FOLDER      the image's root
@@ -10,9 +10,11 @@ The image is `ADDRESS:PORT/ros:1`. Its one layer is a plain tar.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import subprocess
 import sys
+import urllib.parse
 from collections.abc import Iterator, Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -37,8 +39,8 @@ def read(path: Path) -> Iterator[bytes]:
             yield chunk
 
 
-class Image:
-    """What a registry answers with: each digest and the file that has it."""
+class Images:
+    """What a registry answers with: digests, the file of each, and tags."""
 
     def __init__(self, folder: Path, environ: Sequence[str]) -> None:
         beside = folder.parent
@@ -65,7 +67,9 @@ class Image:
                 }
             ],
         }
-        self.manifest = str(self._keep(beside / "container.manifest", manifest)["digest"])
+        kept = self._keep(beside / "container.manifest", manifest)
+        self.tags = {"/v2/ros/manifests/1": str(kept["digest"])}
+        self.beside = beside
 
     def _keep(self, path: Path, value: Any) -> dict[str, Any]:
         path.write_text(json.dumps(value))
@@ -74,33 +78,75 @@ class Image:
         return {"digest": name, "size": path.stat().st_size}
 
 
-def serve(image: Image, address: str, port: int) -> None:
+def serve(images: Images, address: str, port: int) -> None:
+    uploads = itertools.count()
+
     class Registry(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
         def do_HEAD(self) -> None:
             self._answer(body=False)
 
         def do_GET(self) -> None:
             self._answer(body=True)
 
-        def _answer(self, *, body: bool) -> None:
-            name = self.path.rsplit("/", 1)[1]
-            kind = MANIFEST if "/manifests/" in self.path else "application/octet-stream"
-            found = image.blobs.get(image.manifest if name == "1" else name)
-            if found is None:
-                self.send_response(200 if self.path == "/v2/" else 404)
-                self.send_header("content-length", "0")
-                self.end_headers()
+        def do_POST(self) -> None:
+            self._said(202, location=f"/v2/upload/{next(uploads)}")
+
+        def do_PATCH(self) -> None:
+            with self._upload().open("ab") as file:
+                file.writelines(self._body())
+            self._said(202, location=self.path)
+
+        def do_PUT(self) -> None:
+            if "/manifests/" not in self.path:
+                query = urllib.parse.parse_qs(urllib.parse.urlparse(self.path).query)
+                images.blobs[query["digest"][0]] = self._upload()
+                return self._said(201)
+            path = images.beside / f"manifest.{next(uploads)}"
+            path.write_bytes(b"".join(self._body()))
+            name = digest(read(path))
+            images.blobs[name] = path
+            images.tags[self.path] = name
+            return self._said(201)
+
+        def _upload(self) -> Path:
+            number = urllib.parse.urlparse(self.path).path.rsplit("/", 1)[1]
+            return images.beside / f"upload.{number}"
+
+        def _body(self) -> Iterator[bytes]:
+            if self.headers.get("transfer-encoding") != "chunked":
+                yield self.rfile.read(int(self.headers.get("content-length") or 0))
                 return
+            while size := int(self.rfile.readline(), 16):
+                yield self.rfile.read(size)
+                self.rfile.readline()
+            self.rfile.readline()
+
+        def _said(self, status: int, location: str = "") -> None:
+            self.send_response(status)
+            self.send_header("content-length", "0")
+            if location:
+                self.send_header("location", location)
+            self.end_headers()
+
+        def _answer(self, *, body: bool) -> None:
+            name = images.tags.get(self.path) or self.path.rsplit("/", 1)[1]
+            kind = MANIFEST if "/manifests/" in self.path else "application/octet-stream"
+            found = images.blobs.get(name)
+            if found is None:
+                return self._said(200 if self.path == "/v2/" else 404)
             self.send_response(200)
             self.send_header("content-type", kind)
             self.send_header("content-length", str(found.stat().st_size))
-            self.send_header("docker-content-digest", image.manifest if name == "1" else name)
+            self.send_header("docker-content-digest", name)
             self.end_headers()
             for chunk in read(found) if body else ():
                 self.wfile.write(chunk)
+            return None
 
     ThreadingHTTPServer((address, port), Registry).serve_forever()
 
 
 if __name__ == "__main__":
-    serve(Image(Path(sys.argv[1]), sys.argv[4:]), sys.argv[2], int(sys.argv[3]))
+    serve(Images(Path(sys.argv[1]), sys.argv[4:]), sys.argv[2], int(sys.argv[3]))

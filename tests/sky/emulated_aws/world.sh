@@ -73,6 +73,7 @@ unshare --mount --net --pid --ipc --uts --fork --kill-child bash -euc '
   fi
   exec chroot . env -i HOME=/robot PATH="$venv/bin:/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin" \
     LANG=C.UTF-8 PYTHONPATH= RESULTS="$results" EMULATION="$image" ENFORCED="${ENFORCED:-}" \
+    OLD_SKY="${OLD_SKY:-}" \
     HIDDEN="$(printf "%s:" "${here%/tests/*}" "$venv" /root)" \
     "$venv/bin/python" "$here/inside.py" "$@"
 ' world "$root" "$here" "$venv" "$image" "$results" "$@"
