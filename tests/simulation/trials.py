@@ -169,6 +169,7 @@ class Trial(NamedTuple):
     days: float = 30.0
     seed: int = 0
     cap: float | None = None
+    surge: int = 1
 
 
 def run(trial: Trial) -> Outcome:
@@ -181,6 +182,7 @@ def run(trial: Trial) -> Outcome:
         task=task,
         on_demand=OnDemandSpec(0, fallback=True),
         max_usd_per_hour=trial.cap,
+        max_surge=trial.surge,
     )
     scenario = Scenario(
         pool,
@@ -214,9 +216,20 @@ def main() -> None:
     parser.add_argument("--days", type=float, default=30.0)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--cap", type=float)
+    parser.add_argument("--surge", type=int, default=1)
     given = parser.parse_args()
     trials = [
-        Trial(m, p, given.replicas, float(notice), given.answer, given.days, seed, given.cap)
+        Trial(
+            m,
+            p,
+            given.replicas,
+            float(notice),
+            given.answer,
+            given.days,
+            seed,
+            given.cap,
+            given.surge,
+        )
         for m in given.markets.split(",")
         for notice in given.notice.split(",")
         for p in given.policies.split(";")
