@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import secrets
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -100,6 +101,7 @@ class Connection:
         certificate: Ours (DER), which it uses.
         lost_because: Why it is of no more use; empty while it is.
         told: The records that the replica has taken from us.
+        told_at: When it last has.
 
     Raises:
         zenoh.ZError: Nothing was reached.
@@ -127,7 +129,7 @@ class Connection:
         key = partial(names.slot_key, peer.id.pool_uid, peer.id.slot)
         self._cancel_key, self._answers_key = zenoh.KeyExpr(key(names.CANCEL)), key(names.ANSWERS)
         self.lost_because = ""
-        self.told = b""
+        self.told, self.told_at = b"", 0.0
         self._session = zenoh.open(config)
         try:
             self._listener = self._session.info.declare_link_events_listener(
@@ -270,7 +272,7 @@ class Connection:
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
-                self.told = records
+                self.told, self.told_at = records, time.monotonic()
                 if content := reply.ok.payload.to_bytes():
                     newer(content)
 

@@ -37,6 +37,7 @@ _FIRST_PROBES_EVERY_S = 0.1
 _UNREADY_PROBES_EVERY_S = 0.25  # a replica that is there gets requests soon after it is ready
 _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
 _RENEW_AGAIN_S = 5.0
+_TELL_AGAIN_S = 10.0
 _LOOK_EVERY_S = 0.1  # while something large is sent
 
 
@@ -324,9 +325,13 @@ class ZenohLink:
         return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
 
     def _tell_records(self, connection: Connection) -> None:
-        """Send what the replica has not taken yet; with each probe until it has."""
+        """Send what the replica has not taken yet, with each probe until it has.
+
+        And now and then again: it answers with what another manager has signed since.
+        """
         records, id = self._shared.records, self.peer.id
-        if records != connection.told:
+        again = bool(records) and time.monotonic() - connection.told_at > _TELL_AGAIN_S
+        if again or records != connection.told:
             newer = partial(self._shared.newer.__setitem__, id.slot)
             key = names.slot_key(id.pool_uid, id.slot, names.RECORDS)
             connection.tell_records(key, records, newer)
