@@ -548,12 +548,17 @@ def test_an_api_server_of_another_skypilot_is_named_and_ended_only_when_idle(
     sdk.api_info.return_value = SimpleNamespace(version=sky.__version__)
     assert installed.renew_server() == ""
     sdk.api_info.return_value = SimpleNamespace(version="0.9.0")
-    sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="RUNNING")]
+
+    def request(status: str, user: str = "ann") -> SimpleNamespace:
+        return SimpleNamespace(request_id="r1", status=status, user_id=user, user_name=user)
+
+    sdk.api_status.return_value = [request("RUNNING")]
     assert (
         f"is 0.9.0, but {sky.__version__} is installed here: it is busy" in installed.renew_server()
     )
     sdk.api_stop.assert_not_called()
-    sdk.api_status.return_value = [SimpleNamespace(request_id="r1", status="SUCCEEDED")]
+    daemon = request("RUNNING", "skypilot-system")
+    sdk.api_status.return_value = [request("SUCCEEDED"), daemon]
     assert installed.renew_server().endswith("it was idle and has been restarted")
     sdk.api_stop.assert_called_once()
     local.return_value = False

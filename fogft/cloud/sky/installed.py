@@ -246,7 +246,9 @@ class InstalledSky:
         both = f"SkyPilot's API server is {found}, but {sky.__version__} is installed here"
         if not importlib.import_module("sky.server.common").is_api_server_local():
             return both
-        if any(request_of(one).active for one in sdk.api_status()):
+        own = importlib.import_module("sky.skylet.constants").SKYPILOT_SYSTEM_USER_ID
+        asked = [one for one in sdk.api_status() if own not in (one.user_id, one.user_name)]
+        if any(request_of(one).active for one in asked):  # what it does for itself never ends
             return f"{both}: it is busy; run `sky api stop` once it is idle"
         sdk.api_stop()
         return f"{both}: it was idle and has been restarted"
