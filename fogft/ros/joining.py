@@ -135,12 +135,15 @@ class EarlyJoin:
         """Keep the participant known to others. Call it every second or more often."""
         self._timers.look(self._node)
 
-    def done(self) -> None:
-        """End the hidden node, because another node uses the participant now."""
-        self._introduction.close()
+    def done(self) -> spdp.Introduction:
+        """End the hidden node, because another node uses the participant now.
+
+        Returns what may still be introducing it: to end that early would cost whole seconds.
+        """
         self._node.destroy_node()
+        return self._introduction
 
     def close(self) -> None:
         """Leave the domain, if no node has taken over the context."""
-        self.done()
+        self.done().close()
         self.context.try_shutdown()

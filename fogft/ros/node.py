@@ -107,11 +107,8 @@ class SerialisedNode:
             self._context.try_shutdown()
             raise
         self._ports = PortWatch()
-        self._introduction: spdp.Introduction | None = None
-        if early is not None:
-            early.done()
-        else:
-            self._introduction = spdp.Introduction(self._context.get_domain_id())
+        domain_id = self._context.get_domain_id()
+        self._introduction = early.done() if early is not None else spdp.Introduction(domain_id)
 
     @property
     def alive(self) -> bool:
@@ -419,8 +416,7 @@ class SerialisedNode:
         self._entities = ()
         for _, _, done in changes:
             done.set()
-        if self._introduction is not None:
-            self._introduction.close()
+        self._introduction.close()
         self._ports.close()
         self._guard.destroy()
         self._node.destroy_node()
