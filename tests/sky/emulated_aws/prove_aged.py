@@ -56,11 +56,11 @@ sso_registration_scopes = sso:account:access
 # Who asks the API server asks the broken one instead; connections that there are end.
 REDIRECTED = f"""\
 table ip broken {{
-  chain redirect {{
+  chain to_the_broken {{
     type nat hook output priority -100
     tcp dport 46580 redirect to :{BROKEN}
   }}
-  chain end {{
+  chain of_before {{
     type filter hook output priority 0
     tcp dport 46580 reject with tcp reset
   }}
