@@ -96,7 +96,8 @@ def serve(images: Images, address: str, port: int) -> None:
         def do_PATCH(self) -> None:
             with self._upload().open("ab") as file:
                 file.writelines(self._body())
-            self._said(202, location=self.path)
+                last = max(0, file.tell() - 1)
+            self._said(202, location=self.path, range=f"0-{last}")
 
         def do_PUT(self) -> None:
             if "/manifests/" not in self.path:
@@ -123,11 +124,11 @@ def serve(images: Images, address: str, port: int) -> None:
                 self.rfile.readline()
             self.rfile.readline()
 
-        def _said(self, status: int, location: str = "") -> None:
+        def _said(self, status: int, **headers: str) -> None:
             self.send_response(status)
             self.send_header("content-length", "0")
-            if location:
-                self.send_header("location", location)
+            for name, value in headers.items():
+                self.send_header(name, value)
             self.end_headers()
 
         def _answer(self, *, body: bool) -> None:
