@@ -86,19 +86,15 @@ class SerialisedNode:
         self_test()
         self._middleware: str = get_rmw_implementation_identifier()
         self._new_wait_set: Any = rclpy_implementation.WaitSet
-        self._quality = QoSProfile(
-            history=HistoryPolicy.KEEP_ALL,
+        quality = partial(
+            QoSProfile,
             reliability=ReliabilityPolicy.RELIABLE,
             durability=DurabilityPolicy.VOLATILE,
         )
+        self._quality = quality(history=HistoryPolicy.KEEP_ALL)
         # What clients that were killed have not received is kept for them until their leases end.
         # With KEEP_ALL no response to the others is accepted once there are so many.
-        self._served = QoSProfile(
-            history=HistoryPolicy.KEEP_LAST,
-            depth=_KEPT,
-            reliability=ReliabilityPolicy.RELIABLE,
-            durability=DurabilityPolicy.VOLATILE,
-        )
+        self._served = quality(history=HistoryPolicy.KEEP_LAST, depth=_KEPT)
         self._context: Any = early.context if early is not None else new_context(domain_id)
         try:
             self._node = bare_node(name, self._context)

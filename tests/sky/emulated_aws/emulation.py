@@ -57,3 +57,8 @@ class Steps:
         yield
         self.done.append((name, begun_at, time.time()))
         print(f"{self.done[-1][2] - begun_at:7.1f} s  {name}", flush=True)
+
+    def write(self, name: str) -> None:
+        """Write the table of steps to a file in the folder $RESULTS."""
+        table = "".join(f"{end - begin:7.1f} s  {step}\n" for step, begin, end in self.done)
+        Path(os.environ["RESULTS"], f"{name}.txt").write_text(table)

@@ -51,6 +51,15 @@ class Pool:
         )  # fmt: skip
         assert done.returncode == 0, done.stdout
 
+    def leave_nothing(self) -> None:
+        """Stop the API server, and wait until no process of any pool runs here."""
+        self.stop_sky()
+        try:
+            until("nothing of it runs here", lambda: not processes(), 60)
+        except AssertionError:
+            print("still running:", *processes(), sep="\n  ")
+            raise
+
     def fogft(self, *words: str, status: int = 0, limit_s: float = UP_WITHIN_S) -> str:
         """Run a command; return all that it said."""
         done = subprocess.run(
