@@ -91,3 +91,14 @@ def test_without_an_installation_it_says_what_to_do(monkeypatch: pytest.MonkeyPa
     with pytest.raises(CloudError, match="without being installed") as caught:
         wheel.pack()
     assert "pip install" in caught.value.hint
+
+
+def test_without_an_index_it_tells_why_from_the_beginning(
+    installed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setenv("UV_OFFLINE", "1")
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "cache"))
+    needing = METADATA + "".join(f"Requires-Dist: rich!={n}\n" for n in range(100))
+    (tmp_path / "site/fogft-0.1.0.dist-info/METADATA").write_text(needing)
+    with pytest.raises(CloudError, match=r"needs: No solution found .* \.\.\.$"):
+        wheel.lock(wheel.make(tmp_path / "wheels"))

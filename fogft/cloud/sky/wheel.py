@@ -18,6 +18,7 @@ import importlib.metadata
 import io
 import subprocess
 import sys
+import textwrap
 import zipfile
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -35,7 +36,7 @@ FILES = {"requirements.txt": "fogft", "requirements-ros.txt": "fogft[ros]"}
 _COMPILE = ("pip", "compile", "--quiet", "--generate-hashes", "--no-header", "--no-annotate")
 _FOR_ALL = ("--universal", "--python-version", "3.10", "--no-emit-package", "fogft", "-")
 _LIMIT_S = 120.0
-_WORDS = 300  # of what `uv` says
+_SHOWN = 400  # characters of what `uv` says
 
 
 def make(folder: Path, package: Path = _PACKAGE) -> Path:
@@ -130,7 +131,7 @@ def _compiled(wanted: str) -> str:
     except (OSError, subprocess.TimeoutExpired) as error:
         raise CloudError(f"`uv` cannot resolve the packages that fogft needs: {error}") from error
     if done.returncode:
-        said = " ".join(done.stderr.split())[-_WORDS:]
+        said = textwrap.shorten(done.stderr.removeprefix("error: "), _SHOWN, placeholder=" ...")
         raise CloudError(f"`uv` cannot resolve the packages that fogft needs: {said}")
     return done.stdout
 
