@@ -69,6 +69,7 @@ def test_a_permission_that_is_missing_is_named_however_long_the_caller_is_called
     failure = classify(UNAVAILABLE, [text])
     assert failure.cause is Cause.CREDENTIALS
     assert "iam:PassRole on resource: arn:aws:iam::123456789012:role/skypilot-v1" in failure.words
+    assert failure.words.startswith("... is not authorized to perform: ")
     assert failure.words.endswith("allows it.")
 
 

@@ -93,4 +93,6 @@ def _short(text: str, pattern: str, room: int = 300) -> str:
     """Return the part of a text around what matched, and of a refusal what was not allowed."""
     found = _NOT_ALLOWED.search(text) or re.search(pattern, text) if pattern else None
     start = max(0, found.start() - 80) if found and len(text) > room else 0
+    if start and found:  # not in the middle of a word
+        start = text.find(" ", start, found.start()) + 1 or start
     return ("... " if start else "") + text[start : start + room]

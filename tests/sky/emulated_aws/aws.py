@@ -427,6 +427,8 @@ def prepare_account() -> None:
     iam = boto3.client("iam", region_name="us-east-1", **access)
     iam.create_instance_profile(InstanceProfileName="skypilot-v1")
     iam.create_role(RoleName="skypilot-v1", AssumeRolePolicyDocument="{}")
+    of_vms = json.dumps({"Version": "2012-10-17", "Statement": OF_VMS})
+    iam.put_role_policy(RoleName="skypilot-v1", PolicyName="lab", PolicyDocument=of_vms)
     iam.add_role_to_instance_profile(InstanceProfileName="skypilot-v1", RoleName="skypilot-v1")
     for region in REGIONS:
         ec2 = boto3.client("ec2", region_name=region, **access)

@@ -20,9 +20,10 @@ _ACCOUNT = "arn:aws:ec2:us-east-1:ACCOUNT:"
 _BESIDE_AN_INSTANCE = "arn:aws:ec2:*:ACCOUNT:security-group/*"
 _CONDITION = {"Null": {"aws:ResourceTag/fogft-pool": "false"}}
 OF_VMS: list[Mapping[str, Any]] = [
-    {"Action": "ec2:Describe*"},
-    {"Action": "ec2:TerminateInstances", "Condition": _CONDITION},
-]
+    {"Effect": "Allow", "Action": "ec2:Describe*", "Resource": "*"},
+    {"Effect": "Allow", "Action": "ec2:TerminateInstances", "Resource": "*",
+     "Condition": _CONDITION},
+]  # fmt: skip
 
 
 def statements(page: str) -> list[Mapping[str, Any]]:

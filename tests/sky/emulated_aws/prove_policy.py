@@ -7,7 +7,9 @@ and ended under exactly it. Prints a table of steps; ends with status 1 at the f
 
 from __future__ import annotations
 
+import logging
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -32,21 +34,49 @@ OTHERWISE = {
 }
 
 
-def outcome(cloud: SkyCloud, slot: int) -> Machine | None:
-    """Launch a replica; return what became of it, None where it was refused at once."""
-    offer = cloud.offers(RESOURCES)[0]
-    id = ReplicaId(UID, slot, 1)
-    cloud.launch(Launch(id, "proof", offer.placement, offer.usd_per_hour, "abcd", TASK, FILES))
+class Log(logging.Handler):
+    """What the manager's log would have."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        logging.getLogger("fogft").addHandler(self)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(record.getMessage())
+
+
+def order_of(cloud: SkyCloud, slot: int, *, use_spot: bool = True) -> Launch:
+    offer = cloud.offers({**RESOURCES, "use_spot": use_spot})[0]
+    id, price = ReplicaId(UID, slot, 1), offer.usd_per_hour
+    return Launch(id, "proof", offer.placement, price, "abcd", TASK, FILES)
+
+
+def outcome(cloud: SkyCloud, order: Launch) -> Machine:
+    """Launch a replica, or start one that is stopped; return what became of it."""
+    (cloud.start if order.is_there else cloud.launch)(order)
+    id = order.id
 
     def ended() -> Machine | None:
         found = next(m for m in cloud.machines(UID) if m.id == id)
         return found if found.phase is not MachinePhase.PROVISIONING else None
 
     machine = until(f"{id.short} has come to something", ended)
-    return machine if isinstance(machine, Machine) else None
+    assert isinstance(machine, Machine)
+    return machine
+
+
+def names(machine: Machine, action: str) -> None:
+    """See to it that a launch has failed for the want of a permission, and says of which."""
+    failure = machine.failure
+    assert failure is not None, machine
+    print(f"        {failure.cause.value}: {failure.words}", flush=True)
+    assert failure.cause is Cause.CREDENTIALS, failure
+    assert action.split(":")[1].rstrip("*") in failure.words, failure
 
 
 def main() -> int:
+    log = Log()
     stub_server()
     cloud = adapter(Path.home() / "policy")
     with step("credentials are good"):
@@ -61,7 +91,7 @@ def main() -> int:
         (told,) = cloud.left_out()
         print(f"        {told}", flush=True)
         assert "not authorized to perform: servicequotas:GetServiceQuota" in told
-    for action in ("iam:ListAttachedRolePolicies", "iam:ListRolePolicies"):
+    for action in ("iam:ListAttachedRolePolicies", "iam:ListRolePolicies", "iam:GetRolePolicy"):
         control(f"/deny?action={action}")
         with step(f"without {action} `up` says that the role cannot be read"):
             told = " ".join(cloud.exposures(["aws"], open_port=None))
@@ -71,19 +101,13 @@ def main() -> int:
     for slot, action in enumerate(tried):
         control(f"/deny?action={action}")
         with step(f"a launch without {action} fails and names it"):
-            machine = outcome(cloud, slot)
-            assert machine is not None
-            failure = machine.failure
-            assert failure is not None, machine
-            print(f"        {failure.cause.value}: {failure.words}", flush=True)
-            assert failure.cause is Cause.CREDENTIALS, failure
-            assert action.split(":")[1].rstrip("*") in failure.words, failure
+            machine = outcome(cloud, order_of(cloud, slot))
+            names(machine, action)
         control("/deny")
         cloud.terminate(machine.id)
     assert running() == []
     with step("under the whole policy a replica runs"):
-        machine = outcome(cloud, 50)
-        assert machine is not None
+        machine = outcome(cloud, order_of(cloud, 50))
         assert machine.phase is MachinePhase.RUNNING, machine.failure
     control("/deny?action=ec2:TerminateInstances")
     with step("without ec2:TerminateInstances its end is not believed, and the reason is told"):
@@ -95,10 +119,27 @@ def main() -> int:
     with step("... and with it it ends, though SkyPilot may not do what it does before"):
         cloud.terminate(machine.id)
         assert running() == []
+    with step("... and on demand one runs, of which the log says that its guard only stops it"):
+        order = order_of(cloud, 51, use_spot=False)
+        machine = outcome(cloud, order)
+        assert machine.phase is MachinePhase.RUNNING, machine.failure
+        assert any("ModifyInstanceAttribute" in line for line in log.lines)
+    control("/deny?action=ec2:StopInstances")
+    with step("without ec2:StopInstances it is not stopped, and the reason is told"):
+        with pytest.raises(CloudError, match="StopInstances") as refused:
+            cloud.stop(order)
+        print(f"        {refused.value.message}", flush=True)
+        assert len(running()) == 1
+    control("/deny?action=ec2:StartInstances")
+    with step("... and with it it is, but without ec2:StartInstances does not start again"):
+        cloud.stop(order)
+        assert running() == []
+        names(outcome(cloud, replace(order, is_there=True)), "ec2:StartInstances")
     control("/deny")
-    machine = outcome(cloud, 51)
-    assert machine is not None
-    assert machine.phase is MachinePhase.RUNNING, machine.failure
+    cloud.terminate(order.id)
+    with step("under the whole policy, another one runs"):
+        machine = outcome(cloud, order_of(cloud, 52))
+        assert machine.phase is MachinePhase.RUNNING, machine.failure
     control("/deny?action=ec2:DeleteSecurityGroup")
     with step("without ec2:DeleteSecurityGroup the machine ends, and what may be left is told"):
         with pytest.raises(CloudError, match="DeleteSecurityGroup") as refused:
