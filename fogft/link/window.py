@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from itertools import count
 from queue import SimpleQueue
 
+from fogft.byte_limit import ByteLimit
 from fogft.link import batch_frames
 from fogft.requests.load import Handling
 
@@ -62,14 +63,21 @@ class OpenAttempt:
 
 
 class LinkWindow:
-    """The attempts open on one connection."""
+    """The attempts open on one connection.
 
-    limit, limit_bytes = ATTEMPTS_LIMIT, BYTES_LIMIT  # a larger single one still gets in alone
+    Args:
+        standing: As many more have room: pulls of topics, which are open all the time.
 
-    def __init__(self) -> None:
+    Attributes:
+        limit: How many may be open.
+        large: The bound of their bytes.
+    """
+
+    def __init__(self, standing: int = 0) -> None:
+        self.limit = ATTEMPTS_LIMIT + standing
+        self.large = ByteLimit(BYTES_LIMIT)
         self._lock = threading.Lock()
         self._open: dict[bytes, OpenAttempt] = {}
-        self.held_bytes = 0  # bytes of all open attempts
         self._closed = False
         self._declined = False
 
@@ -78,16 +86,14 @@ class LinkWindow:
 
     def admit(self, attempt: OpenAttempt) -> bool:
         """Take an attempt in; False when full, closed, or its request is open already."""
-        size = attempt.size
         with self._lock:
             if self._closed or attempt.request_id in self._open:
                 return False
-            full = len(self._open) >= self.limit or self.held_bytes + size > self.limit_bytes
-            if full and self._open:
+            if len(self._open) >= self.limit or not self.large.has_room(attempt.size):
                 self._declined = True
                 return False
             self._open[attempt.request_id] = attempt
-            self.held_bytes += size
+            self.large.add(attempt.size)
             return True
 
     def attempts(self) -> list[OpenAttempt]:
@@ -105,7 +111,7 @@ class LinkWindow:
             if self._open.get(attempt.request_id) is not attempt:
                 return False
             del self._open[attempt.request_id]
-            self.held_bytes -= attempt.size
+            self.large.remove(attempt.size)
             return True
 
     def forget(self, request_id: bytes) -> OpenAttempt | None:
@@ -115,7 +121,7 @@ class LinkWindow:
             if attempt is not None:
                 attempt.forgotten = attempt.payload is not None  # before it is seen to be gone
                 del self._open[request_id]
-                self.held_bytes -= attempt.size
+                self.large.remove(attempt.size)
             return attempt
 
     def regained_room(self) -> bool:
@@ -125,7 +131,7 @@ class LinkWindow:
         with self._lock:
             # A quarter free: a window that is full to the brim is not announced for each slot.
             roomy = len(self._open) <= self.limit * 3 // 4
-            if roomy and self.held_bytes <= self.limit_bytes * 3 // 4:
+            if roomy and self.large.held <= self.large.limit * 3 // 4:
                 self._declined = False
                 return True
             return False
@@ -136,7 +142,7 @@ class LinkWindow:
             self._closed = True
             ended = list(self._open.values())
             self._open.clear()
-            self.held_bytes = 0
+            self.large.held = 0
             return ended
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from queue import Empty
 from typing import Any
@@ -11,6 +12,8 @@ import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.byte_limit import SMALL_BYTES
+from fogft.counters import Counters
 from fogft.errors import FrameError
 from fogft.link import batch_frames, frame
 from fogft.link.frame import NO_LOAD, NO_STAMP
@@ -19,7 +22,8 @@ from fogft.link.window import BatchBuffer, OpenAttempt
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.replica.listener import ZenohListener
 from fogft.link.zenoh.replica.query_ends import QueryEnd
-from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueue
+from fogft.link.zenoh.replica.reply_queue import BYTES_LIMIT as REPLY_BYTES_LIMIT
+from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueue, ReplyQueues
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal
@@ -205,6 +209,37 @@ def test_replies_leave_in_order_and_only_those_of_one_query_together(
     assert found == put
     with pytest.raises(Empty):
         queue.next(0.0)
+
+
+class _Stalled:
+    """A stream of a robot that reads when it is let."""
+
+    def __init__(self) -> None:
+        self.reads = threading.Event()
+
+    def send_at_once(self, send: Callable[[bytes], None]) -> bool:
+        return False
+
+    def send(self, send: Callable[[bytes], None]) -> None:
+        self.reads.wait(10.0)
+
+
+def test_a_large_reply_passes_beside_small_ones_and_none_of_them_is_dropped() -> None:
+    counters, stalled = Counters(), _Stalled()
+    stream: Any = stalled
+    queues = ReplyQueues(counters)
+
+    def put(n: int, size: int) -> None:
+        queues.put(b"token", "robot", Reply(stream, request_id(n), bytes(size), ""), more=True)
+
+    put(0, 1)
+    put(1, REPLY_BYTES_LIMIT + 1)
+    put(2, 1)
+    assert counters.snapshot() == {"replies": 3}
+    put(3, SMALL_BYTES + 1)
+    assert counters.snapshot() == {"replies": 3, "reply_dropped": 1}
+    stalled.reads.set()
+    queues.close(10.0)
 
 
 # -- over Zenoh ---------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
+from fogft.byte_limit import SMALL_BYTES
 from fogft.link.window import (
     IGNORED_AFTER_S,
     IGNORED_LIMIT,
@@ -30,22 +31,27 @@ class Attempt:
 class WindowMachine(RuleBasedStateMachine):
     """A window beside a plain model of it: a list of what is open."""
 
-    LIMIT, LIMIT_BYTES = 4, 100
+    LIMIT, LIMIT_BYTES = 4, 4 * SMALL_BYTES
 
     def __init__(self) -> None:
         super().__init__()
         self.window: LinkWindow = LinkWindow()
-        self.window.limit, self.window.limit_bytes = self.LIMIT, self.LIMIT_BYTES
+        self.window.limit, self.window.large.limit = self.LIMIT, self.LIMIT_BYTES
         self.open: list[Attempt] = []
         self.all: list[Attempt] = []
         self.closed = False
 
-    @rule(number=st.integers(0, 6), size=st.integers(0, 150))
+    def large(self) -> int:
+        return sum(a.size for a in self.open if a.size > SMALL_BYTES)
+
+    @rule(number=st.integers(0, 6), size=st.integers(0, 6 * SMALL_BYTES))
     def admit(self, number: int, size: int) -> None:
+        """What is small needs a place only; a large one the bytes, too, or to be the only one."""
         attempt = Attempt(bytes([number]), size)
-        room = len(self.open) < self.LIMIT and sum(a.size for a in self.open) + size <= 100
+        fits = not self.large() or self.large() + size <= self.LIMIT_BYTES
+        room = len(self.open) < self.LIMIT and (size <= SMALL_BYTES or fits)
         known = any(a.request_id == attempt.request_id for a in self.open)
-        expected = not self.closed and not known and (room or not self.open)
+        expected = not self.closed and not known and room
         assert self.window.admit(attempt) is expected
         if expected:
             self.open.append(attempt)
@@ -73,7 +79,7 @@ class WindowMachine(RuleBasedStateMachine):
     @invariant()
     def counts_are_right(self) -> None:
         assert len(self.window) == len(self.open)
-        assert self.window.held_bytes == sum(a.size for a in self.open)
+        assert self.window.large.held == self.large()
 
 
 TestWindow = WindowMachine.TestCase
@@ -118,7 +124,7 @@ def test_an_attempt_ends_once_whoever_comes_first() -> None:
         thread.join()
     assert set(granted.values()) == {1}
     assert len(granted) == len(attempts)
-    assert (len(window), window.held_bytes) == (0, 0)
+    assert (len(window), window.large.held) == (0, 0)
 
 
 @given(

@@ -43,6 +43,7 @@ class Forwarder:
 
     held_limit = 2048  # requests under way at once; more are refused as overloaded
     of_one_limit = 512  # the same for one robot: nobody takes all the room
+    held_bytes = 256 << 20  # of the large ones together
     kept_bytes = 16 << 20  # answers kept for copies that come later, together
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -51,7 +52,7 @@ class Forwarder:
         self._dispatchers: dict[str, Dispatcher] = {}
         self._ready: frozenset[str] = frozenset()
         self._unready_since: dict[str, float] = {}
-        self._known = KnownRequests(self.kept_bytes, 4 * self.held_limit)
+        self._known = KnownRequests(self.kept_bytes, 4 * self.held_limit, self.held_bytes)
         self._by_robot: Counter[str] = Counter()
         self._queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
@@ -107,7 +108,8 @@ class Forwarder:
             return Refusal.NOT_READY
         of_robot = self._by_robot[incoming.robot]
         full = self._known.held >= self.held_limit or of_robot >= self.of_one_limit
-        return Refusal.OVERLOADED if full else None
+        too_large = not self._known.large.has_room(len(incoming.payload))
+        return Refusal.OVERLOADED if full or too_large else None
 
     def _refuse(self, incoming: Incoming, reason: Refusal) -> None:
         self.refused[reason] += 1

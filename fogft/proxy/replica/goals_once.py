@@ -22,6 +22,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 
+from fogft.byte_limit import ByteLimit
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
@@ -74,9 +75,10 @@ class _ActionServer:
     def at_work(self, now: float) -> int:
         return sum(known.holds(now) for known in self.open.values())
 
-    @property
-    def held_bytes(self) -> int:
-        return sum(goal.size * max(len(goal.waiting), 1) for goal in self.open.values())
+    def count(self, large: ByteLimit) -> None:
+        """Add the goals that have no answer, and their copies."""
+        for goal in self.open.values():
+            large.add(goal.size * max(len(goal.waiting), 1))
 
 
 class GoalsOnce:
@@ -141,8 +143,10 @@ class GoalsOnce:
             return Refusal.EXPIRED
         if not self._is_ready(incoming.service) or incoming.service not in self._clients:
             return Refusal.NOT_READY
-        held_bytes = sum(server.held_bytes for server in self._servers.values())
-        if held_bytes and held_bytes + len(incoming.payload) > _BYTES_LIMIT:
+        large = ByteLimit(_BYTES_LIMIT)
+        for other in self._servers.values():
+            other.count(large)
+        if not large.has_room(len(incoming.payload)):
             return Refusal.OVERLOADED
         known = server.open.get(goal)
         if known is None:

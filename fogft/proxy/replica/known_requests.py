@@ -11,6 +11,7 @@ from __future__ import annotations
 import heapq
 from collections import OrderedDict
 
+from fogft.byte_limit import ByteLimit
 from fogft.proxy.replica.service_queue import Job
 
 _DEADLINES_KEPT = 1024  # of jobs that were forgotten
@@ -22,9 +23,14 @@ class KnownRequests:
     Args:
         kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
         kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
+        held_bytes: Of the requests of open jobs.
+
+    Attributes:
+        held: How many jobs are open.
+        large: The bound of their bytes.
     """
 
-    def __init__(self, kept_bytes: int, kept_ids: int) -> None:
+    def __init__(self, kept_bytes: int, kept_ids: int, held_bytes: int) -> None:
         self._kept_bytes_limit = kept_bytes
         self._kept_ids = kept_ids
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
@@ -33,7 +39,7 @@ class KnownRequests:
         self._kept: OrderedDict[bytes, Job] = OrderedDict()
         self._kept_bytes = 0
         self.held = 0
-        self.held_bytes = 0
+        self.large = ByteLimit(held_bytes)
 
     def __len__(self) -> int:
         """Return how much is remembered: requests, answered ones included, and deadlines."""
@@ -57,12 +63,12 @@ class KnownRequests:
             self._deadlines = [due for due, job in live if job and job.deadline == due[0]]
             heapq.heapify(self._deadlines)
         self.held += 1
-        self.held_bytes += job.size
+        self.large.add(job.size)
 
     def release(self, job: Job) -> None:
         """Note that a job is done."""
         self.held -= 1
-        self.held_bytes -= job.size
+        self.large.remove(job.size)
 
     def forget(self, job: Job) -> None:
         """Forget a finished job, so that a copy is run again."""

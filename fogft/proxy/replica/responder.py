@@ -52,7 +52,7 @@ class Responder:
     """
 
     held_limit = 512  # requests held at once; more are refused, from whom has most waiting
-    held_bytes = 64 << 20  # of them together; more are refused as overloaded
+    held_bytes = 64 << 20  # of the large ones together; more are refused as overloaded
     outstanding = OUTSTANDING  # passed on to one service at once, where no limit is given
     kept_bytes, kept_ids = 16 << 20, 32768  # as for `KnownRequests`
 
@@ -74,7 +74,7 @@ class Responder:
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
         self._interruptions = Interruptions()
-        self._known = KnownRequests(self.kept_bytes, self.kept_ids)
+        self._known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
         self._queues: dict[str, ServiceQueue] = {}
         self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
         self.ran_s = self.wasted_s = 0.0
@@ -197,8 +197,7 @@ class Responder:
             return Refusal.BUSY, None
         deadline = now + remaining_s
         hopeless = queue.hopeless(incoming.robot, deadline, remaining_s)
-        held_bytes = self._known.held_bytes + len(incoming.payload)
-        if hopeless or (held_bytes > self.held_bytes and self._known.held):
+        if hopeless or not self._known.large.has_room(len(incoming.payload)):
             return Refusal.OVERLOADED, None
         if self._known.held < self.held_limit:
             return None, None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.goals_once import GoalsOnce
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
@@ -28,10 +29,12 @@ class Scene:
     def calls(self):
         return self.clients[SERVICE].calls
 
-    def give(self, goal: bytes, service: str = SERVICE, remaining_s: float = 5.0) -> FakeIncoming:
+    def give(
+        self, goal: bytes, service: str = SERVICE, remaining_s: float = 5.0, more: bytes = b""
+    ) -> FakeIncoming:
         """Every copy of a goal has another request id."""
         self.asked += 1
-        id, payload = self.asked.to_bytes(16, "big"), HEADER + goal * 16 + b"5"
+        id, payload = self.asked.to_bytes(16, "big"), HEADER + goal * 16 + b"5" + more
         incoming = FakeIncoming(id, payload, service=service, remaining_s=remaining_s)
         self.goals.request(incoming)
         return incoming
@@ -232,15 +235,17 @@ def test_what_an_action_server_was_given_too_much_of_begins_anew():
 
 
 def test_what_is_held_is_bounded_by_bytes_and_a_large_one_alone_passes(monkeypatch):
-    monkeypatch.setattr("fogft.proxy.replica.goals_once._BYTES_LIMIT", 60)
-    scene = Scene(outstanding=0)  # none is passed on
-    assert [scene.give(goal).outcome for goal in (b"a", b"b", b"c")] == [
+    monkeypatch.setattr("fogft.proxy.replica.goals_once._BYTES_LIMIT", 3 * SMALL_BYTES)
+    scene, large = Scene(outstanding=0), bytes(SMALL_BYTES)  # none is passed on
+    assert [scene.give(goal, more=large).outcome for goal in (b"a", b"b", b"c")] == [
         [], [], ["refused overloaded"],
     ]  # fmt: skip
-    assert scene.give(b"a").outcome == ["refused overloaded"]
+    assert scene.give(b"a", more=large).outcome == ["refused overloaded"]
+    assert scene.give(b"d").outcome == []
     scene.wait(6.0)
     monkeypatch.setattr("fogft.proxy.replica.goals_once._BYTES_LIMIT", 1)
-    assert scene.give(b"a").outcome == []
+    assert scene.give(b"d").outcome == []
+    assert scene.give(b"a", more=large).outcome == []
 
 
 def test_the_parts_of_one_action_server_die_once():

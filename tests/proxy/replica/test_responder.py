@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.responder import Responder
 from fogft.proxy.replica.service_queue import EMPTY_REQUEST
@@ -352,13 +353,19 @@ def test_a_request_that_ros_has_no_room_for_may_be_sent_again():
 
 
 def test_held_bytes_are_bounded():
-    """A robot whose requests others answer first goes on sending: its window is free again."""
+    """A robot whose requests others answer first goes on sending: its window is free again.
+
+    One that is larger than the limit passes beside small ones, and they pass beside it.
+    """
     scene = Scene(held_bytes=10)
-    big = scene.ask(A, payload=b"larger than allowed, but alone")
-    assert scene.ask(B, payload=b"q").outcome == ["refused overloaded"]
-    scene.answer(0, b"r")
+    small, large = b"q", bytes(SMALL_BYTES + 1)
+    assert scene.ask(A, payload=small).outcome == []
+    big = scene.ask(B, payload=large)
+    assert scene.ask(b"c" * 16, payload=large).outcome == ["refused overloaded"]
+    assert scene.ask(b"d" * 16, payload=small).outcome == []
+    scene.answer(1, b"r")
     assert big.outcome == [b"r"]
-    assert scene.ask(B, payload=b"q").outcome == []
+    assert scene.ask(b"c" * 16, payload=large).outcome == []
 
 
 def test_a_service_that_was_lost_frees_its_room_and_no_other():

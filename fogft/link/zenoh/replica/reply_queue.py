@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 
+from fogft.byte_limit import ByteLimit
 from fogft.counters import Counters
 from fogft.link import batch_frames, frame
 from fogft.link.compression import Compression
@@ -101,7 +102,7 @@ class ReplyQueue:
     def __init__(self) -> None:
         self.replies: SimpleQueue[Reply | QueryEnd | None] = SimpleQueue()
         self.waiting = 0
-        self.waiting_bytes = 0
+        self.large = ByteLimit(BYTES_LIMIT)  # of the waiting ones
         self.thread: threading.Thread | None = None
         self._taken: list[Reply | QueryEnd | None] = []  # it did not fit to what was taken before
 
@@ -178,12 +179,11 @@ class ReplyQueues:
             if self._closed:
                 return
             queue = self._queue(token, robot)
-            full = queue.waiting >= REPLIES_LIMIT or queue.waiting_bytes + size > BYTES_LIMIT
-            dropped = full and queue.waiting > 0
+            dropped = queue.waiting >= REPLIES_LIMIT or not queue.large.has_room(size)
             if dropped:
                 reply.payload, reply.refusal, size = b"", Refusal.LOST, 0
             queue.waiting += 1
-            queue.waiting_bytes += size
+            queue.large.add(size)
             queue.replies.put(reply)
         if dropped:
             self._counters.add("reply_dropped")
@@ -240,17 +240,18 @@ class ReplyQueues:
             if isinstance(taken, QueryEnd):
                 self._guarded(taken.say)
                 self._guarded(partial(unended.add, taken))
-                done, size = 1, 0
+                sizes = [0]
             elif taken:
-                done, size = len(taken), sum(len(reply.payload) for reply in taken)
+                sizes = [len(reply.payload) for reply in taken]
                 self._guarded(partial(taken[0].stream.send, partial(send_together, taken)))
             else:
                 return
             if unended:
                 self._guarded(unended.look)
             with self._lock:
-                queue.waiting -= done
-                queue.waiting_bytes -= size
+                queue.waiting -= len(sizes)
+                for size in sizes:
+                    queue.large.remove(size)
             del taken  # its payloads, while this thread waits
 
     def _guarded(self, step: Callable[[], None]) -> None:

@@ -120,7 +120,7 @@ class Attempts:
         self._room = tell.room
         self._on_large = tell.large
         self._ended = ended
-        self.window = LinkWindow()
+        self.window = LinkWindow(standing=len(self._services))
         self.watched = False
         self._large_since = float("-inf")
         self._sending_since: float | None = None

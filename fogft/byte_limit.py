@@ -1,0 +1,35 @@
+"""Bound the bytes of large messages held at once; small ones neither wait for them nor bar them.
+
+Owns: the sum, and what is small. Not here: how many messages there may be: their owner counts.
+"""
+
+from __future__ import annotations
+
+SMALL_BYTES = 16 << 10
+
+
+class ByteLimit:
+    """The large messages that are held: within a limit together, or a single one of any size.
+
+    Attributes:
+        limit: In bytes.
+        held: Bytes of the large ones now.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.held = 0
+
+    def has_room(self, size: int) -> bool:
+        """Whether a message may be held, too."""
+        return size <= SMALL_BYTES or not self.held or self.held + size <= self.limit
+
+    def add(self, size: int) -> None:
+        """Note that a message is held."""
+        if size > SMALL_BYTES:
+            self.held += size
+
+    def remove(self, size: int) -> None:
+        """Note that a message is held no longer."""
+        if size > SMALL_BYTES:
+            self.held -= size
