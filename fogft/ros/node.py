@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, TypeVar
@@ -40,6 +41,7 @@ E = TypeVar("E", Server, Client, Publisher, Subscription)
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
 _KEPT = 5000  # Fast DDS keeps no more of any kind
 _NO_LIMIT = -1  # of rcl_wait: until something happens
+_REST = 9  # times what a new wait set takes, until the next one: many entities may be made in a row
 
 
 class SerialisedNode:
@@ -328,7 +330,8 @@ class SerialisedNode:
             except Exception as error:
                 raise RosError(f"`{name}` cannot be created: {error}") from error
             self._changes.append((entity, True, threading.Event()))
-            self._guard.trigger()
+            if len(self._changes) == 1:
+                self._guard.trigger()
         return entity
 
     def _withdraw(self, entity: Entity) -> None:
@@ -357,14 +360,19 @@ class SerialisedNode:
     def _run(self) -> None:
         try:
             wait_set, waiting = self._apply_changes()
+            rest_until = 0.0
             while not self._stopping:
-                if self._changes:
+                began = time.monotonic()
+                if self._changes and (began >= rest_until or self._any_withdrawn()):
                     wait_set, waiting = self._apply_changes()
+                    now = time.monotonic()
+                    rest_until = now + _REST * (now - began)
                 wait_set.clear_entities()
                 wait_set.add_guard_condition(self._guard.handle)
                 for add, _, entity in waiting:
                     add(entity.handle)
-                wait_set.wait(_NO_LIMIT)
+                rest_s = rest_until - time.monotonic() if self._changes else None
+                wait_set.wait(_NO_LIMIT if rest_s is None else max(0, int(rest_s * 1e9)))
                 is_ready = wait_set.is_ready
                 ready = [entity for (_, where, entity) in waiting if is_ready(*where)]
                 for entity in ready:
@@ -373,6 +381,11 @@ class SerialisedNode:
             log.exception("the take loop of ROS ended")
         finally:
             self._end_ros()
+
+    def _any_withdrawn(self) -> bool:
+        """Whether somebody waits for an entity to be destroyed."""
+        with self._create_lock:
+            return any(not added for _, added, _ in self._changes)
 
     def _apply_changes(self) -> tuple[Any, list[tuple[Any, tuple[str, int], Any]]]:
         """Return a new wait set and, for each entity, how to add it and where it then stands."""

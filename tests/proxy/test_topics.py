@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import threading
 from typing import Any
 
 import pytest
@@ -297,6 +298,30 @@ def test_a_replica_that_starts_anew_begins_a_new_session():
     world.nodes[0].heard["/back"](b"after")
     world.carry()
     assert world.robot_node.published["/back"] == [b"before", b"after"]
+
+
+def test_a_probe_is_answered_while_topics_are_being_made(monkeypatch):
+    """The wire's thread asks what is ready; a pool may have a thousand topics to make."""
+    monkeypatch.undo()  # with threads
+    node, first_made, go_on = FakeTopics(), threading.Event(), threading.Event()
+    replica = TopicsOnReplica([TO, TopicSpec("/second", TO.type, TO.origin)])
+    make = node.publisher
+
+    def publisher(name, type_name, quality):
+        made = make(name, type_name, quality)
+        if name == "/second":
+            first_made.set()
+            go_on.wait(10.0)
+        else:
+            made.subscribers = lambda: go_on.set() or using.join(10.0) or 1
+        return made
+
+    node.publisher = publisher
+    using = threading.Thread(target=replica.use, args=(node,))
+    using.start()
+    first_made.wait(10.0)
+    assert replica.ready() == {TO.key_name}
+    replica.close()
 
 
 def test_noise_from_a_peer_harms_nobody():

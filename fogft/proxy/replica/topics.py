@@ -172,7 +172,8 @@ class TopicsOnReplica:
 
     def ready(self) -> frozenset[str]:
         """Return the names of the topics that have an endpoint here."""
-        heard = {name for name, one in self._publishers.items() if one.subscribers()}
+        publishers = tuple(self._publishers.items())  # while `use` adds to them
+        heard = {name for name, one in publishers if one.subscribers()}
         return frozenset(self._subscriptions) | heard
 
     def request(self, incoming: Incoming) -> None:
