@@ -9,7 +9,8 @@ allows. So, under demand, half the limit is tried for some answers; it is kept i
 stays near what it was. Once in a while the double is tried, and kept if it gains.
 
 Without demand nothing is learned and nothing limited. A service that answers every 3 ms or
-more often is not limited: what waits in it is over before it matters.
+more often is not limited: what waits in it is over before it matters. One that takes up to 0.1 s
+has one more in hand than it works on, or it would stand still between two.
 
 Owns: the limit of one service. Not here: who waits (`fair_queue`).
 """
@@ -17,7 +18,7 @@ Owns: the limit of one service. Not here: who waits (`fair_queue`).
 from __future__ import annotations
 
 QUICK_S = 0.003
-SOLO_S = 0.01  # below this, one at a time would leave the service idle between two
+IN_HAND_S = 0.1  # below this, one more is in hand
 _NEAR = 0.85
 _SAMPLES = 30
 _TRY_AGAIN_S = 60.0
@@ -52,6 +53,13 @@ class ConcurrencyLimit:
     def known(self) -> int:
         """The limit, if given or learned; else 0."""
         return self.limit if self._given is not None or self._tried else 0
+
+    @property
+    def in_hand(self) -> int:
+        """How many the service is given."""
+        on_trial = self._given is not None or not self._tried or self._kept is not None
+        more = 0 if on_trial or self.takes_s >= IN_HAND_S else 1
+        return min(self.limit + more, max(self.limit, self._most))
 
     def finished(self, level: int, took_s: float, now: float) -> None:
         """Learn from an answer; at its start `level` requests were running, itself included."""
@@ -92,7 +100,7 @@ class ConcurrencyLimit:
     def _half(self, each_s: float) -> int:
         if each_s < QUICK_S:
             return self.limit
-        return min(self.limit, max(self.limit // 2, 1 if each_s >= SOLO_S else 2))
+        return max(self.limit // 2, 1)
 
     def _set(self, limit: int) -> None:
         self.limit = limit

@@ -85,6 +85,7 @@ class ServiceQueue:
         self.at_work = 0
         self._begun_last = 0.0
         self._alone = False  # the job at work is to have no other beside it
+        self._next: Job | None = None  # passed on though the service is at work on all that it can
         self._longest_s = 0.0  # that it lately took; 0 before its first answer
         self._quiet_since: float | None = None  # it has work, and has ended none since
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
@@ -100,9 +101,10 @@ class ServiceQueue:
         deadline = job.deadline + (LONGEST_S if job.spare else 0.0)
         self._waiting.put(job.id, job.robot, deadline, job)
 
-    @property
-    def _has_room(self) -> bool:
-        return self.at_work < self.limit.limit and not self._alone
+    def _has_room(self, job: Job) -> bool:
+        if self.at_work and (job.alone or self._alone):
+            return False
+        return self.at_work < (self.limit.limit if job.spare else self.limit.in_hand)
 
     def has_free_slot(self, now: float) -> bool:
         """Whether nothing waits, and the service can start one more (almost) at once."""
@@ -118,7 +120,7 @@ class ServiceQueue:
 
     def takes(self, job: Job) -> bool:
         """Whether a job that arrives now is passed on at once."""
-        return self._has_room and not len(self._waiting) and not (job.alone and self.at_work)
+        return not len(self._waiting) and self._has_room(job)
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
         """Return the load when `ended` have just ended; None until the pace is known.
@@ -145,13 +147,14 @@ class ServiceQueue:
         What it returns may be past its deadline, or about to be while others wait that are not:
         then it was not begun and takes no room.
         """
-        if not self._has_room:
+        if self.at_work >= self.limit.in_hand or self._alone:
             return None
         job = self._waiting.take()
-        if job is not None and job.alone and self.at_work:
+        if job is not None and not self._has_room(job):
             self.put(job)  # when the service has nothing else
             return None
-        if job is not None and job.deadline > now + (self.limit.takes_s if self._waiting else 0.0):
+        before = (1 if self._waiting else 0) + (self.at_work >= self.limit.limit)
+        if job is not None and job.deadline > now + before * self.limit.takes_s:
             self.begin(job, now)
         return job
 
@@ -165,6 +168,8 @@ class ServiceQueue:
             self._quiet_since = now
         self._begun_last = now
         job.passed_on, job.begun, job.level = True, now, self.at_work
+        if self.at_work > self.limit.limit:
+            self._next = job
 
     def remove(self, job: Job) -> bool:
         """Remove a waiting job; return whether it was waiting."""
@@ -177,11 +182,16 @@ class ServiceQueue:
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
         self.free(job)
+        if self._next is not None:  # only now does the service begin with it
+            self._next.begun, self._next.level = now, self.at_work
+            self._begun_last, self._next = now, None
         self._unanswered = self.at_work
         self._quiet_since = now if self.at_work else None
 
     def free(self, job: Job) -> None:
         """Note that the service is done with a job."""
+        if job is self._next:
+            self._next = None
         if job.passed_on:
             job.passed_on = False
             self.at_work -= 1
@@ -208,7 +218,7 @@ class ServiceQueue:
 
     def died(self) -> None:
         """Note that the service is a new process, of which nothing is known."""
-        self._quiet_since, self._unanswered = None, 0
+        self._quiet_since, self._unanswered, self._next = None, 0, None
         self._longest_s = self._last_deadline = 0.0
 
     def overdue(self, job: Job, now: float) -> None:

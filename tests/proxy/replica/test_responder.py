@@ -580,6 +580,29 @@ def test_a_given_limit_is_kept():
     assert len(scene.client.calls) == 3
 
 
+def saturated(takes_s: float, answers: int = 150) -> Scene:
+    """Return a replica that has learned that its service does one thing at a time."""
+    scene = Scene()
+    for n in range(answers + 10):
+        scene.ask(n.to_bytes(16, "big"), remaining_s=1000.0)
+    for ended in range(answers):
+        scene.clock.now += takes_s
+        scene.answer(ended)
+    assert scene.responder.limits == {"/s": 1}
+    return scene
+
+
+def test_a_short_service_has_its_next_request_in_hand_and_a_long_one_does_not():
+    """So it never stands still between two; the next one's time counts from its turn."""
+    scene = saturated(0.02)
+    assert len(scene.client.calls) == 152
+    before = scene.responder.ran_s
+    scene.clock.now += 0.02
+    scene.answer(150)
+    assert scene.responder.ran_s - before == pytest.approx(0.02)
+    assert len(saturated(0.2).client.calls) == 151
+
+
 @given(
     st.lists(
         st.tuples(st.sampled_from(["ask", "answer", "crash", "wait", "cancel"]), st.integers(0, 3)),
