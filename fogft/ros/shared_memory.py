@@ -38,6 +38,7 @@ FOLDER = Path("/dev/shm")
 
 _TURN_LIMIT_S = 5.0
 _IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
+_PORT_EVENT = re.compile(rb"\0fast(?:dds|rtps)_port\d+\0")
 _REMOVED = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+) \(deleted\)")
 # A port begins, in Fast DDS 2.14 and 3.2, with: its number, how many read it, two limits in ms (one
 # a third of the other), how many messages it holds, how many wait; flags, the lowest "not broken".
@@ -146,7 +147,7 @@ class PortWatch:
     def _run(self) -> None:
         reopen_ports()
         while self._id >= 0 and not self._closed:
-            if b"_port" in os.read(self._watch, _EVENTS_BYTES):
+            if _PORT_EVENT.search(os.read(self._watch, _EVENTS_BYTES)):
                 reopen_ports()
         if self._id >= 0:
             os.close(self._watch)
