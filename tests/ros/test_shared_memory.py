@@ -13,6 +13,7 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import pytest
@@ -43,35 +44,29 @@ def leave(folder: Path) -> Callable[[str], Path]:
     return leave_file
 
 
-LEFT = [
+LEFT = {  # each a group of its own
     "fastdds_0123456789abcdef",
-    "fastdds_0123456789abcdef_el",
-    "fastrtps_0123456789abcdef",
-    "fastrtps_0123456789abcdef_el",
+    "fastdds_1123456789abcdef_el",
+    "fastrtps_2123456789abcdef",
+    "fastrtps_3123456789abcdef_el",
     "fastdds_port7411",
-    "fastdds_port7411_el",
-    "fastdds_port7411_sl",
-    "sem.fastdds_port7411_mutex",
-    "sem.fastrtps_port7411_mutex",
+    "fastdds_port7412_el",
+    "fastdds_port7413_sl",
+    "sem.fastdds_port7414_mutex",
+    "sem.fastrtps_port7415_mutex",
     "fast_datasharing_01.0f.bd_0.0.1.3",
     "lttng-ust-wait-6-0",
-]
+}
+OTHERS = {"psm_1", "sem.other", "fastdds_12_x", "fastdds_xyz", "my_fastdds_12", "lttng"}
 
 
-@pytest.mark.parametrize("pattern", LEFT)
-def test_what_nobody_uses_goes(leave: Callable[[str], Path], pattern: str) -> None:
-    path = leave(pattern)
-    assert path.name in shared_memory.sweep()
-    assert not path.exists()
-
-
-@pytest.mark.parametrize(
-    "pattern", ["psm_1", "sem.other", "fastdds_12_x", "fastdds_xyz", "my_fastdds_12", "lttng"]
-)
-def test_what_is_not_ros_stays(leave: Callable[[str], Path], pattern: str) -> None:
-    path = leave(pattern)
-    assert path.name not in shared_memory.sweep()
-    assert path.exists()
+def test_what_nobody_uses_goes_and_what_is_not_ros_stays(
+    folder: Path, leave: Callable[[str], Path]
+) -> None:
+    for name in LEFT | OTHERS:
+        leave(name)
+    assert set(shared_memory.sweep()) == LEFT
+    assert set(os.listdir(folder)) == OTHERS
 
 
 @pytest.mark.parametrize("used", ["fastdds_ab", "fastdds_ab_el"])
@@ -234,10 +229,10 @@ def test_a_live_node_survives_and_a_killed_one_is_swept(
         client = make_node(ros_domain).client("/left", SET_BOOL)
         wait_for(client.available, "discovery")
         answers: list[bytes] = []
-        for _ in range(5):
+        for _ in range(2):
             assert not theirs & set(shared_memory.sweep())
             client.call(b"\x00\x01\x00\x00\x01", answers.append)
-        wait_for(lambda: len(answers) == 5, "responses while sweeping")
+        wait_for(lambda: len(answers) == 2, "responses while sweeping")
     finally:
         process.kill()
         process.wait()
@@ -245,6 +240,22 @@ def test_a_live_node_survives_and_a_killed_one_is_swept(
     left = theirs & set(os.listdir(shared_memory.FOLDER)) - shared_memory.names_in_use()
     assert left == set()
     assert theirs - _names_of(os.getpid())
+
+
+def test_ports_are_looked_at_when_one_goes_and_not_for_the_files_beside_it(
+    leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those beside it go with each ROS process of the machine, of whatever domain."""
+    looks: SimpleQueue[None] = SimpleQueue()
+    monkeypatch.setattr(shared_memory, "reopen_ports", lambda: looks.put(None))
+    left = [leave(f"fastdds_port7411{beside}") for beside in ("_el", "_sl", "")]
+    watch = shared_memory.PortWatch()
+    looks.get(timeout=LIMIT_S)
+    for path in left:
+        path.unlink()
+    looks.get(timeout=LIMIT_S)
+    watch.close()
+    assert looks.empty()
 
 
 def _other_node(domain: int) -> subprocess.Popen[str]:
