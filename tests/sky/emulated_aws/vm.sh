@@ -63,7 +63,9 @@ exec ip netns exec "$name" unshare --mount --pid --fork --kill-child --uts \
         --add-runtime here=/usr/local/sbin/runc-here --default-runtime here \
         --insecure-registry 10.66.0.1:5000 >var/log/dockerd.log 2>&1 &
     fi
+    # How a VM that ends itself finds AWS. And the niceness of Ray would put it behind all that runs on
+    # this machine, not behind what runs on it.
     exec env -i PATH="$path" \
       chroot . /usr/sbin/sshd -D -e -o UsePAM=no -o PidFile=/run/sshd.pid \
-      -o SetEnv=AWS_ENDPOINT_URL=http://10.66.0.1:5566  # where a VM that ends itself finds AWS
+      -o "SetEnv=AWS_ENDPOINT_URL=http://10.66.0.1:5566 RAY_worker_niceness=0"
   ' vm "$disk" "$image" "$host_root" "$user" "$key" "$address" "$first" "$@"
