@@ -46,11 +46,22 @@ def without_descriptors(folder: Path, pids: Sequence[int]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def read_only(folder: Path, pids: Sequence[int]) -> Iterator[None]:
-    """Lay the folder over itself, read-only: what is open stays so, nothing new is."""
-    subprocess.run(["mount", "--bind", str(folder), str(folder)], check=True)
-    subprocess.run(["mount", "-o", "remount,bind,ro", str(folder)], check=True)
+    """Lay the folder over itself, read-only: what is open stays so, nothing new is.
+
+    It is made read-only aside, where nobody writes: else the kernel may find it busy.
+    """
+    aside = folder.with_name(f"{folder.name}-aside")
+    aside.mkdir()
+    for command in (
+        ["mount", "--bind", folder, aside],
+        ["mount", "-o", "remount,bind,ro", aside],
+        ["mount", "--bind", aside, folder],
+        ["umount", aside],
+    ):
+        subprocess.run(command, check=True)
+    aside.rmdir()
     yield
-    subprocess.run(["umount", str(folder)], check=True)
+    subprocess.run(["umount", folder], check=True)
 
 
 @contextlib.contextmanager
