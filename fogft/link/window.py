@@ -225,8 +225,6 @@ class BatchBuffer:
 
     def take(self) -> list[OpenAttempt]:
         """Return all that is held, in order."""
-        if not self._attempts:  # the usual case, without the lock
-            return []
         with self._lock:
             return self._take()
 

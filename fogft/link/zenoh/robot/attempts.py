@@ -193,7 +193,8 @@ class Attempts:
 
     def send(self) -> None:
         """Send attempts offered with `more`. Never blocks: they are small and have credit."""
-        self._send_together(self._batch.take())
+        if self._batch:
+            self._send_together(self._batch.take())
 
     def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
         if len(attempts) < 2 or self._flow.thin:  # there, each is compressed

@@ -116,26 +116,22 @@ class ZenohLink:
 
     def send(self) -> None:
         """Flush requests that were offered with `more`. Never blocks."""
-        live = self._live
-        if live is not None:
-            live.attempts.send()
-        for retiring in tuple(self._retiring):  # a moment ago it was the live one
-            retiring.attempts.send()
+        for connection in (self._live, *self._retiring):  # a moment ago it was the live one
+            if connection is not None:
+                connection.attempts.send()
 
     def forget(self, request_id: bytes) -> None:
         """Free the window of a request whose answer is no longer wanted."""
-        live = self._live
-        if live is not None:
-            live.attempts.forget(request_id)
-        for retiring in tuple(self._retiring):
-            retiring.attempts.forget(request_id)
+        for connection in (self._live, *self._retiring):
+            if connection is not None:
+                connection.attempts.forget(request_id)
 
     def flush(self) -> None:
-        """Send cancellations for forgotten, unanswered requests."""
-        self.send()
-        live = self._live
-        if live is not None:
-            live.attempts.flush()
+        """Send what waits to be sent, and cancellations for forgotten, unanswered requests."""
+        for connection in (self._live, *self._retiring):
+            if connection is not None:
+                connection.attempts.send()
+                connection.attempts.flush()
 
     def status(self) -> LinkStatus:
         """Return a snapshot."""
