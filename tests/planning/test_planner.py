@@ -119,11 +119,19 @@ def test_only_location_left_is_used_after_a_loss() -> None:
     assert launches(world) == ["1.2"]
 
 
-def test_silent_replica_is_replaced_while_another_answers() -> None:
-    """Silence past `replace_after_s` is replaced, new before old."""
-    world = World(spec(2)).having(replica(0), replica(1, state="silent", silent_s=16))
+@pytest.mark.parametrize("setting_up", [False, True])
+def test_silent_replica_is_replaced_while_another_answers(setting_up: bool) -> None:
+    """Silence past `replace_after_s` is replaced, new before old.
+
+    So is one of a cloud that has not told since that its set-up is over; that alone is no reason.
+    """
+    parts = [replica(0), replica(1, state="silent", silent_s=16, age_s=5000)]
+    parts = [replace(p, machine=replace(p.machine, setting_up=setting_up)) for p in parts]
+    world = World(spec(2)).having(*parts)
     assert launches(world) == ["1.2"]
     assert ends(world) == []
+    unknown = replace(world, links=None)
+    assert (launches(unknown), ends(unknown)) == ([], [])
 
 
 def test_briefly_silent_replica_is_left_alone() -> None:

@@ -252,7 +252,8 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
         return Verdict.FAILED, machine.failure or Reason(Cause.ERROR)
     if machine.notice:
         return Verdict.LEAVING, Reason(Cause.NOTICE)
-    if machine.setting_up and not serving:
+    ever_ready = record is not None and record.first_ready_at is not None
+    if machine.setting_up and not serving and not ever_ready:
         if now - _accepted_at(machine, record, now) > SETUP_LIMIT_S:
             return Verdict.FAILED, _timeout(Cause.NOT_SET_UP, SETUP_LIMIT_S)
         return Verdict.GOOD, None

@@ -164,8 +164,7 @@ class Proof:
         with trouble:
             end = time.monotonic() + seconds
             while time.monotonic() < end:
-                assert {*self.pool.replicas()} == {self.replica}, self.pool.status()
-                assert not self.pool.others(self.replica)
+                assert self.pool.others("") == {self.replica}, self.pool.status()
                 pause.wait(1.0)
             print(self.pool.status()["notes"], flush=True)
 
@@ -185,11 +184,11 @@ class Proof:
         print(f"          asked in vain {Broken.asked} times")
         assert Broken.asked > 5
         with step("... and is well again, until the pool says so"):
-            until("no note is left", lambda: not self.pool.status()["notes"])
+            until("it is whole, and no note is left", self.is_well)
         with step("SkyPilot's API server hangs"):
             self.through(hangs(), HANGS_S)
         with step("... and goes on, until the pool says so"):
-            until("no note is left", lambda: not self.pool.status()["notes"])
+            until("it is whole, and no note is left", self.is_well)
         LOGIN.lasts(-60)
         self.pool.fogft("scale", "up", "1")
         with step("the login has ended, and another replica is wanted"):
@@ -208,11 +207,14 @@ class Proof:
         assert not running()
         assert not list((HOME / "pools").glob("*"))
 
+    def is_well(self) -> bool:
+        return self.pool.whole(1) and not self.pool.status()["notes"]
+
     def through_refusals(self) -> None:
         """The one replica serves on, and the pool says why there is no other."""
 
         def told() -> str:
-            assert self.replica in self.pool.replicas(), self.pool.status()
+            assert self.replica in self.pool.others(""), self.pool.status()
             events = self.pool.status()["events"]
             reasons = [(event["reason"] or {}).get("words", "") for event in events]
             notes = [str(note) for note in self.pool.status()["notes"]]

@@ -109,6 +109,8 @@ def up_and_left(pool: Pool) -> subprocess.Popen[bytes]:
 
 
 def of_pool(pool: Pool) -> list[dict[str, Any]]:
+    if not (pool.state / "status.json").exists():
+        return []
     uid = pool.status()["uid"]
     return [i for i in running() if i["labels"]["fogft-pool"] == uid]
 
@@ -132,6 +134,13 @@ def kill(pool: Pool) -> None:
     os.kill(pool.pid("manager"), signal.SIGTERM)
 
 
+def leave(pool: Pool, waiting: subprocess.Popen[bytes]) -> None:
+    """End a manager for good, and the `up` that waits for its pool."""
+    kill(pool)
+    waiting.kill()
+    waiting.wait()
+
+
 def main() -> int:
     make_impatient(*OF_ALL)
     alone, hangs, unborn = Pool(ALONE), Pool(HANGS), Pool(UNBORN)
@@ -146,8 +155,7 @@ def main() -> int:
     waiting = up_and_left(hangs)
 
     def hanging() -> bool:
-        mine = of_pool(hangs) if (hangs.state / "status.json").exists() else []
-        return any((disk_of(i) / "home/ubuntu/setup-begun").exists() for i in mine)
+        return any((disk_of(i) / "home/ubuntu/setup-begun").exists() for i in of_pool(hangs))
 
     with step("`up` whose `setup` hangs, until it does"):
         until("it hangs", hanging)
@@ -156,16 +164,14 @@ def main() -> int:
     assert result["answered"] == result["requests"] > 10, result
     assert result["failed"] == result["wrong"] == result["twice"] == 0, result
     assert len(running()) == 2
+    leave(hangs, waiting)
     make_impatient(*OF_UNBORN)
-    also_waiting = up_and_left(unborn)
+    waiting = up_and_left(unborn)
     with step("`up` of a third pool, until its VM exists"):
-        until("it exists", lambda: len(running()) == 3)
+        until("it exists", lambda: of_pool(unborn))
     (newborn,) = of_pool(unborn)
-    for pool in (unborn, hangs, alone):
-        kill(pool)
-    for one in (also_waiting, waiting):
-        one.kill()
-        one.wait()
+    leave(unborn, waiting)
+    kill(alone)
     kill_server()
     with step("manager and API server are gone: until the VM that hangs has ended itself"):
         until("it is gone", lambda: not of_pool(hangs))
