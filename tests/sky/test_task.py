@@ -198,11 +198,12 @@ def vm(tmp_path: Path) -> Path:
 
 
 def shell(home: Path, script: str, **environ: str) -> subprocess.CompletedProcess[str]:
-    """Run a script as SkyPilot does: its shell is interactive, and so knows of stopped children."""
-    file = home / "script"
+    """Run a script as SkyPilot does: its shells are interactive, so know of stopped children."""
+    file, outer = home / "script", home / "outer-script"
     file.write_text(script)
+    outer.write_text(f"bash --norc -i {file}\n")
     return subprocess.run(
-        ["bash", "--norc", "-i", file],
+        ["bash", "--norc", "-i", outer],
         cwd=home,
         env={
             "HOME": str(home),
