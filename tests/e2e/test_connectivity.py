@@ -104,19 +104,19 @@ def test_a_pool_behind_gateways_whose_replicas_dial_out(pool, machines, ros_doma
     wait(lambda: len(up_of(report(pool), "gateways")) == len(GATEWAYS))
     wait(lambda: all(ready(machines[name].report()) == {0, 1, 2000} for name in GATEWAYS))
     wait(lambda: ready(report(pool)) == {0, 1, 2000})
-    client = pool.client(120, 25)
-    wait(lambda: sum(passed(machines[name]) for name in GATEWAYS) > 25)
+    client = pool.client(120, 10)
+    wait(lambda: sum(passed(machines[name]) for name in GATEWAYS) > 10)
     used = max(GATEWAYS, key=lambda name: passed(machines[name]))
     (other,) = set(GATEWAYS) - {used}
     before = passed(machines[other])
     machines[used].kill()
-    wait(lambda: passed(machines[other]) > before + 25)
+    wait(lambda: passed(machines[other]) > before + 10)
     wait(lambda: {link["through"] for link in up_of(report(pool), "links")} == {other})
     wait(lambda: len(up_of(report(pool), "gateways")) == 1)
     tree = wait(lambda: (tree := drawn(pool)).count(" up ") == 1 and tree).splitlines()
     wait(lambda: phases(pool.status()) == {0: "ready", 1: "ready", 2000: "ready"})
     result = client.finish()
-    assert result["requests"] > 50
+    assert result["requests"] > 20
     assert result["failed"] == result["wrong"] == result["twice"] == 0, result
     assert tree[0].startswith("robot ")
     doors = [line for line in tree if "── gateway " in line]  # long lines are folded

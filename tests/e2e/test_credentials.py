@@ -40,7 +40,7 @@ def generations(pool: Pool) -> list[str]:
 def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
     """Both robots use both replicas; then keys change twice over, and ada is shut out."""
     pool.wait(lambda: [link["state"] for link in links(ada)] == ["up", "up"])
-    first = pool.client(120, 10)
+    first = pool.client(120, 5)
     second = Client(ada.environ, 6, 10, 12.0)
     result = second.result()
     assert result["requests"] > 40
@@ -54,7 +54,7 @@ def test_two_robots_new_keys_and_a_revocation_lose_no_request(pool, ada):
     pool.fogft("credentials", "rotate", "replica")
     pool.wait(lambda: generations(pool) == ["2", "2"])
     result = first.finish()
-    assert result["requests"] > 100  # ten a second, for as long as all this takes
+    assert result["requests"] > 50  # five a second, for as long as all this takes
     assert flawless(result), result
     states = [line.split()[:3] for line in pool.fogft("credentials", "list").splitlines()[1:]]
     assert ["robot", "ada.1", "revoked"] in states

@@ -50,7 +50,7 @@ def test_a_pool_moves_under_load_and_is_managed_by_one_machine_only(pool: Pool) 
     given = ("--passphrase-file", str(secret))
     before = machines(pool)
     epoch = json.loads((pool.folder / "home/pools/e2e/lease.json").read_text())["epoch"]
-    client = pool.client(300, 10)
+    client = pool.client(300, 5)
 
     assert pool.fogft("export", "e2e", str(file), *given).strip() == str(file)
     assert b"e2e" in file.read_bytes()

@@ -85,7 +85,7 @@ def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     """
     pool.write(replicas=1)
     pool.up()
-    client = pool.client(120, 10)
+    client = pool.client(120, 5)
     pool.fogft("scale", "up", "1", "--wait")
     assert pool.ready() == 2
 

@@ -46,7 +46,7 @@ def test_a_version_that_crashes_is_rolled_back_and_the_next_one_taken_with_an_up
     pool.up()
     pool.wait(lambda: (pool.folder / "home" / "pools" / "e2e" / "good.yaml").exists())
     old = replicas(pool)
-    client, counting = pool.client(300, 10), Counting(pool)
+    client, counting = pool.client(300, 5), Counting(pool)
 
     write(pool, "bad 100", plan="no_such_service.py")
     said = pool.fogft("up", str(pool.file), "--yes", ok=False)

@@ -57,7 +57,7 @@ def test_hostile_parties_cost_a_pool_nothing_but_their_own_machine(
     pool.up()
     eve = Machine(pool, "robot", "eve")
     whole, usd_per_hour = _generations(pool), _usd_per_hour(pool)
-    client = pool.client(200.0, 10.0, 20.0)
+    client = pool.client(200.0, 5.0, 20.0)
     with ExitStack() as attacked:
         attacks = [
             attacked.enter_context(_attacked(pool, eve, one)) for one in pool.status()["replicas"]

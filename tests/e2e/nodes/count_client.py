@@ -35,5 +35,5 @@ while asking:
     future = client.call_async(SetBool.Request(data=True))
     rclpy.spin_until_future_complete(node, future, timeout_sec=12.0)
     answers.append(future.result().message if future.done() else None)
-    time.sleep(0.1)
+    time.sleep(0.2)
 print(json.dumps(answers), flush=True)
