@@ -22,6 +22,7 @@ from fogft.planning.placement import crowding
 
 # After the mark, the client proxy needs a moment to read it and to report what is in flight.
 DRAIN_SETTLE_S = 2.0
+DRAIN_LIMIT_S = 10.0
 
 
 @dataclass
@@ -51,7 +52,6 @@ def choose_endings(
     history: History,
     *,
     now: float,
-    drain_limit_s: float,
     dear_first: bool = False,
     held: Collection[ReplicaId] = (),
     first: Assessment | None = None,
@@ -71,9 +71,7 @@ def choose_endings(
     unwanted = [s for s in standing_in if s.unwanted]
     if surplus <= 0 and not machines.lost and first is None and not unwanted and spare <= 0:
         return Endings()
-    chooser = _Chooser(
-        wanted, (*machines.good, *machines.replaced, *standing_in), now, drain_limit_s
-    )
+    chooser = _Chooser(wanted, (*machines.good, *machines.replaced, *standing_in), now)
     if health.uplink_suspected or not health.links_known:
         if surplus > 0 or machines.lost or unwanted or spare > 0:
             chooser.out.notes.append(Reason(Cause.NOBODY_HEARD))
@@ -146,14 +144,11 @@ def _by_expendability(replicas: Iterable[Assessment], *, dear_first: bool) -> li
 
 
 class _Chooser:
-    def __init__(
-        self, wanted: int, working: Iterable[Assessment], now: float, drain_limit_s: float
-    ) -> None:
+    def __init__(self, wanted: int, working: Iterable[Assessment], now: float) -> None:
         self.out = Endings()
         self.counted_out = 0
         self._wanted = wanted
         self._now = now
-        self._drain_limit_s = drain_limit_s
         self._pillars = {s.id for s in working if s.serving}
 
     def end_lost(self, replica: Assessment, history: History) -> None:
@@ -205,6 +200,6 @@ class _Chooser:
         if replica.draining_since is None:
             return True
         age_s = self._now - replica.draining_since
-        if age_s >= self._drain_limit_s:
+        if age_s >= DRAIN_LIMIT_S:
             return False
         return age_s < DRAIN_SETTLE_S or link.in_flight > 0

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
-from fogft.planning.listing import Listing, Row, Scale, catalogue, without_offer
+from fogft.planning.listing import Listing, Row, without_offer
 from fogft.planning.observed.backoff import EVERYWHERE, Backoff
 from fogft.planning.observed.hazard import UNKNOWN, penalty
 
@@ -161,19 +161,3 @@ def _weighed(rows: Sequence[Row], hazards: Mapping[str, float]) -> tuple[Row, ..
         return tuple(rows)
     rest = [row for row in rows if not row.spot or row.location not in hazards]
     return tuple(sorted([*rest, *known], key=without_offer))
-
-
-def choose(
-    offers: Sequence[Offer],
-    *,
-    taken: Collection[Placement],
-    excluded: Collection[str] = (),
-    backing_off: Mapping[str, Backoff] | None = None,
-    avoid: Collection[str] = (),
-    budget_usd_per_hour: float | None = None,
-    scale: Scale | None = None,
-) -> Choice:
-    """Choose among offers once; see `Market`."""
-    listing = catalogue(offers).listing(None, None, excluded, scale or Scale())
-    market = Market(listing, backing_off=backing_off, avoid=avoid)
-    return market.choose(taken, budget_usd_per_hour=budget_usd_per_hour)

@@ -34,7 +34,6 @@ from fogft.planning.sizing import Size, size
 
 __all__ = ["Plan", "PlannedEnd", "PlannedLaunch", "plan"]
 
-DRAIN_LIMIT_S = 10.0
 # A plan is planned on again so often; two passes are what nearly every world needs.
 MOST_PASSES = 8
 
@@ -77,7 +76,6 @@ def plan(
     observed: Observed,
     history: History,
     *,
-    drain_limit_s: float = DRAIN_LIMIT_S,
     health: Health | None = None,
 ) -> Plan:
     """Plan changes that bring the pool closer to its spec, within the safety rules.
@@ -91,13 +89,10 @@ def plan(
         intent: What the user wants besides.
         observed: The world now, `observed.now` included.
         history: What happened before.
-        drain_limit_s: The longest that a replica to be ended is waited for.
         health: What `judge` makes of these very arguments, where that is known already.
     """
     health = health or judge(pool_uid, spec, observed, history)
-    decided = latest = plan_once(
-        spec, intent, observed, history, health=health, drain_limit_s=drain_limit_s
-    )
+    decided = latest = plan_once(spec, intent, observed, history, health=health)
     if observed.machines is None:
         return decided
     for _ in range(MOST_PASSES):
@@ -113,7 +108,7 @@ def plan(
             draining=decided.draining,
         )
         health = judge(pool_uid, spec, world, memory)
-        latest = plan_once(spec, intent, world, memory, health=health, drain_limit_s=drain_limit_s)
+        latest = plan_once(spec, intent, world, memory, health=health)
         is_done = not latest.launches and not latest.terminations
         is_done = is_done and set(latest.draining) == set(decided.draining)
         decided = decided._replace(
@@ -146,7 +141,6 @@ def plan_once(
     history: History,
     *,
     health: Health,
-    drain_limit_s: float,
 ) -> Plan:
     if observed.machines is None:
         known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
@@ -228,7 +222,6 @@ def plan_once(
                 health,
                 history,
                 now=observed.now,
-                drain_limit_s=drain_limit_s,
                 dear_first=bool(excess),
                 held=staying,
                 first=first if makes_room else None,

@@ -18,7 +18,8 @@ from fogft.model.groups import groups_of, with_spot
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.spec import PoolSpec
-from fogft.planning.placement import choose
+from fogft.planning.listing import Scale, catalogue
+from fogft.planning.placement import Market as Offered
 from fogft.planning.sizing import size
 from fogft.pool.manager.offers import ask
 from fogft.simulation.baselines import ActiveZones, InTurn, Naive, Search, Static
@@ -258,8 +259,9 @@ def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
     """Return a careful fixed placement of this many replicas."""
     chosen: list[Offer] = []
     taken: list[Placement] = []
+    market = Offered(catalogue(offers).listing(None, None, (), Scale()))
     for _ in range(count):
-        offer = choose(offers, taken=taken).offer
+        offer = market.choose(taken).offer
         if offer is not None:
             chosen.append(offer)
             taken.append(offer.placement)

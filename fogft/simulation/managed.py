@@ -15,13 +15,12 @@ from fogft.model.groups import is_stand_in
 from fogft.model.intent import Intent
 from fogft.model.replica import LinkReport, LinkState, MachinePhase, Membership, ReplicaId
 from fogft.model.spec import PoolSpec
-from fogft.planning.endings import DRAIN_SETTLE_S
+from fogft.planning.endings import DRAIN_LIMIT_S, DRAIN_SETTLE_S
 from fogft.planning.fallback import OFTEN_S, SETTLED_S, STAYS_S, losses_of_late
 from fogft.planning.observed import backoff, launches
 from fogft.planning.observed.hazard import EVERY_S, as_of
 from fogft.planning.observed.health import LONE_SILENCE_FACTOR
 from fogft.planning.observed.history import Event, History, compacted
-from fogft.planning.planner import DRAIN_LIMIT_S
 from fogft.planning.rollout import Trial
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager.reconciler import Reconciler, Tick

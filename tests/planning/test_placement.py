@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Collection, Sequence
+from typing import Any
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
+from fogft.planning.listing import Scale, catalogue
 from fogft.planning.observed.backoff import EVERYWHERE, Backoff
-from fogft.planning.placement import choose, crowding
+from fogft.planning.placement import Choice, Market, crowding
 
 placements = st.builds(
     Placement,
@@ -24,6 +27,20 @@ offers = st.lists(
     min_size=1,
     unique_by=lambda o: o.placement,
 )
+
+
+def choose(
+    offers: Sequence[Offer],
+    *,
+    taken: Collection[Placement],
+    excluded: Collection[str] = (),
+    budget_usd_per_hour: float | None = None,
+    **pauses: Any,
+) -> Choice:
+    listing = catalogue(offers).listing(None, None, excluded, Scale())
+    return Market(listing, **pauses).choose(taken, budget_usd_per_hour=budget_usd_per_hour)
+
+
 REST = Backoff(until=1.0, failures=1, cause=Cause.CAPACITY)
 
 

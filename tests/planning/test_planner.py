@@ -219,7 +219,7 @@ def test_drain_replaces_new_before_old() -> None:
 def test_draining_ends_when_idle_or_after_its_limit(
     drained_s: float, in_flight: int, expected: list[str]
 ) -> None:
-    """After the mark the proxy gets a moment; then idle ends it, and `drain_limit_s` at last."""
+    """After the mark the proxy gets a moment; then idle ends it, and `DRAIN_LIMIT_S` at last."""
     world = World(spec(1)).having(
         replica(0, at=A), replica(1, drained_s=drained_s, in_flight=in_flight)
     )

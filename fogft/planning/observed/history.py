@@ -365,6 +365,7 @@ class History:
 
 
 YOUNG_S = 60.0
+KEPT_S = 86_400.0
 
 
 def died_young(record: Record, event: Event) -> bool:
@@ -373,20 +374,16 @@ def died_young(record: Record, event: Event) -> bool:
 
 
 def compacted(
-    events: Iterable[Event],
-    now: float,
-    keep_s: float = 86_400.0,
-    *,
-    history: History | None = None,
+    events: Iterable[Event], now: float, *, history: History | None = None
 ) -> list[Event]:
     """Drop events that no decision needs any more.
 
-    Kept whole: launches that are open, or to which something happened within `keep_s`.
+    Kept whole: launches that are open, or to which something happened within `KEPT_S`.
     Kept in part: the latest launch of each slot, so that generations stay used; the latest failed
     launches of a version, and one that was ready, so that it is known what was given up. Of a
     kept launch's comings and goings of readiness the first READY and the last two stay. That the
     clock was set is never forgotten, that the machine slept only with all that was before. What
-    no decision reads (`TOLD_ONLY`) stays for `keep_s`.
+    no decision reads (`TOLD_ONLY`) stays for `KEPT_S`.
 
     Args:
         history: What follows from these very events, where that is known already.
@@ -399,7 +396,7 @@ def compacted(
     for index, event in reversed(list(enumerate(events))):
         if event.kind in MOVING:
             later_s += event.by_s
-        elif now - (event.at + later_s) < keep_s:
+        elif now - (event.at + later_s) < KEPT_S:
             if event.kind in TOLD_ONLY:
                 told.add(index)
             else:
