@@ -336,7 +336,7 @@ class MigrationSpec:
     """When a replica moves: for a score lower by `gain`, at least `stay_s` after it was ready."""
 
     gain: float = 0.3
-    stay_s: float = 3600.0
+    stay_s: float = 600.0
 
 
 def _robot_at(written: Any) -> tuple[float, float]:

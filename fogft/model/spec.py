@@ -299,9 +299,9 @@ class PoolSpec:
     )
     max_surge: int = key(
         Whole(0, 4, "machines"),
-        "Extra machines during a replacement. With 0, a machine that still serves is replaced "
-        "only if the file changes, and ends before its successor starts.",
-        default=1,
+        "Extra machines during a replacement, or while none serves. With 0, a machine that still "
+        "serves is replaced only if the file changes, and ends before its successor starts.",
+        default=3,
     )
     max_usd_per_hour: float | None = key(
         Number(MAX_USD_PER_HOUR, "US dollars per hour"),

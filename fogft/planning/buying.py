@@ -246,11 +246,16 @@ class Buyer:
         )
         return on_demand >= group.on_demand.base
 
-    def places(self, without: Assessment | None) -> list[Placement]:
-        """Return the current and planned placements of the replicas."""
+    def places(self, without: Assessment | None, *, lasting: bool = False) -> list[Placement]:
+        """Return the current and planned placements of the replicas.
+
+        Args:
+            lasting: Not of those that stand in, which go again.
+        """
         stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
-        taken = [s.placement for s in stay]
-        return taken + [launch.offer.placement for launch in self.launches]
+        taken = [(s.slot, s.placement) for s in stay]
+        taken += [(launch.slot, launch.offer.placement) for launch in self.launches]
+        return [place for slot, place in taken if not (lasting and is_stand_in(slot))]
 
     def price(self, replica: Assessment) -> float:
         """Return a machine's price: today's if known, else that of its order."""
@@ -263,7 +268,7 @@ class Buyer:
         why = old.why if old is not None else None
         if old is not None and (why is None or why.place_at_fault):
             avoid.add(old.placement.location)
-        taken = self.places(old)
+        taken = self.places(old, lasting=not need.stands_in)
         spot = False if need.stands_in else self.kind(need.group, old)
         moves = why is not None and why.is_move
         market = self.market(need.group, spot, at_leisure=moves)

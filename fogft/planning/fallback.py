@@ -5,10 +5,10 @@ Where a group has `fallback`, on-demand machines in slots of their own stand in.
 the moment that a spot replica is lost, is noticed or is refused, beside the order of
 another spot machine, and end once enough others have been ready for `SETTLED_S`.
 
-Once all are lost, as many more than are wanted boot as `max_surge` allows, until the first of
-them serves. While an on-demand machine serves, which nobody takes away, spot is asked for alone,
-and another one stands in only once that was refused. Nor is a slot short whose first machine is
-still booting.
+Once all are lost, more than are wanted boot, as `max_surge` allows, until the first of them
+serves; two in place of a lone one, since they cost the more. While an on-demand machine serves,
+which nobody takes away, spot is asked for alone, and another one stands in only once that was
+refused. Nor is a slot short whose first machine is still booting.
 
 Owns: who stands in, and how many are missing.
 Not here: where they are bought (`buying`) and the two steps of an ending (`endings`).
@@ -28,9 +28,10 @@ from fogft.planning.observed.history import History
 SETTLED_S = 20.0
 # Under a cap that has no room for both, a stand-in makes way for a spot machine after so long.
 STAYS_S = 600.0
-# Where as many spot machines as are wanted were lost within so long, one is on demand: losses come
-# in clusters, and without one all that are left may go at once.
-OFTEN_S = 2700.0
+# Where so many spot machines were lost within so long, one is on demand: losses come in clusters,
+# and without one all that are left may go at once.
+OFTEN = 2
+OFTEN_S = 1800.0
 
 
 def stand_ins(machines: Classification) -> list[Assessment]:
@@ -41,13 +42,13 @@ def stand_ins(machines: Classification) -> list[Assessment]:
 def held(group: Group, wanted: int, history: History, now: float) -> int:
     """Return how many stand-ins replace spot machines, for which no search is made then.
 
-    One, where as many were lost within `OFTEN_S` as are wanted. None in place of a lone one: that
-    would be to give up spot machines.
+    One, where `OFTEN` were lost within `OFTEN_S`. None in place of a lone one: that would be to
+    give up spot machines.
     """
     spot = wanted - group.on_demand.base
     if not group.on_demand.fallback or spot < 2:
         return 0
-    return int(len(losses_of_late(history, now)) >= spot)
+    return int(len(losses_of_late(history, now)) >= OFTEN)
 
 
 def losses_of_late(history: History, now: float) -> list[float]:
@@ -119,7 +120,7 @@ def spare(
 
 def _racing(wanted: int, surge: int, standing_in: Sequence[Assessment]) -> int:
     """Return how many more boot where none serves yet: of many at once the fastest decides."""
-    return surge if wanted > 1 and not any(s.serving for s in standing_in) else 0
+    return 0 if any(s.serving for s in standing_in) else min(surge, 2 * wanted - 1)
 
 
 def has_served(replica: Assessment, for_s: float, now: float) -> bool:

@@ -62,6 +62,12 @@ def test_when_all_are_lost_more_stand_ins_than_are_wanted_boot_until_the_first_s
     assert {end.id.slot for end in later.terminations} == {*slots[2:]}
 
 
+def test_in_place_of_a_lone_one_two_stand_ins_boot_beside_another_spot_machine():
+    of = replace(MIXED, replicas=1, max_surge=3)
+    lost = world(replica(0, of=of, state="noticed"), of=of)
+    assert ordered(lost) == [(STAND_INS, False), (STAND_INS + 1, False), (0, True)]
+
+
 def test_while_an_on_demand_machine_serves_spot_is_asked_first():
     """Nobody takes it away, so one more loss is not urgent; a refusal is."""
     three = replace(MIXED, replicas=3, on_demand=OnDemandSpec(1, fallback=True))
@@ -183,10 +189,10 @@ def test_of_equal_places_no_name_is_preferred():
 
 @pytest.mark.parametrize("wanted", [2, 4])
 @pytest.mark.parametrize("is_held", [False, True])
-def test_where_as_many_as_are_wanted_were_lost_a_stand_in_is_held_in_place_of_one(wanted, is_held):
-    losses = wanted if is_held else wanted - 1
+def test_where_two_were_lost_lately_a_stand_in_is_held_in_place_of_one(wanted, is_held):
+    losses = 1 + is_held
     gone = [
-        Event(NOW - 600 * age_of, kind, 7, age_of + 1, PLACES[2].location)
+        Event(NOW - 400 * age_of, kind, 7, age_of + 1, PLACES[2].location)
         for age_of in range(losses)
         for kind in (EventKind.LAUNCH, EventKind.GONE)
     ]

@@ -224,7 +224,7 @@ MISTAKES = {
     "truth value for a number": (
         pool("max_surge: yes"),
         "pool.yaml:4: fogft.max_surge: must be a whole number, not the boolean `true`",
-        "write a whole number from 0 to 4; the default is 1",
+        "write a whole number from 0 to 4; the default is 3",
     ),
     "nothing for a number": (
         pool("replicas:"),
@@ -311,7 +311,7 @@ MISTAKES = {
     "too large a surge": (
         pool("max_surge: 5"),
         "pool.yaml:4: fogft.max_surge: must be from 0 to 4, not `5`",
-        "write a whole number from 0 to 4; the default is 1",
+        "write a whole number from 0 to 4; the default is 3",
     ),
     "negative time-out": (
         pool(services="[{name: a, type: a/srv/A, timeout_s: -1}]"),

@@ -169,7 +169,7 @@ class Trial(NamedTuple):
     days: float = 30.0
     seed: int = 0
     cap: float | None = None
-    surge: int = 1
+    surge: int = 3
 
 
 def run(trial: Trial) -> Outcome:
@@ -216,7 +216,7 @@ def main() -> None:
     parser.add_argument("--days", type=float, default=30.0)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--cap", type=float)
-    parser.add_argument("--surge", type=int, default=1)
+    parser.add_argument("--surge", type=int, default=3)
     given = parser.parse_args()
     trials = [
         Trial(
