@@ -7,13 +7,16 @@ whose connections would then be looked for there: in vain.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
-import sys
+import tempfile
 from pathlib import Path
 
 import pytest
+
+from tests.link import forked
 
 ROOT = Path(__file__).parents[1]
 _INSIDE = "FOGFT_TEST_IN_OWN_PROCESS"
@@ -35,19 +38,19 @@ def run(item: pytest.Item) -> bool:
     marker = item.get_closest_marker("timeout")
     limit_s = float(marker.args[0]) if marker else _USUAL_LIMIT_S
     stacks = f"faulthandler_timeout={limit_s - 2 * _TO_TELL_S}"
-    try:
-        done = subprocess.run(
-            [sys.executable, "-m", "pytest", "-o", stacks, *command],
-            cwd=ROOT,
-            env={**kept, _INSIDE: item.nodeid},
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=limit_s - _TO_TELL_S,
-        )
-    except subprocess.TimeoutExpired as hung:
-        told = "\n".join((said or b"").decode() for said in (hung.stdout, hung.stderr))
-        pytest.fail(f"hangs in a process of its own:\n{told}", pytrace=False)
-    if done.returncode or "\n1 passed" not in done.stdout:
-        pytest.fail(f"in a process of its own:\n{done.stdout}\n{done.stderr}", pytrace=False)
+    with tempfile.TemporaryFile("w+") as said:
+        given = json.dumps([["-o", stacks, *command], {**kept, _INSIDE: item.nodeid}])
+        process = forked.Forked("tests.own_process_forked", [given], said.fileno())
+        process.stdin.close()
+        process.stdout.close()
+        try:
+            code = process.wait(limit_s - _TO_TELL_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            said.seek(0)
+            pytest.fail(f"hangs in a process of its own:\n{said.read()}", pytrace=False)
+        said.seek(0)
+        told = said.read()
+    if code or "\n1 passed" not in told:
+        pytest.fail(f"in a process of its own:\n{told}", pytrace=False)
     return True
