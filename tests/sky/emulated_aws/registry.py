@@ -109,7 +109,7 @@ def serve(images: Images, address: str, port: int) -> None:
             name = digest(read(path))
             images.blobs[name] = path
             images.tags[self.path] = name
-            return self._said(201)
+            return self._said(201, **{"docker-content-digest": name})
 
         def _upload(self) -> Path:
             number = urllib.parse.urlparse(self.path).path.rsplit("/", 1)[1]
