@@ -15,7 +15,7 @@ from tests.fuzz.state_files import read_by, state_files
 from tests.fuzz.targets import Target
 from tests.nightly import by_day
 
-CASES = by_day(12, at_night=2000)
+CASES = by_day(6, at_night=2000)
 IN_PLACE: dict[str, bytes] = {
     "nested too deep": b"[" * 200_000,
     "not UTF-8": b'{"\xe9": "\xff"}',
