@@ -428,7 +428,7 @@ def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: P
 @needs("skypilot")
 def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, Any, Any]):
     """With no network the catalogue's zones have ids, not names: then the region is the offer."""
-    installed, _, _ = real
+    installed, _, sky = real
 
     def sold(**resources: Any) -> Sale:
         return installed.offers(task.as_launched(resources))
@@ -445,6 +445,15 @@ def test_offers_come_from_the_catalogue(home: Path, real: tuple[InstalledSky, An
     assert {offer.as_of for offer in found.offers} == {catalogue.stat().st_mtime}
     steady = sold(infra="aws/us-west-2", cpus="4", use_spot=False).offers
     assert {(o.placement.instance, o.placement.spot) for o in steady} == {("m6i.xlarge", False)}
+    for spot in (True, False):
+        everywhere = sold(infra="aws", cpus="2", use_spot=spot).offers
+        assert {o.placement.region for o in everywhere} == {"us-east-1", "us-west-2", "eu-west-1"}
+        for offer in everywhere:
+            place = offer.placement
+            asked = sky.Resources(
+                cloud=sky.AWS(), instance_type=place.instance, region=place.region, use_spot=spot
+            )
+            assert offer.usd_per_hour == asked.get_cost(3600), "SkyPilot's own price"
     nothing = sold(infra="aws", cpus="1000+")
     assert (nothing.offers, nothing.left_out) == ([], {"aws": "nothing there matches"})
     with pytest.raises(RefusedError, match="cpus"):
