@@ -284,17 +284,23 @@ for _ in sys.stdin:
 @pytest.mark.ros
 @needs("fastdds")
 def test_a_port_that_a_successor_removed_is_known_by_its_bytes(ros_domain: int) -> None:
-    """They are Fast DDS's own: nothing of them is documented."""
+    """They are Fast DDS's own: nothing of them is documented.
+
+    Now and then Fast DDS finds out first, when it writes just after the port's owner was killed.
+    """
     environ = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
     command, pipe = [sys.executable, "-c", CALLER], subprocess.PIPE
     killed = _other_node(ros_domain)
     caller = subprocess.Popen(command, env=environ, stdin=pipe, stdout=pipe, text=True)
     try:
         assert _broken(caller) == 0
-        killed.kill()
-        killed.wait()
-        killed = _other_node(ros_domain)
-        assert _broken(caller) > 0
+        found = 0
+        for _ in range(3):
+            killed.kill()
+            killed.wait()
+            killed = _other_node(ros_domain)
+            found = found or _broken(caller)
+        assert found > 0
     finally:
         for process in (killed, caller):
             process.kill()
