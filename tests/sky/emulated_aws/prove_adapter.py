@@ -118,7 +118,8 @@ class Proof:
             until("a answers", lambda: get(first.endpoint or ""))
             until("b answers", lambda: get(second.endpoint or ""))
         with step("... until SkyPilot says so, too"):  # a launch under way keeps its own machine
-            until("both are set up", lambda: not any(m.setting_up for m in self.cloud.machines(UID)))
+            listed = self.cloud.machines
+            until("both are set up", lambda: not any(one.setting_up for one in listed(UID)))
         # What the VM got: the user's set-up, fogft from our wheel, the replica's files and no more.
         assert "hello" in get(first.endpoint, "/setup-ran")
         assert "Usage: fogft" in get(first.endpoint, "/fogft-help")
