@@ -94,6 +94,7 @@ NEEDS = {
     "litert": Need(_installed("ai_edge_litert"), "scripts/setup vision"),
     "matplotlib": Need(_installed("matplotlib"), "scripts/setup plot"),
     "mkdocs": Need(_installed("mkdocs", "material"), "scripts/setup docs"),
+    "uv": Need(_installed("uv"), "scripts/test-sky --quick"),
     "moto": Need(_installed("moto", "boto3", "flask"), "scripts/test-sky --quick"),
     "mujoco": Need(_installed("mujoco"), "scripts/setup vision"),
     "namespaces": Need(can_make_namespaces, "root and `ip`, for network namespaces"),

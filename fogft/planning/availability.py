@@ -151,7 +151,7 @@ def full_together(sold: Collection[Placement], assumed: Assumption) -> float:
     """
     share = assumed.no_room
     full = joint_unavailability([(place, share) for place in sold], assumed.correlation)
-    if not sold or not 0 < share < 1 or not full:
+    if not sold or not 0 < share < 1 or not 0 < full < 1:
         return full if sold else 0.0
     lasts_s = assumed.spot_uptime_s * share / (1 - share) * math.log(share) / math.log(full)
     return min(1.0, full * (1 + assumed.recovery_s / lasts_s))

@@ -60,6 +60,11 @@ def losses_of_late(history: History, now: float) -> list[float]:
     ]
 
 
+def surge_of(group: Group, wanted: int, surge: int) -> int:
+    """Return how many more boot while nobody serves: none where stopped standbys start sooner."""
+    return 0 if group.on_demand.standbys >= wanted else surge
+
+
 def is_safe(machines: Classification) -> bool:
     """Whether a replica serves that cannot be preempted."""
     return any(s.serving and not s.placement.spot for s in (*machines.good, *machines.replaced))

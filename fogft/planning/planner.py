@@ -227,7 +227,12 @@ def plan_once(
                 first=first if makes_room else None,
                 standing_in=mine,
                 spare=fallback.spare(
-                    count, here, mine, observed.now, surge=spec.max_surge, held=kept
+                    count,
+                    here,
+                    mine,
+                    observed.now,
+                    surge=fallback.surge_of(group, count, spec.max_surge),
+                    held=kept,
                 ),
             )
         )
@@ -311,7 +316,8 @@ def _stand_ins_missing(
         mine = others.part(groups, group)
         first = sum(group_of(groups, slot) is group for slot in begun)
         wanted = count - first
-        for _ in range(fallback.missing(wanted, mine, here, history, surge=surge, safe=safe)):
+        more = fallback.surge_of(group, count, surge)
+        for _ in range(fallback.missing(wanted, mine, here, history, surge=more, safe=safe)):
             need = stand_in(group, used)
             used.add(need.slot)
             needs.append(need)

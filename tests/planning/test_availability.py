@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fogft.model.replica import Placement
@@ -131,6 +131,7 @@ def test_while_no_location_has_room_no_spot_machine_is_up():
 
 
 @given(places=st.lists(placements, min_size=1, max_size=6), another=placements, share=fractions)
+@example(places=[A], another=A, share=1.0 - 2**-53)  # two such are 1 by their rounding
 def test_another_location_never_hurts(places, another, share):
     assumed = Assumption(no_room=share)
     assert full_together([*places, another], assumed) <= full_together(places, assumed) + 1e-9

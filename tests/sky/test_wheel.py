@@ -15,6 +15,7 @@ import pytest
 
 from fogft.cloud.sky import wheel
 from fogft.errors import CloudError
+from tests.needs import needs
 
 METADATA = "Metadata-Version: 2.3\nName: fogft\nVersion: 0.1.0\n"
 WHEEL = "Wheel-Version: 1.0\nGenerator: hatchling\nRoot-Is-Purelib: true\nTag: cp311-none-any\n"
@@ -93,6 +94,7 @@ def test_without_an_installation_it_says_what_to_do(monkeypatch: pytest.MonkeyPa
     assert "pip install" in caught.value.hint
 
 
+@needs("uv")
 def test_without_an_index_it_tells_why_from_the_beginning(
     installed: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
