@@ -146,6 +146,9 @@ def test_bytes_of_another_shape_go_to_nobody(
         make().client("/arm/grasp", TYPE).call(b"\0\1\0", lambda _: None)
 
 
+TURN_S = 0.01
+
+
 class PlainClient:
     """A client of `rmw_zenoh` with its default queue of ten, and an executor that is slow.
 
@@ -156,6 +159,7 @@ class PlainClient:
 
     def __init__(self, session: zenoh.Session, *, answers_probes: bool) -> None:
         self.lost = self.taken = 0
+        self.longest_turn_s = 0.0
         self._session = session
         self._answers: deque[bytes] = deque(maxlen=10)
         self._probes: deque[Any] = deque()
@@ -176,7 +180,9 @@ class PlainClient:
 
     def _spin(self) -> None:
         while self._open:
-            time.sleep(0.01)  # its callback
+            began = time.monotonic()
+            time.sleep(TURN_S)  # its callback
+            self.longest_turn_s = max(self.longest_turn_s, time.monotonic() - began)
             if self._answers:
                 self._answers.popleft()
                 self.taken += 1
@@ -205,20 +211,31 @@ class PlainClient:
             one.undeclare()
 
 
-def test_a_burst_of_a_plain_client_loses_no_answer(
-    make: Callable[..., RmwZenohNode], peer: zenoh.Session
-) -> None:
-    """Its executor takes one in 10 ms; what its queue has no room for waits here."""
+def burst(node: RmwZenohNode, peer: zenoh.Session) -> PlainClient:
+    """Have a new client ask 64 times at once; return it when all answers have come."""
     client = PlainClient(peer, answers_probes=True)
-    with contextlib.closing(client):
-        node = make()
+    with contextlib.closing(client), contextlib.closing(node):
         wait_for(lambda: node.graph.servers("/robot/get_parameter_types"), "the client's node")
         echo(node)
         wait_for(lambda: any("/SS/" in t and "grasp" in t for t in tokens(peer)), "the service")
         for number in range(64):
             client.call(number)
         wait_for(lambda: client.taken + client.lost >= 64, "all answers")
-        assert (client.taken, client.lost) == (64, 0)
+    return client
+
+
+def test_a_burst_of_a_plain_client_loses_no_answer(
+    make: Callable[..., RmwZenohNode], peer: zenoh.Session
+) -> None:
+    """Its executor takes one in 10 ms; what its queue has no room for waits here.
+
+    Where the machine held that executor up, it was a slower client: another one asks.
+    """
+    for _ in range(5):
+        client = burst(make(), peer)
+        if not client.lost or client.longest_turn_s < 2 * TURN_S:
+            break
+    assert (client.taken, client.lost) == (64, 0)
 
 
 def test_what_is_not_answered_ends_without_a_reply(
