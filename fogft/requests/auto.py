@@ -25,7 +25,7 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import Demand, Load
+from fogft.requests.load import NEVER, Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
@@ -131,8 +131,9 @@ class Auto(Learning):
         if not able:
             return ()
         for replica in able:  # what others answered first it may never end: `more` does not see it
-            if self._replicas[replica].doubt_oldest(now):
-                self.news = True  # what else it has goes to another, too
+            begun = self._replicas[replica].oldest_begun
+            if begun < NEVER:
+                self._doubts(replica, begun, now)
         best = self._best(request, able, now)
         known = self._replicas[best]
         self._spares.request(known.service_s, now)

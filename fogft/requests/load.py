@@ -128,11 +128,16 @@ class ReplicaLoad:
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
         return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s)
 
+    @property
+    def oldest_begun(self) -> float:
+        """When the oldest of our open requests there began; infinity for none."""
+        for begun, _ in self._at_work.values():
+            return begun
+        return NEVER
+
     def _spent_s(self, now: float) -> float:
         """Return for how long it has been at the oldest of ours; 0 for none."""
-        for begun, _ in self._at_work.values():
-            return now - max(begun, self.ended_at)
-        return 0.0
+        return now - max(self.oldest_begun, self.ended_at) if self._at_work else 0.0
 
     def avoided(self, now: float) -> bool:
         """Whether to prefer others: it is in doubt, or has failed."""
@@ -248,14 +253,6 @@ class ReplicaLoad:
         if self.ended_at < begun and now >= self.doubtful_at(begun):
             self.doubted = True
         return self.doubted
-
-    def doubt_oldest(self, now: float) -> bool:
-        """Doubt it by the oldest attempt; return whether that is new."""
-        for begun, _ in self._at_work.values():
-            if now - begun < self.delay_s or self.doubted:
-                break
-            return self.doubt(begun, now)
-        return False
 
     def forget(self) -> None:
         """Note that its link is new or gone: nothing is in flight, and doubts are over."""
