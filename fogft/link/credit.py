@@ -20,7 +20,8 @@ from __future__ import annotations
 
 import threading
 
-SMALL_BYTES = 16 << 10
+from fogft.byte_limit import SMALL_BYTES
+
 _FRAME_BYTES = 256  # what travels with a payload: key, header, encryption
 
 

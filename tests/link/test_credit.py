@@ -5,7 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.credit import SMALL_BYTES, Credit
+from fogft.byte_limit import SMALL_BYTES
+from fogft.link.credit import Credit
 
 
 def test_a_large_send_is_never_taken():

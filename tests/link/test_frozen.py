@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 import pytest
 
-from fogft.link.credit import SMALL_BYTES
+from fogft.byte_limit import SMALL_BYTES
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal

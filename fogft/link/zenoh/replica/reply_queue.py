@@ -23,11 +23,10 @@ from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 
-from fogft.byte_limit import ByteLimit
+from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.counters import Counters
 from fogft.link import batch_frames, frame
 from fogft.link.compression import Compression
-from fogft.link.credit import SMALL_BYTES
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
 from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
