@@ -7,12 +7,10 @@ Not here: what is told with each probe (`server`), records (`fogft.records.recor
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 
 from fogft.link.dial_out.replica import DialOut
 from fogft.model.plain import to_plain
 from fogft.model.proxy_config import ServerProxyConfig
-from fogft.model.replica import ReplicaId
 from fogft.records.client import Known, RendezvousClient
 from fogft.records.record import RecordError, RecordKind
 from fogft.records.roster import SlotState, dial_in
@@ -21,48 +19,6 @@ from fogft.records.signing import Signer
 log = logging.getLogger(__name__)
 
 _NOTHING = Known()
-
-
-class Announcer:
-    """Keeps one replica's record current: its endpoint, or that it dials out.
-
-    Args:
-        endpoint: ``host:port`` as it was told; empty if it was not.
-        dials_out: It cannot be reached.
-    """
-
-    def __init__(
-        self,
-        id: ReplicaId,
-        records: RendezvousClient,
-        *,
-        endpoint: str,
-        port: int,
-        dials_out: bool,
-    ) -> None:
-        self._id = id
-        self._records = records
-        self._fixed = SlotState(endpoint=endpoint, dials_out=dials_out)
-        self._port = port
-        self._said: SlotState | None = None
-
-    def look(self, ready: frozenset[str], *, draining: bool) -> bool:
-        """Publish changes; return whether there were any."""
-        seen = self._records.known.seen_host
-        host = f"[{seen}]" if ":" in seen else seen
-        state = replace(
-            self._fixed,
-            observed_endpoint=f"{host}:{self._port}" if host else "",
-            services=tuple(sorted(ready)),
-            draining=draining,
-        )
-        if state == self._said:
-            return False
-        self._said = state
-        self._records.publish(
-            RecordKind.SLOT, str(self._id.slot), self._id.generation, to_plain(state)
-        )
-        return True
 
 
 class Presence:
@@ -77,21 +33,15 @@ class Presence:
 
     def __init__(self, config: ServerProxyConfig, listening: str) -> None:
         ours = config.credentials
-        self._own_doors = config.dial_out
+        self._config = config
+        self._port = listening.rpartition(":")[2]
+        self._said: SlotState | None = None
         self._seen: Known | None = None
         self._client: RendezvousClient | None = None
-        self._announcer: Announcer | None = None
         self._dial_out: DialOut | None = None
         if config.rendezvous:
             self._client = RendezvousClient(
                 config.rendezvous, ours, config.id.pool_uid, cache=config.records
-            )
-            self._announcer = Announcer(
-                config.id,
-                self._client,
-                endpoint=config.advertise,
-                port=int(listening.rpartition(":")[2]),
-                dials_out=bool(config.dial_out),
             )
             self._client.start()
         if config.dial_out:
@@ -101,15 +51,29 @@ class Presence:
 
     def look(self, ready: frozenset[str], *, draining: bool) -> Known:
         """Publish changes, dial new dial-in ports; return the known records."""
-        if self._client is None or self._announcer is None:
+        if self._client is None:
             return _NOTHING
-        self._announcer.look(ready, draining=draining)
+        self._announce(self._client, ready, draining=draining)
         known = self._client.known
         if known is not self._seen:
             self._seen = known
             if self._dial_out is not None:
-                self._dial_out.follow((*self._own_doors, *doors(known)))
+                self._dial_out.follow((*self._config.dial_out, *doors(known)))
         return known
+
+    def _announce(self, client: RendezvousClient, ready: frozenset[str], *, draining: bool) -> None:
+        seen, id = client.known.seen_host, self._config.id
+        host = f"[{seen}]" if ":" in seen else seen
+        state = SlotState(
+            endpoint=self._config.advertise,
+            observed_endpoint=f"{host}:{self._port}" if host else "",
+            dials_out=bool(self._config.dial_out),
+            services=tuple(sorted(ready)),
+            draining=draining,
+        )
+        if state != self._said:
+            self._said = state
+            client.publish(RecordKind.SLOT, str(id.slot), id.generation, to_plain(state))
 
     def close(self) -> None:
         """Disconnect."""
