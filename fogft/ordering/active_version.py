@@ -3,9 +3,7 @@
 Replicas of another version stand by: they apply every request, and nobody sees their answers.
 A version becomes active by a handover, from a snapshot of the active one, or when that has left.
 
-Owns: which version is active, which should be, and when the active one counts as gone.
-Not here: carrying the change out (`fogft.ordering.sequencer`).
-Rules: docs/design/rolling-update.md.
+Rules: docs/design/rolling-update.md. Not here: carrying the change out (`ordering.sequencer`).
 """
 
 from __future__ import annotations
@@ -29,10 +27,6 @@ class ActiveVersion:
         self.version = version
         self._gone_since: float | None = None
         self._is_gone = False
-
-    def counts(self, version: str) -> bool:
-        """Whether answers of this version count."""
-        return version == self.version
 
     def may_lead(self, version: str) -> bool:
         """Whether a term may begin from the state of a replica of this version."""

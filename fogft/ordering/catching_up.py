@@ -1,10 +1,8 @@
-"""Replicate one term's log to all replicas of a stateful service. Pure.
+"""What each replica of a stateful service still needs of one term's log. Pure.
 
-It holds what each replica still needs: requests by number while the log has them, else a
-checkpoint and what came after. What is to be sent collects until `take`.
-
-Owns: one term's log and checkpoint, and what each replica is to be sent.
-Not here: what replicas answer, and who obeys (`sequencer`). Protocol: docs/design/state.md.
+Requests by number while the log has them, else a checkpoint and what came after. What is to be sent
+collects until `take`. Not here: what replicas answer, and who obeys (`sequencer`).
+Protocol: docs/design/state.md.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from collections.abc import Callable
 from fogft.ordering import orders
 from fogft.ordering.log import Checkpoint, OrderedLog
 from fogft.ordering.orders import START, Op, Position
-from fogft.ordering.peer import Order, Peer, Phase, far_behind
+from fogft.ordering.peer import LAG_LIMIT, Order, Peer, Phase
 
 CHECKPOINT_RETRY_S = 1.0
 WINDOW = 128
@@ -28,13 +26,7 @@ class CatchingUp:
         handed_over: Whether the term begins with what replicas of another version left.
     """
 
-    def __init__(
-        self,
-        epoch: int,
-        counts: Callable[[int], bool],
-        *,
-        handed_over: bool,
-    ) -> None:
+    def __init__(self, epoch: int, counts: Callable[[int], bool], *, handed_over: bool) -> None:
         self.base: Position | None = None  # None until the term has begun
         self.log: OrderedLog | None = None
         self.peers: dict[int, Peer] = {}
@@ -141,7 +133,7 @@ class CatchingUp:
         at, kept = promise.position, log.checkpoint
         may_join = promise.sound and self._knows(replica, at) and log.covers(at.index)
         from_index = max(at.index if may_join else -1, kept.index if kept else -1)
-        if far_behind(log.last - from_index) and self.ready and not waited:
+        if log.last - from_index > LAG_LIMIT and self.ready and not waited:
             return
         if may_join and from_index == at.index:
             peer.phase = Phase.ASKED

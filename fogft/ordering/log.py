@@ -1,8 +1,4 @@
-"""The numbered requests that a replica may still need, and the snapshot before them. Pure.
-
-Owns: entries from `start` + 1 to `last`, their bounds, and the checkpoint.
-Not here: who needs them (`sequencer`).
-"""
+"""The numbered requests that a replica may still need, and the snapshot before them. Pure."""
 
 from __future__ import annotations
 
@@ -56,25 +52,13 @@ class OrderedLog:
         return within and len(self._entries) < self.entries_limit
 
     def append(self, payload: bytes) -> int:
-        """Number a request; ask `has_room` before.
-
-        Raises:
-            ValueError: There is no room.
-        """
-        if not self.has_room(len(payload)):
-            raise ValueError("the log is full")
+        """Number a request; ask `has_room` before."""
         self._entries.append(payload)
         self.held_bytes += len(payload)
         return self.last
 
     def get(self, index: int) -> bytes:
-        """Return a request.
-
-        Raises:
-            IndexError: It is not in the log.
-        """
-        if not self.start < index <= self.last:
-            raise IndexError(f"the log has no number {index}")
+        """Return a request whose number is above `start`, and at most `last`."""
         return self._entries[index - self.start - 1]
 
     def covers(self, index: int) -> bool:

@@ -1,12 +1,8 @@
 """The orders between a sequencer and the replicas of a stateful service. Pure values.
 
-An order travels as an ordinary request whose 16-byte id is the order itself: operation,
-epoch and index. So a request needs no envelope, and its bytes are never copied for it.
-An answer is the payload that belongs to the operation, or a refusal.
-
-Owns: epochs, positions, orders, and their bytes.
-Not here: who sends which order (`sequencer`) and what becomes of it (`replica`).
-Protocol: docs/design/state.md.
+An order travels as an ordinary request whose 16-byte id is the order itself: operation, epoch and
+index. So a request needs no envelope. An answer is the payload that belongs to the operation, or a
+refusal. Protocol: docs/design/state.md.
 """
 
 from __future__ import annotations
@@ -56,11 +52,7 @@ START = Position()
 
 @dataclass(frozen=True)
 class Promise:
-    """A replica's answer when it is claimed; unsound after a failed restore.
-
-    Attributes:
-        sound: Whether its state is that of `position`; a restore that failed leaves it unsound.
-    """
+    """A replica's answer when it is claimed; `sound` is false after a failed restore."""
 
     position: Position
     sound: bool

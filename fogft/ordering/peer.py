@@ -1,10 +1,8 @@
 """A sequencer's view of a replica in one term, and orders to it. Pure values.
 
-The first answer counts, so callers go as fast as the fastest replica. A slower one falls behind for
-as long as that lasts; should the faster ones die, every caller would wait until it has applied all
-that it lacks. So one that is far behind is given a snapshot instead, though not too often.
-
-Owns: what is remembered of each replica. Not here: what follows from it (`sequencer`).
+Callers go as fast as the fastest replica, so a slower one falls behind. Should the faster ones die,
+every caller would wait until it has applied all that it lacks. So one that is far behind is given a
+snapshot instead, though not too often. What follows from all this is the `sequencer`'s.
 """
 
 from __future__ import annotations
@@ -41,11 +39,6 @@ class Phase(Enum):
     JOINED = "joined"  # it applies what is sent to it
 
 
-def far_behind(requests: int) -> bool:
-    """Whether a replica lacks so many requests that a snapshot is better."""
-    return requests > LAG_LIMIT
-
-
 class Lag:
     """How far a replica is behind. Snapshots pause the sender, so they become rarer."""
 
@@ -55,7 +48,7 @@ class Lag:
 
     def too_far(self, behind: int, now: float) -> bool:
         """Whether a replica with this many unanswered requests should be restored now."""
-        if not far_behind(behind):
+        if behind <= LAG_LIMIT:
             if now >= self._next_at + self._wait_s:
                 self._wait_s = RESTORE_FIRST_S  # it has kept up for as long again
             return False

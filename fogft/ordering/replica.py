@@ -3,7 +3,6 @@
 What happens comes in by methods; what to do comes out as effects, in their order. The service works
 on one thing at a time, under a serial number; what ends under an older one is of no interest.
 
-Owns: which state the service is in, which term is obeyed, which answers are kept.
 Not here: calling the service and answering (`fogft.proxy.replica.ordered_responder`).
 Protocol: docs/design/state.md.
 """

@@ -1,14 +1,11 @@
 """One term of a stateful service: claim replicas, have them join, take their answers. Pure.
 
-A term claims the replicas and begins from the state of one of them, never from one before the mark;
-one replica is enough. From then on it numbers requests, and the first answer counts. When most of
-the replicas that stay run another version, that takes over at one point of the order.
+A term begins from the state of one replica, never from one before the mark. From then on it numbers
+requests, and the first answer counts. When most of the replicas that stay run another version, that
+takes over at one point of the order. The owner sends what `take` returns, and reports each order's
+end, once, by `replied`, `refused` or `declined`.
 
-The owner sends what `take` returns, and reports each order's end, once, by `replied`, `refused` or
-`declined`.
-
-Owns: how far each replica obeys, from what a term begins, which answer is returned, and when it is
-handed over. Not here: what each replica is to be sent (`catching_up`), callers and deadlines
+Not here: what each replica is to be sent (`catching_up`), callers and deadlines
 (`fogft.proxy.robot.service_order`). Protocol and its argument: docs/design/state.md.
 """
 
@@ -77,11 +74,7 @@ class Sequencer:
         self._leaving: frozenset[int] = frozenset()
         self._change_to: str | None = None  # no number is given meanwhile
         self._unanswered: dict[int, None] = {}
-        self._replicas = CatchingUp(
-            epoch,
-            self._counts,
-            handed_over=begin is not None,
-        )
+        self._replicas = CatchingUp(epoch, self._counts, handed_over=begin is not None)
         self._peers = self._replicas.peers
         self.take = self._replicas.take  # the orders to send, in this order; they are forgotten
         if begin is not None:
@@ -153,7 +146,7 @@ class Sequencer:
         return self._versions.get(replica, "")
 
     def _counts(self, replica: int) -> bool:
-        return self.active.counts(self._version(replica))
+        return self._version(replica) == self.active.version
 
     def _gave_no_checkpoint(self, replica: int) -> None:
         if self._replicas.donor == replica:

@@ -1,18 +1,14 @@
 """Which replicas are believed when they report that a request crashed a service. Pure.
 
 One that is broken, or lies, says so of requests that others answer. Were it believed, the others
-would run each of those alone.
-
-Owns: that judgement. Not here: what follows from a death (`pending`).
+would run each of those alone. What follows from a death is `pending`'s.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-FALSE_ALARMS = 3
-"""So many false alarms within `LATELY_S`, and a replica is not believed until they are older."""
-LATELY_S = 60.0
+FALSE_ALARMS, LATELY_S = 3, 60.0  # so many false alarms lately, and it is not believed
 ALARM_S = 1.0  # what is said within it, counted from the first time, is about one death
 
 

@@ -1,20 +1,16 @@
 """Hedging that follows the load: every replica while they are idle, one when they are full. Pure.
 
-* **The first copy** goes where it is expected to be answered first: round trip, and one service
-  time for it and each request before it. A replica that is doubted, or that fails, comes last.
-* **Spare copies** go to every other replica that is believed to be free, at once or as soon as it
-  is, so the first answer wins and the loss of a replica is not even seen. A replica drops a spare
-  copy that would have to wait. While spares make other requests wait for longer than they save,
-  fewer requests get them; as the wait goes, all of them do again.
-* **A late hedge**: an attempt that takes longer than 95 % of that replica's recent answers, and
-  than what was before it there takes, is hedged at a free replica, if the budget has a token.
+* **The first copy** goes where the answer is expected first.
+* **Spare copies** go to every other replica as soon as it is believed to be free. A replica drops
+  one that would have to wait. While spares cost more waiting than they save, fewer requests get
+  them.
+* **A late hedge**: an attempt that takes longer than 95 % of that replica's recent answers is
+  hedged at a free replica, if the budget has a token.
 * **Doubt**: a replica with such an attempt, that has ended nothing since that began, is doubted
-  until it does. What it has goes to another one at once, which costs no token; so does what
-  nobody works on (refused, link suspect, replica gone).
+  until it does. What it has goes to another one, and that costs no token.
 
 Laws: a request always has a copy that is no spare; late hedges <= capacity + share * requests.
 
-Owns: the choice, the budget, how many requests get spare copies.
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 
@@ -40,36 +36,6 @@ _MEMORY = 0.98  # of what spares saved and cost, from one request to the next
 _RETRY_S = 0.02
 
 
-class TokenBucket:
-    """Tokens for extra copies: a share of the requests, and a few to begin with.
-
-    Tokens come with requests, not with time: a service that is asked once a minute and one that is
-    asked a thousand times a second both send the same share of extra copies.
-
-    Law: after n requests at most ``capacity + share * n`` copies were taken.
-
-    Args:
-        share: Tokens that each request brings, above 0 and at most 1.
-        capacity: The most that are kept, and how many there are at first.
-    """
-
-    def __init__(self, share: float, capacity: float) -> None:
-        self._share = share
-        self._capacity = capacity
-        self.tokens = capacity  # what is there now
-
-    def request(self) -> None:
-        """Count a request."""
-        self.tokens = min(self._capacity, self.tokens + self._share)
-
-    def take(self) -> bool:
-        """Take a token if there is one."""
-        if self.tokens < 1.0:
-            return False
-        self.tokens -= 1.0
-        return True
-
-
 class Spares:
     """Which requests get spare copies: all, unless those cost more waiting than they save.
 
@@ -85,7 +51,7 @@ class Spares:
         self.open: dict[tuple[bytes, int], float] = {}  # when each was sent that has not ended
 
     def request(self, service_s: float, now: float) -> None:
-        """Note a request: let the share recover, and old data decay."""
+        """Note a request; old data decays."""
         self._saved_s *= _MEMORY
         self._cost_s *= _MEMORY
         if self._at is not None and self.share < 1.0:
@@ -113,7 +79,7 @@ class Auto(Learning):
 
     def __init__(self) -> None:
         super().__init__()
-        self._budget = TokenBucket(BUDGET_SHARE, BUDGET_CAPACITY)
+        self._tokens = BUDGET_CAPACITY  # for late hedges; each request brings a share of one
         self._spares = Spares()
         self._demand = Demand()
         # When a spare was first, by the copy that it beat, until that has ended.
@@ -126,7 +92,7 @@ class Auto(Learning):
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
         """Return the replica expected to answer first, and other idle ones."""
-        self._budget.request()
+        self._tokens = min(BUDGET_CAPACITY, self._tokens + BUDGET_SHARE)
         self._demand.asked(now)
         if not able:
             return ()
@@ -182,9 +148,10 @@ class Auto(Learning):
                 if now < due:
                     self._look(due)
                     return ()
-                if not free or not self._budget.take():
+                if not free or self._tokens < 1.0:
                     self._look(now + _RETRY_S)
                     return ()
+                self._tokens -= 1.0
                 candidates = free
                 self.hedges += 1
             elif all(self._replicas[c].doubted for c in candidates):
@@ -294,7 +261,7 @@ class Auto(Learning):
         return {
             "hedges": self.hedges,
             "spare_share": self._spares.share,
-            "tokens": self._budget.tokens,
+            "tokens": self._tokens,
             "replicas": {
                 short(replica): {
                     "service_s": known.service_s,

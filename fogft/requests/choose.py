@@ -1,12 +1,10 @@
 """Hedging policies: which replicas get a request first, which next, and when. Pure.
 
-A policy is asked when a request comes (`first`) and again while it is open (`more`), and is
-told how each attempt ended. It never sends anything; the dispatcher does as it says, but for
-replicas that may not be asked, and requests that may have ended a service (`pending`).
+A policy never sends anything; the dispatcher does as it says, but for replicas that may not be
+asked, and requests that may have ended a service (`pending`).
 
-Owns: `all` and `failover`; the interface of every policy.
-Not here: `auto` (`fogft.requests.auto`), which answer wins (`fogft.requests.decide`), which policy
-a service has (`fogft.proxy.robot.dispatcher`).
+Owns: `all` and `failover`; the interface of every policy. Not here: `auto` (`requests.auto`),
+which answer wins (`decide`).
 """
 
 from __future__ import annotations

@@ -1,18 +1,14 @@
 """How many requests a service may have concurrently, given or learned from latency. Pure.
 
-A service that works on one request after the other answers no more in an hour when it has ten
-of them instead of one: the others only wait inside it, where nobody can take them back or put
-a more urgent one before them. One that works on ten at a time needs ten.
+A service that works on one request after the other gains nothing from ten: nine wait inside it,
+where nobody can take them back or put a more urgent one before them. One that works on ten at a
+time needs ten. Which it is shows in its throughput, limit / latency: under demand, half the limit
+is tried for some answers, and kept if throughput stays near what it was; once in a while the
+double is, and kept if it gains.
 
-Which it is shows in its throughput, limit / latency, while as many are at work as the limit
-allows. So, under demand, half the limit is tried for some answers; it is kept if throughput
-stays near what it was. Once in a while the double is tried, and kept if it gains.
-
-Without demand nothing is learned and nothing limited. A service that answers every 3 ms or
-more often is not limited: what waits in it is over before it matters. One that takes up to 0.1 s
-has one more in hand than it works on, or it would stand still between two.
-
-Owns: the limit of one service. Not here: who waits (`fair_queue`).
+A service that answers every 3 ms or more often is not limited: what waits in it is over before it
+matters. One that takes up to 0.1 s has one more in hand than it works on, or it would stand still
+between two. Who waits is `fair_queue`'s.
 """
 
 from __future__ import annotations
@@ -89,18 +85,14 @@ class ConcurrencyLimit:
                 self._set(limit_before)
                 return
         self._set(tried)
-        for candidate in (self._half(each_s), min(2 * tried, self._most)):
+        half = tried if each_s < QUICK_S else max(tried // 2, 1)
+        for candidate in (half, min(2 * tried, self._most)):
             last = self._tried.get(candidate)
             if candidate != tried and (last is None or now - last >= _TRY_AGAIN_S):
                 self._kept = (tried, rate)
                 self._tried[tried] = now  # so that it does not swing between the two
                 self._set(candidate)
                 return
-
-    def _half(self, each_s: float) -> int:
-        if each_s < QUICK_S:
-            return self.limit
-        return max(self.limit // 2, 1)
 
     def _set(self, limit: int) -> None:
         self.limit = limit

@@ -1,14 +1,12 @@
 """Decide what an answer means for its request: first success, or what a quorum agrees on. Pure.
 
-An answer goes through `read` first, which looks into its bytes and may be slow: no lock is held.
-Bytes that are no response are refused there, before they count. Then `judge` says what it means.
+An answer goes through `read` first, which may be slow: no lock is held. Then `judge` says what it
+means. What decides for actions and stateful services says, too, what else replicas must have:
+goals, cancellations, an order.
 
-Replicas of actions and of stateful services must have more than single requests: goals,
-cancellations, an order. What decides for those says what else is to be sent, too.
-
-Owns: the interface of every decision; the first success, and the first that is ok.
-Not here: votes (`fogft.requests.votes`), actions (`fogft.proxy.robot.actions`), stateful services
-(`fogft.proxy.robot.service_order`); which requests await an answer (`pending`).
+Owns: the interface of every decision; the first success, and the first that is ok. Not here: votes
+(`requests.votes`), actions and stateful services (`proxy.robot`), which requests await an answer
+(`pending`).
 """
 
 from __future__ import annotations

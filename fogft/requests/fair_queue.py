@@ -1,18 +1,14 @@
 """The queue at a replica: by deadline within a robot, fair between robots. Pure.
 
-Each robot has a queue of its own, the earliest deadline first. Whose turn it is goes by a
-count of what each robot was given (start-time fair queueing): the one that was given least is
-next, and one that comes back after a pause begins where the others are, so it can neither
-save up turns nor lose them. With one robot this is earliest deadline first.
-
-When there is no room, the robot that has most waiting gives way: its latest deadline goes.
+Whose turn it is goes by a count of what each robot was given (start-time fair queueing): the one
+that was given least is next, and one that comes back after a pause begins where the others are. So
+it can neither save up turns nor lose them.
 
 Laws: what is put in comes out once, or is removed; a robot with something waiting is served
 at least every n-th time, with n robots waiting; of two requests of one robot the earlier
 deadline goes first.
 
-Owns: the order. Not here: how many may wait or run at once (`concurrency`,
-`proxy.replica.responder`).
+Not here: how many may wait or run at once (`concurrency`, `proxy.replica.responder`).
 """
 
 from __future__ import annotations

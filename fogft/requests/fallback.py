@@ -1,18 +1,13 @@
 """When the fallback service is called, and how long its answer is awaited. Pure.
 
-A fallback is a service on the robot itself, cheaper than the replicas'. It is asked for a
-request once: at the deadline, or after a delay beside the replicas, or at once while no
-replica is ready. An answer that is there first is returned, whoever gave it. At the deadline
-the replicas are out, and the fallback's answer is awaited for its own time.
+A fallback is a service on the robot itself. It is asked for a request once: at the deadline, or
+after a delay, or at once while no replica is ready. After the deadline only its answer counts.
 
 Law: a request is handed to the fallback at most once, and ends exactly once.
-
-Owns: which requests are due. Not here: calling (`proxy.robot.delivery`), the replicas' answers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Generic, TypeVar
 
 from fogft.model.choices import FallbackSpec
@@ -49,21 +44,13 @@ class FallbackTimer(Generic[T]):
 
     def due(self, now: float, *, able: bool) -> list[bytes]:
         """Remove and return the requests to pass to the fallback now."""
-        found = list(self._due(now, able=able))
-        for request in found:
+        found = []
+        while now >= self.look_at(able=able):
+            request = next(iter(self._arrived))
             del self._arrived[request]
             self._handed.add(request)
+            found.append(request)
         return found
-
-    def _due(self, now: float, *, able: bool) -> Iterator[bytes]:
-        at_once = not able and self.spec.while_none_ready
-        after_s = 0.0 if at_once else self.spec.after_s
-        if after_s is None:
-            return
-        for request, arrived in self._arrived.items():
-            if now < arrived + after_s:
-                return
-            yield request
 
     def ended(self, request: bytes) -> None:
         """Note that a replica has answered the request."""

@@ -1,11 +1,8 @@
 """Recent latencies: quantiles of a decaying histogram. Pure.
 
-Buckets grow by 10 % from 0.1 ms to over a day, so a quantile is right to about 5 %. A sample
-weighs less the more samples, or the more time, came after it.
-
-An attempt that was told to stop has taken *at least* the time until then. It is counted as
-that time: a quantile at or below the time after which attempts are stopped is not moved by
-it, whereas leaving it out would make a slow replica look as fast as its fast answers.
+Buckets grow by 10 % from 0.1 ms to over a day, so a quantile is right to about 5 %. An attempt that
+was stopped counts as the time until then: leaving it out would make a slow replica look as fast as
+its fast answers.
 """
 
 from __future__ import annotations

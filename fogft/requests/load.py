@@ -1,10 +1,7 @@
 """A replica's load, by its own report and by what one robot has sent. Pure.
 
-A replica says with each answer and refusal how much it has to do (`Load`). Between two of them
-the robot counts what it sent itself. Several robots need no coordination: each sees the others
-in the replica's words.
-
-Owns: what is known of one replica. Not here: who is asked (`auto`, `choose`).
+Between two reports the robot counts what it sent itself. Several robots need no coordination: each
+sees the others in the replica's words. Who is asked is decided in `auto` and `choose`.
 """
 
 from __future__ import annotations

@@ -1,18 +1,13 @@
 """One service's unanswered requests, with its hedging and decision policies. Pure.
 
-Every step of a request's life is one method: it is begun, sent on, answered, refused, and
-closed. Each keeps the table, the policy and the decision in step, and returns what is to be
-done. Called under its owner's lock; the time is an argument.
+Each step of a request's life keeps the table, the policy and the decision in step, and returns what
+is to be done. Called under its owner's lock. The first success takes the request out of the table,
+so that whatever comes later is LATE by construction: a late answer can never reach another request,
+and no request is answered twice.
 
-Every request has the replicas that work on it (its open attempts). The first success takes the
-request out of the table, so that whatever comes later is LATE by construction: a late answer can
-never reach another request, and no request is answered twice.
-
-An attempt ends as a success, a failure (refusal, crash, lost link) or a rejection: a real
-response that the service itself marks as not ok. A rejection is kept, and is returned only when
-nothing better can come. A replica that declined a request, failed it or came after it may be
-asked (again) even while others work on it, because those others may be frozen. Whether it is, is
-the policy's to say.
+A rejection is kept, and is returned only when nothing better can come. A replica that declined a
+request, failed it or came after it may be asked (again) even while others work on it, because those
+others may be frozen. Whether it is, is the policy's to say.
 
 Owns: which answer is returned, who may be asked, and when a request has nobody working on it.
 Not here: what an answer means (`decide`), who is asked (`choose`), when the fallback is

@@ -1,11 +1,8 @@
 """Quorum: the answer that k replicas agree on, and replicas that keep disagreeing. Pure.
 
-Every answer to a request is a ballot. An answer with which `quorum` ballots agree, its own
-included, is final; every ballot is then judged by it, also those that come later. A minority
-is never returned, and without a final answer nobody is blamed: two that differ do not tell
-who is wrong.
+Once k ballots agree, every ballot is judged by that answer, also those that come later. Without
+agreement nobody is blamed: two that differ do not tell who is wrong.
 
-Owns: ballots, final answers (for a while), each replica's record.
 Not here: what agreeing means (`fogft.ros.comparison`), requests and deadlines (`pending`).
 """
 
@@ -42,8 +39,7 @@ class Comparison(Protocol):
 class Quorum(Decide):
     """``quorum: k``: an answer with which k replicas agree; see `decide.Decide`.
 
-    Replicas go on working on a request that has its answer: what they would have said is what
-    tells a wrong one.
+    Replicas go on working on a request that has its answer: what they say tells a wrong one.
 
     Args:
         newly_flagged: Called with a replica that has disagreed once too often, and how often.

@@ -14,8 +14,7 @@ from fogft.errors import FrameError
 SESSION_BYTES = 8
 BATCH_LIMIT = 1000
 _NUMBER_LIMIT = 1 << 63
-_MESSAGE = struct.Struct(f">{SESSION_BYTES}sQ")
-_PULL = struct.Struct(f">{SESSION_BYTES}sQ")
+_HEAD = struct.Struct(f">{SESSION_BYTES}sQ")
 _BATCH = struct.Struct(f">{SESSION_BYTES}sQI")
 _ENTRY = struct.Struct(">QI")
 NO_SESSION = bytes(SESSION_BYTES)
@@ -25,28 +24,28 @@ Batch = tuple[bytes, int, list[tuple[int, bytes]]]
 
 def encode_message(session: bytes, number: int, message: bytes) -> bytes:
     """Encode a message of the robot: publisher (random at its start), number, CDR."""
-    return _MESSAGE.pack(session, number) + message
+    return _HEAD.pack(session, number) + message
 
 
 def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
     """Decode a message of the robot. Raises FrameError."""
-    if len(frame) < _MESSAGE.size:
+    if len(frame) < _HEAD.size:
         raise FrameError(f"a message of {len(frame)} bytes")
-    session, number = _MESSAGE.unpack_from(frame)
+    session, number = _HEAD.unpack_from(frame)
     _check(number)
-    return session, number, frame[_MESSAGE.size :]
+    return session, number, frame[_HEAD.size :]
 
 
 def encode_pull(session: bytes, after: int) -> bytes:
     """Encode a pull of messages after a number of a session; `NO_SESSION` asks where to begin."""
-    return _PULL.pack(session, after)
+    return _HEAD.pack(session, after)
 
 
 def decode_pull(frame: bytes) -> tuple[bytes, int]:
     """Decode a pull. Raises FrameError."""
-    if len(frame) != _PULL.size:
+    if len(frame) != _HEAD.size:
         raise FrameError(f"a pull of {len(frame)} bytes")
-    session, after = _PULL.unpack(frame)
+    session, after = _HEAD.unpack(frame)
     _check(after)
     return session, after
 

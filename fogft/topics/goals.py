@@ -3,8 +3,7 @@
 Everything about a goal is known by the id that its client gave it, the first 16 bytes of a
 request (CDR, after its header).
 
-Owns: what the parts' bytes mean, which goals are under way and who has them, one status out of
-several. Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.messages`).
+Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.messages`).
 """
 
 from __future__ import annotations
@@ -13,8 +12,8 @@ import math
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from enum import Enum
 
+from fogft.model.refusal import Refusal
 from fogft.model.spec import Part
 
 _ID = slice(4, 20)
@@ -65,27 +64,6 @@ def cancel_request(goal: bytes) -> bytes:
 def names_one(cancel: bytes) -> bool:
     """Whether a request to cancel means one goal, not all, or all until a moment."""
     return any(goal_of(cancel)) and not any(cancel[20:28])
-
-
-class Had(Enum):
-    """A replica's last answer about a goal."""
-
-    NOTHING_SAID = "nothing said"
-    TAKEN = "taken"
-    REFUSED = "refused"
-
-
-@dataclass(frozen=True)
-class Took:
-    """A replica's acceptance of a goal.
-
-    Attributes:
-        goal: Which; None where it did not, had it before, or that is not known any more.
-        in_vain: The goal is over, or cancelled.
-    """
-
-    goal: bytes | None
-    in_vain: bool
 
 
 @dataclass(frozen=True)
@@ -159,20 +137,27 @@ class Goals:
         self._goals[goal].ids.add(id)
         self._of_id[id] = goal
 
-    def took(self, id: bytes, replica: int, now: float, *, accepts: bool) -> Took:
-        """Note a replica's answer whether it accepts a goal. Unknown ids are ignored."""
+    def took(
+        self, id: bytes, replica: int, now: float, *, accepts: bool
+    ) -> tuple[bytes | None, bool]:
+        """Note a replica's answer whether it accepts a goal. Unknown ids are ignored.
+
+        Returns:
+            The goal, or None where the replica did not accept it, had it before, or it is not known
+            any more; and whether the goal is over, or cancelled.
+        """
         known = self._given_by(id)
         if known is None:
             goal = self.over.get(id) if accepts else None
-            return Took(goal, in_vain=True)
+            return goal, True
         if accepts:
             known.accepted = True
             known.takers.add(replica)
         word = known.words.get(replica)
         if word is not None and math.isfinite(word.since):  # it has taken it before
-            return Took(None, in_vain=False)
+            return None, False
         known.words[replica] = _Word(math.inf, now if accepts else -math.inf)
-        return Took(goal_of(known.request) if accepts else None, in_vain=known.cancelled)
+        return goal_of(known.request) if accepts else None, known.cancelled
 
     def failed(self, id: bytes, replica: int, now: float) -> None:
         """Note that a goal did not reach a replica: it is sent again soon."""
@@ -266,15 +251,18 @@ class Goals:
         known = self._goals.get(goal)
         return known is not None and known.accepted
 
-    def had(self, goal: bytes, replica: int, asked_at: float) -> Had:
-        """Return a replica's last answer about a goal when asked for the result."""
+    def lacked(self, goal: bytes, replica: int, asked_at: float) -> Refusal | None:
+        """Return why a replica that was asked for the result did not have the goal; None: it had.
+
+        It refused the goal (`FORGOTTEN`), or has said nothing of it yet (`NOT_READY`).
+        """
         known = self._goals.get(goal)
         word = None if known is None else known.words.get(replica)
         if known is not None and known.cancelled:
-            return Had.TAKEN  # it need not be given it any more
+            return None  # it need not be given it any more
         if word is None or asked_at < word.since:
-            return Had.NOTHING_SAID
-        return Had.TAKEN if math.isfinite(word.since) else Had.REFUSED
+            return Refusal.NOT_READY
+        return None if math.isfinite(word.since) else Refusal.FORGOTTEN
 
 
 def merged(said: Mapping[int, Mapping[bytes, int]]) -> dict[bytes, int]:

@@ -1,10 +1,7 @@
 """Queues of topic messages: at a replica for robots, on the robot for each replica. Pure.
 
-Messages are numbered by their publisher from 1. A replica keeps the last ones in a `Ring`; a
-robot asks for what comes after the last number that it has, so whatever is lost on the way is
-asked for again. On the robot an `Outbox` holds, for one replica, what that has not confirmed.
-
-Owns: which messages are kept, and in what order they go. Not here: sending them.
+Messages are numbered by their publisher from 1. A robot asks for what comes after the last number
+that it has, so whatever is lost on the way is asked for again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Which replicas' messages the robot gets. Pure: time is an argument.
 
-Replicas run the same nodes on the same input, so most of what they publish says the same.
-
-Owns: `leader`, `stamp`, `goal`, `all`. Not here: an action's status (`fogft.ros.messages`).
+Replicas run the same nodes on the same input, so most of what they publish says the same. Not here:
+an action's status (`fogft.ros.messages`).
 """
 
 from __future__ import annotations

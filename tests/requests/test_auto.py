@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.auto import BUDGET_CAPACITY, FEWEST_SPARES, Auto, Spares, TokenBucket
+from fogft.requests.auto import BUDGET_CAPACITY, FEWEST_SPARES, Auto, Spares
 from fogft.requests.latency import Latencies
 from fogft.requests.load import NEVER, Load, ReplicaLoad
 
@@ -16,17 +16,6 @@ A, B = b"a" * 16, b"b" * 16
 def idle(service_s: float, spent_s: float | None = None) -> Load:
     """What a replica says that has nothing more to do."""
     return Load(0, 0, 0, service_s, service_s if spent_s is None else spent_s)
-
-
-@given(st.lists(st.booleans(), max_size=300), st.floats(0.01, 1.0), st.floats(0, 20))
-def test_the_budget_is_never_exceeded(takes, share, capacity):
-    """After n requests at most capacity + share * n tokens were taken."""
-    bucket = TokenBucket(share, capacity)
-    taken = 0
-    for n, take in enumerate(takes, start=1):
-        bucket.request()
-        taken += take and bucket.take()
-        assert taken <= capacity + share * n + 1e-6
 
 
 @given(st.lists(st.floats(0.0002, 1000), min_size=1, max_size=200), st.floats(0.5, 0.99))

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.model.refusal import Refusal
 from fogft.model.spec import Part
 from fogft.topics import goals
-from fogft.topics.goals import Goals, Had, Took
+from fogft.topics.goals import Goals
 
 HEADER = b"\0\1\0\0"
 
@@ -113,26 +114,26 @@ def test_who_did_not_look_at_it_is_given_it_again_in_a_moment():
 
 
 @pytest.mark.parametrize(
-    ("said", "asked_at", "had"),
+    ("said", "asked_at", "lacked"),
     [
-        ([], 9.0, Had.NOTHING_SAID),
-        ([True], 9.0, Had.TAKEN),
-        ([True], 1.0, Had.NOTHING_SAID),  # it was asked for the result before it took the goal
-        ([False], 1.0, Had.REFUSED),
-        ([True, False], 9.0, Had.TAKEN),  # it has it already: action servers refuse a second one
-        ([False, True], 9.0, Had.TAKEN),
-        ([False, True], 1.0, Had.NOTHING_SAID),
+        ([], 9.0, Refusal.NOT_READY),
+        ([True], 9.0, None),
+        ([True], 1.0, Refusal.NOT_READY),  # it was asked for the result before it took the goal
+        ([False], 1.0, Refusal.FORGOTTEN),
+        ([True, False], 9.0, None),  # it has it already: action servers refuse a second one
+        ([False, True], 9.0, None),
+        ([False, True], 1.0, Refusal.NOT_READY),
     ],
 )
-def test_what_it_says_of_a_goal_counts_from_when_it_has_answered(said, asked_at, had):
+def test_what_it_says_of_a_goal_counts_from_when_it_has_answered(said, asked_at, lacked):
     made = under_way(1, 2)
     for accepts in said:
         made.took(b"id", 2, 2.0, accepts=accepts)
-    assert made.had(goal(1), 2, asked_at) is had
+    assert made.lacked(goal(1), 2, asked_at) is lacked
 
 
 def test_nobody_has_said_anything_of_a_goal_that_is_not_known():
-    assert Goals().had(goal(1), 1, 9.0) is Had.NOTHING_SAID
+    assert Goals().lacked(goal(1), 1, 9.0) is Refusal.NOT_READY
     for step in (Goals().ended, Goals().awaited):
         step(goal(1))
     Goals().lost(goal(1), 1)
@@ -210,7 +211,7 @@ def test_goals_that_nobody_awaits_are_forgotten_first(monkeypatch):
         made.made(request(number), bytes([number]), (1,), until=5.0)
     assert made.lacking(2, 9.0) == [request(1)]
     assert made.kept == 3
-    assert made.took(bytes([8]), 1, 1.0, accepts=True).goal == goal(8)
+    assert made.took(bytes([8]), 1, 1.0, accepts=True)[0] == goal(8)
 
 
 def test_who_takes_a_goal_that_was_forgotten_does_not_do_so_in_vain(monkeypatch):
@@ -219,8 +220,8 @@ def test_who_takes_a_goal_that_was_forgotten_does_not_do_so_in_vain(monkeypatch)
     made = Goals()
     for number in (1, 2):
         made.made(request(number), bytes([number]), (1,), until=5.0)
-    assert made.took(bytes([1]), 1, 1.0, accepts=True).goal is None
-    assert made.took(bytes([2]), 1, 1.0, accepts=True) == Took(goal(2), in_vain=False)
+    assert made.took(bytes([1]), 1, 1.0, accepts=True)[0] is None
+    assert made.took(bytes([2]), 1, 1.0, accepts=True) == (goal(2), False)
 
 
 def test_a_goal_that_was_made_while_nobody_was_there_is_known():
@@ -248,14 +249,14 @@ def test_a_goal_that_was_cancelled_is_given_to_nobody_and_nobody_is_expected_to_
     made.cancelled(goal(1))
     made.awaited(goal(1))  # its client asks what became of it
     assert made.lacking(3, 9.0) == []
-    assert made.had(goal(1), 3, 0.0) is Had.TAKEN
-    assert made.took(b"id", 2, 2.0, accepts=True) == Took(goal(1), in_vain=True)
+    assert made.lacked(goal(1), 3, 0.0) is None
+    assert made.took(b"id", 2, 2.0, accepts=True) == (goal(1), True)
     made.ended(goal(1))
-    assert made.took(b"id", 3, 2.0, accepts=True) == Took(None, in_vain=True)
+    assert made.took(b"id", 3, 2.0, accepts=True) == (None, True)
 
 
 def test_who_takes_a_goal_that_is_over_does_so_in_vain():
     made = under_way(1, 2)
     made.ended(goal(1))
-    assert made.took(b"id", 2, 2.0, accepts=False).goal is None
-    assert made.took(b"id", 2, 2.0, accepts=True) == Took(goal(1), in_vain=True)
+    assert made.took(b"id", 2, 2.0, accepts=False)[0] is None
+    assert made.took(b"id", 2, 2.0, accepts=True) == (goal(1), True)

@@ -29,7 +29,7 @@ from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.requests.decide import Decide, Judgement, Means, Pending, Reachable, Send
 from fogft.topics import goals
-from fogft.topics.goals import Goals, Had
+from fogft.topics.goals import Goals
 
 log = logging.getLogger(__name__)
 
@@ -178,11 +178,11 @@ class _GoalPart(Decide):
     def _took(self, id: bytes, replica: int, *, accepts: bool) -> None:
         action, now = self._action, self._action.clock()
         with action.lock:
-            took = action.goals.took(id, replica, now, accepts=accepts)
-            if took.goal is not None and took.in_vain:
-                action.cancel(took.goal, (replica,), now)
-        if took.goal is not None and not took.in_vain:
-            action.began(took.goal, replica)
+            goal, in_vain = action.goals.took(id, replica, now, accepts=accepts)
+            if goal is not None and in_vain:
+                action.cancel(goal, (replica,), now)
+        if goal is not None and not in_vain:
+            action.began(goal, replica)
 
     def refused(
         self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
@@ -267,9 +267,9 @@ class _ResultPart(Decide):
         now, unknown = action.clock(), goals.is_unknown(payload)
         with action.lock:
             under_way = goal in action.goals
-            had = action.goals.had(goal, replica, pending.open.get(replica, -math.inf))
-            if under_way and unknown and had is not Had.TAKEN:
-                return Refusal.FORGOTTEN if had is Had.REFUSED else Refusal.NOT_READY
+            lacked = action.goals.lacked(goal, replica, pending.open.get(replica, -math.inf))
+            if under_way and unknown and lacked is not None:
+                return lacked
             if reading and under_way and now < pending.deadline:
                 losers = action.goals.takers(goal) | set(action.replicas)
                 action.cancel(goal, losers - {replica}, now)
