@@ -80,14 +80,6 @@ def load_types(type_names: Sequence[str]) -> None:
             self_test()
 
 
-def declare_gone(participant: str, domain_id: int | None) -> None:
-    """Tell the ROS domain that the process of this `Joined.participant` was killed."""
-    from fogft.ros import spdp
-
-    with contextlib.suppress(ValueError):  # what a file says
-        spdp.declare_gone(bytes.fromhex(participant), domain_id)
-
-
 def join(
     speaks: Speaks,
     name: str,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import RosError
 from fogft.model.type_definition import difference
-from fogft.proxy.replica.service_queue import CANCEL_TYPE, EMPTY_REQUEST
+from fogft.proxy.replica.responder import CANCEL_TYPE, EMPTY_REQUEST
 from fogft.ros import messages, types
 from fogft.ros.types import definition
 

@@ -17,7 +17,7 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 from typing import Any
 
@@ -215,6 +215,11 @@ class Forwarder:
             "refused": {reason.value: count for reason, count in self.refused.items()},
         }
 
+    def work(self) -> dict[str, float]:
+        """Return the counters in the form of a probe's answer."""
+        refused = {reason.value: float(count) for reason, count in self.refused.items()}
+        return {"held": self.in_flight, "ran": self.passed, "joined": self.joined, **refused}
+
     def close(self) -> None:
         """Refuse requests under way, and stop."""
         with self._lock:
@@ -222,14 +227,3 @@ class Forwarder:
         for job in left:
             self._stop(job.id, Refusal.LOST)
         self._queue.put(None)
-
-
-def numbers(report: Mapping[str, Any]) -> dict[str, float]:
-    """Return a forwarder's counters in the form of a probe's answer."""
-    refused = report["refused"]
-    return {
-        "held": report["in_flight"],
-        "ran": report["passed"],
-        "joined": report["joined"],
-        **{reason: float(count) for reason, count in refused.items()},
-    }

@@ -31,7 +31,7 @@ from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.type_definition import RESPONSE
 from fogft.process import Watchdog, notify, start_log, stop_on_signal
 from fogft.proxy.config import read_gateway
-from fogft.proxy.gateway.gateway import Forwarder, numbers
+from fogft.proxy.gateway.gateway import Forwarder
 from fogft.proxy.middleware import fault_of
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher, Wake
@@ -150,7 +150,7 @@ class _Gateway:
             ready=ready,
             draining=self._draining,
             in_flight=self._forwarder.in_flight,
-            work=numbers(self._forwarder.report()),
+            work=self._forwarder.work(),
             detail="" if ready else "no replica behind it answers",
             behind=behind,
             types=self._proxy.links.types() if probe.describe else {},

@@ -6,6 +6,11 @@ At most `OUTSTANDING` requests a service are passed on at a time; the others wai
 ROS service keeps the last ten requests that it has not yet begun and silently loses more. What
 waits past its deadline is never begun, nor what its robot no longer wants.
 
+A service is told to stop what it works on through the cancel service that it offers: "stop what you
+are doing". That names no request, because a ROS service does not know our ids. So a service that
+has one is given one request at a time, and nothing more until the cancel service has answered: else
+what stops might be the next request. (The two travel apart, in any order.)
+
 Owns: what becomes of the requests that this replica holds.
 Not here: which ids are known (`known_requests`), in what order they run and how many
 (`service_queue`), readiness and the command (`supervisor`), links, ROS.
@@ -23,7 +28,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.known_requests import KnownRequests
-from fogft.proxy.replica.service_queue import Interruptions, Job, ServiceQueue
+from fogft.proxy.replica.service_queue import HOLD_LIMIT_S, Job, ServiceQueue
 from fogft.requests.load import Handling
 from fogft.ros.port import RosClient
 
@@ -32,6 +37,11 @@ log = logging.getLogger(__name__)
 # The default depth of a service's queue (rmw_qos_profile_services_default). Kept true by
 # tests/proxy/test_processes.py, which sends a burst to an ordinary service.
 OUTSTANDING = 10
+
+CANCEL_TYPE = "std_srvs/srv/Trigger"
+# A serialised message without fields: the header, the byte that stands for no fields, padding.
+# Kept true by tests/ros/test_types.py.
+EMPTY_REQUEST = bytes((0, 1, 0, 0, 0, 0, 0, 0))
 
 
 class Responder:
@@ -73,7 +83,7 @@ class Responder:
         self._clock, self._answered = clock, answered
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
-        self._interruptions = Interruptions()
+        self._cancel_clients: Mapping[str, RosClient] = {}
         self._known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
         self._queues: dict[str, ServiceQueue] = {}
         self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
@@ -130,7 +140,7 @@ class Responder:
     ) -> None:
         """Set the clients of the local services, and of their cancel services, by service."""
         self._clients = clients
-        self._interruptions.use(cancel_clients or {})
+        self._cancel_clients = cancel_clients or {}
 
     # -- from the wire --------------------------------------------------------------------
 
@@ -221,15 +231,24 @@ class Responder:
         for id in dropped:
             self._end(id, Refusal.CANCELLED)
         for job in at_work:
-            queue = self._queues[job.service]
-            with self._lock:
-                held = self._interruptions.begin(job, queue, self._clock())
-            if held and self._interruptions.send(job.service, self._interrupted):
-                self.interrupted += 1
+            client, queue = self._cancel_clients.get(job.service), self._queues[job.service]
+            if client is not None:
+                with self._lock:
+                    held = queue.hold(job, self._clock())
+                if held:
+                    self._interrupt(job.service, client)
+
+    def _interrupt(self, service: str, client: RosClient) -> None:
+        try:
+            client.call(EMPTY_REQUEST, lambda _: self._interrupted(service))
+            self.interrupted += 1
+        except RosError as error:
+            log.warning("cancel_not_called service=%s reason=%r", service, str(error))
+            self._interrupted(service)
 
     def _interrupted(self, service: str) -> None:
         with self._lock:
-            self._interruptions.ended(service)
+            self._queues[service].release()
         self._pass_on(service)
 
     # -- to the service -------------------------------------------------------------------
@@ -334,7 +353,6 @@ class Responder:
                 if service in (None, name):
                     lost += queue.abandoned(float("inf"))
                     queue.died()
-                    self._interruptions.ended(name)
         for job in (*blamed, *lost):
             self._forget_ticket(job)
         for job in spared:  # first: room that the blamed leave is not for them
@@ -348,7 +366,10 @@ class Responder:
         with self._lock:
             late = self._known.expired(now)
             abandoned = [job for queue in self._queues.values() for job in queue.abandoned(now)]
-            self._interruptions.tick(now)
+            for name, queue in self._queues.items():
+                if queue.held_until <= now:
+                    log.warning("cancel_unanswered service=%s waited_s=%.1f", name, HOLD_LIMIT_S)
+                    queue.release()
         for id in late:
             self._end(id, Refusal.EXPIRED)
         for job in abandoned:

@@ -34,8 +34,8 @@ from fogft.model.type_definition import Definition
 from fogft.proxy.replica.goals_once import GoalsOnce, for_the_moment
 from fogft.proxy.replica.offering import Offering
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
-from fogft.proxy.replica.responder import Responder
-from fogft.proxy.replica.service_queue import CANCEL_TYPE, Job, limits_of
+from fogft.proxy.replica.responder import CANCEL_TYPE, Responder
+from fogft.proxy.replica.service_queue import Job, limits_of
 from fogft.proxy.replica.serving_lease import HeldLease
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica

@@ -3,30 +3,20 @@
 In what order requests run is decided here and nowhere else (`take`). Called under the
 responder's lock.
 
-A service is told to stop what it works on through the cancel service that it offers, a
-`std_srvs/srv/Trigger`: "stop what you are doing". That names no request, because a ROS service does
-not know our ids. So a service that has one is given one request at a time, and nothing more until
-the cancel service has answered: else what stops might be the next request. (The two travel apart,
-in any order.)
-
-Owns: a service's queue, its limit, the room that is taken, and the cancel calls under way.
+Owns: a service's queue, its limit, and the room that is taken.
 Not here: request ids and copies (`responder`), the order itself (`requests.fair_queue`).
 """
 
 from __future__ import annotations
 
-import logging
 from collections import deque
-from collections.abc import Callable, Mapping
 
-from fogft.errors import RosError
 from fogft.link.port import Incoming
 from fogft.model.keys import LONGEST_S
 from fogft.model.spec import ServiceSpec
 from fogft.requests.concurrency import ConcurrencyLimit
 from fogft.requests.fair_queue import FairQueue
-from fogft.requests.load import NEARLY, Handling, Load
-from fogft.ros.port import RosClient
+from fogft.requests.load import NEARLY, NEVER, Handling, Load
 
 # Job whose deadline has passed is still in the service's hands and takes its room. After so
 # long its response is taken for lost.
@@ -40,6 +30,7 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
+HOLD_LIMIT_S = 2.0  # a cancel service that has not answered by then is given up
 _TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
 
 
@@ -90,6 +81,7 @@ class ServiceQueue:
         self._quiet_since: float | None = None  # it has work, and has ended none since
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
         self._last_deadline = 0.0
+        self.held_until = NEVER  # nothing is begun before, or before `release`
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
     def __len__(self) -> int:
@@ -200,6 +192,20 @@ class ServiceQueue:
             if not self._unanswered:
                 self._quiet_since = None
 
+    def hold(self, job: Job, now: float) -> bool:
+        """Begin nothing more until `release`; False if the job does not run, or one is held."""
+        if self.held_until < NEVER or not job.passed_on:
+            return False
+        self.at_work += 1
+        self.held_until = now + HOLD_LIMIT_S
+        return True
+
+    def release(self) -> None:
+        """End a `hold`, if there is one."""
+        if self.held_until < NEVER:
+            self.held_until = NEVER
+            self.at_work -= 1
+
     def hangs(self, now: float) -> bool:
         """Whether the service has work, and has finished none for far longer than usual."""
         return self.quiet_s(now) > max(_HANGS_AFTER_S, _HANGS_AFTER_TIMES * self._longest_s)
@@ -218,6 +224,7 @@ class ServiceQueue:
 
     def died(self) -> None:
         """Note that the service is a new process, of which nothing is known."""
+        self.release()
         self._quiet_since, self._unanswered, self._next = None, 0, None
         self._longest_s = self._last_deadline = 0.0
 
@@ -242,56 +249,3 @@ def limits_of(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
     # A cancel service names no request, so it must be clear which one is meant.
     limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
     return {name: limit for name, limit in limits.items() if limit}
-
-
-log = logging.getLogger(__name__)
-
-CANCEL_TYPE = "std_srvs/srv/Trigger"
-# A serialised message without fields: the header, the byte that stands for no fields, padding.
-# Kept true by tests/ros/test_types.py.
-EMPTY_REQUEST = bytes((0, 1, 0, 0, 0, 0, 0, 0))
-_LIMIT_S = 2.0
-
-
-class Interruptions:
-    """The cancel services of a replica. `send` needs no lock, the rest the responder's."""
-
-    def __init__(self) -> None:
-        self._clients: Mapping[str, RosClient] = {}
-        self._under_way: dict[str, tuple[ServiceQueue, float]] = {}
-
-    def use(self, clients: Mapping[str, RosClient]) -> None:
-        """Set the clients of the cancel services, by the service that they interrupt."""
-        self._clients = clients
-
-    def begin(self, job: Job, queue: ServiceQueue, now: float) -> bool:
-        """Hold back the service's next request; return whether there is a service to call."""
-        service = job.service
-        if service not in self._clients or service in self._under_way or not job.passed_on:
-            return False
-        queue.at_work += 1
-        self._under_way[service] = (queue, now + _LIMIT_S)
-        return True
-
-    def send(self, service: str, ended: Callable[[str], None]) -> bool:
-        """Call the cancel service; `ended` is called once it has answered."""
-        try:
-            self._clients[service].call(EMPTY_REQUEST, lambda _: ended(service))
-        except (RosError, KeyError) as error:
-            log.warning("cancel_not_called service=%s reason=%r", service, str(error))
-            ended(service)
-            return False
-        return True
-
-    def ended(self, service: str) -> None:
-        """Note that the cancel service has answered or died: the next request may go."""
-        found = self._under_way.pop(service, None)
-        if found is not None:
-            found[0].at_work -= 1
-
-    def tick(self, now: float) -> None:
-        """Give up on cancel services that do not answer."""
-        for service, (_, until) in list(self._under_way.items()):
-            if until <= now:
-                log.warning("cancel_unanswered service=%s waited_s=%.1f", service, _LIMIT_S)
-                self.ended(service)

@@ -65,11 +65,6 @@ class Supervisor:
         self.last_exit = ""
 
     @property
-    def pid(self) -> int | None:
-        """The pid of the command; None if it does not run."""
-        return self._child.pid if self._child is not None else None
-
-    @property
     def alive(self) -> bool:
         """Whether the command runs."""
         return self._child is not None

@@ -21,7 +21,7 @@ import os
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
-from typing import Any, Protocol
+from typing import Any
 
 from fogft.counters import worth_logging
 from fogft.errors import RosError
@@ -48,15 +48,8 @@ _SHORTEST_S = 0.002
 _TICK_S = 0.02  # until losers are told, at the latest
 
 
-class Wake(Protocol):
-    """Has `Dispatcher.tick` called then, if not sooner; without a moment, at once. Any thread."""
-
-    def __call__(self, at: float = -NEVER, /) -> None:
-        """Bring it about."""
-
-
-def _nobody(at: float = -NEVER, /) -> None:
-    """Wake nobody."""
+# Has `Dispatcher.tick` called at a moment, if not sooner; without one, at once. Any thread.
+Wake = Callable[..., None]
 
 
 class Dispatcher:
@@ -87,7 +80,7 @@ class Dispatcher:
         fault_of: Callable[[bytes], str] = lambda payload: "",
         ok_of: Callable[[str], Accepts] | None = None,
         empty_response: bytes | None = None,
-        wake: Wake = _nobody,
+        wake: Wake = lambda at=-NEVER: None,
         clock: Callable[[], float] = time.monotonic,
         max_pending_bytes: int = 256 << 20,
         max_pending: int = 1 << 16,

@@ -10,6 +10,7 @@ import contextlib
 import functools
 import json
 import logging
+import math
 import os
 import sys
 import threading
@@ -44,7 +45,8 @@ from fogft.proxy.robot.manager_restart import ManagerRestart
 from fogft.proxy.robot.order_mark import OrderMark
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.votes import Quorum
-from fogft.ros import memory_tuning
+from fogft.ros import memory_tuning, spdp
+from fogft.ros.joining import Pauses
 
 if TYPE_CHECKING:
     from fogft.ros.joining import EarlyJoin
@@ -277,7 +279,7 @@ class _Running:
         """Serve until told to stop, until the pool's folder is gone, or another is to go on.
 
         Returns:
-            Whether another process is to go on: see `standby.Renewal`.
+            Whether another process is to go on, because this one was stopped for long.
         """
         proxy, config, folder = self.proxy, self.config, self.config_path.parent
         memory, watchdog = memory_tuning.Trimmer(), Watchdog()
@@ -289,7 +291,7 @@ class _Running:
         started = reported = time.monotonic()
         looked = 0.0
         changed = False  # since the last report
-        participant, renewal = b"", in_line.Renewal()
+        participant, pauses, renew_at = b"", Pauses(), math.inf
         while not stop.is_set():
             changed = proxy.run_once() or changed
             now = time.monotonic()
@@ -299,7 +301,9 @@ class _Running:
             memory.look()
             watchdog.work()
             self.joined.node.look()
-            if renewal.due():
+            if pauses.was_long():
+                renew_at = now + in_line.RENEWED_AFTER_S
+            if now >= renew_at:
                 return True
             try_step(self.managing.look, config.lock)
             if self.held:
@@ -400,10 +404,10 @@ def _same(old: ClientProxyConfig, new: ClientProxyConfig, path: Path) -> ClientP
 
 def _bury(config: ClientProxyConfig) -> None:
     """Tell ROS that the process which had the lock before us is gone: if killed, it could not."""
-    with contextlib.suppress(StateError):
+    with contextlib.suppress(StateError, ValueError):  # what a file says
         left = disk.read_json(config.status)
         if isinstance(left, dict) and isinstance(said := left.get("participant"), str):
-            middleware.declare_gone(said, config.domain_id)
+            spdp.declare_gone(bytes.fromhex(said), config.domain_id)
 
 
 def _tell(path: Path, proxy: ClientProxy) -> None:

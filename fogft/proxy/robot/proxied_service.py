@@ -22,30 +22,7 @@ from fogft.ros.port import RosClient, RosNode, RosServer
 log = logging.getLogger(__name__)
 
 _LOOK_EVERY_S = 2.0  # whether clients understand our middleware, and who else offers it
-
-
-# Longer than the command of a lone replica takes to be started again.
-HOLD_S = 3.0
-
-
-class Advertising:
-    """Whether one service should be offered, as replicas come and go."""
-
-    def __init__(self) -> None:
-        self._offered = False
-        self._unable_since: float | None = None
-
-    def wanted(self, spec: ServiceSpec, *, able: bool, waiting: int, now: float) -> bool:
-        """Return whether a service with this policy should be offered now."""
-        at_once = spec.fallback is not None and spec.fallback.while_none_ready
-        if able or at_once or spec.advertised is Advertise.ALWAYS:
-            self._offered, self._unable_since = True, None
-        elif self._offered and spec.advertised is Advertise.WHILE_READY:
-            if self._unable_since is None:
-                self._unable_since = now
-            limit_s = HOLD_S + (spec.timeout_s if waiting else 0.0)
-            self._offered = now < self._unable_since + limit_s
-        return self._offered
+HOLD_S = 3.0  # longer than the command of a lone replica takes to be started again
 
 
 class ProxiedService:
@@ -58,7 +35,8 @@ class ProxiedService:
         self._fallback: RosClient | None = None
         self._fallback_name = ""
         self.trouble = ""
-        self._advertising = Advertising()
+        self._wanted = False
+        self._unable_since: float | None = None
         self._looked_at = 0.0
 
     def adopt(self, spec: ServiceSpec, node: RosNode | None) -> None:
@@ -86,15 +64,25 @@ class ProxiedService:
 
     def advertise(self, node: RosNode, now: float) -> None:
         """Offer or withdraw the service, as required now (monotonic seconds)."""
-        able, waiting = self.dispatcher.able, self.dispatcher.waiting
-        wanted = self._advertising.wanted(self.spec, able=able, waiting=waiting, now=now)
-        if wanted and self.server is None:
+        self._look_whether_wanted(now)
+        if self._wanted and self.server is None:
             self._offer(node)
-        elif not wanted and self.server is not None:
+        elif not self._wanted and self.server is not None:
             self._withdraw()
         elif self.server is not None and now > self._looked_at + _LOOK_EVERY_S:
             self._looked_at = now
             self._note("service_disturbed", self.server.mismatch())
+
+    def _look_whether_wanted(self, now: float) -> None:
+        spec = self.spec
+        at_once = spec.fallback is not None and spec.fallback.while_none_ready
+        if self.dispatcher.able or at_once or spec.advertised is Advertise.ALWAYS:
+            self._wanted, self._unable_since = True, None
+        elif self._wanted and spec.advertised is Advertise.WHILE_READY:
+            if self._unable_since is None:
+                self._unable_since = now
+            limit_s = HOLD_S + (spec.timeout_s if self.dispatcher.waiting else 0.0)
+            self._wanted = now < self._unable_since + limit_s
 
     def _offer(self, node: RosNode) -> None:
         spec = self.spec

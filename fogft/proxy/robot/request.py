@@ -8,7 +8,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from fogft.metrics.outcomes import Outcome, Outcomes
 from fogft.model.refusal import Refusal
@@ -19,7 +19,7 @@ from fogft.requests.pending import PendingRequests
 _TRACE_KEPT = 20_000  # lines until they are written, once a second
 
 
-class RequestTrace:
+class RequestTrace(NamedTuple):
     """The replicas asked for a traced request. Times on the dispatcher's clock, in seconds.
 
     Attributes:
@@ -27,16 +27,8 @@ class RequestTrace:
         refused: Each replica that refused it, with its last reason.
     """
 
-    __slots__ = ("asked", "refused")
-
-    def __init__(self) -> None:
-        self.asked: dict[int, float] = {}
-        self.refused: dict[int, Refusal] = {}
-
-    def declined(self, replica: int, asked: float | None) -> None:
-        """Undo that a replica was asked at this time; earlier attempts stay."""
-        if self.asked.get(replica) == asked:
-            self.asked.pop(replica, None)
+    asked: dict[int, float]
+    refused: dict[int, Refusal]
 
 
 class Request:
@@ -52,7 +44,7 @@ class Request:
         self.payload = payload
         self.handle = handle
         self.arrived = arrived
-        self.trace = RequestTrace() if traced else None
+        self.trace = RequestTrace({}, {}) if traced else None
 
 
 class Ledger:
@@ -94,7 +86,7 @@ class Ledger:
         """Trace a request's outcome, if enabled."""
         if self.outcomes.trace is None:
             return
-        arrived, trace = pending.item.arrived, pending.item.trace or RequestTrace()
+        arrived, trace = pending.item.arrived, pending.item.trace or RequestTrace({}, {})
         asked = {key: begun - arrived for key, begun in trace.asked.items()}
         self.outcomes.note(
             request,

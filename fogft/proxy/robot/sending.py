@@ -166,7 +166,9 @@ class Sender:
         with self._ledger.lock:
             pending = self._ledger.requests.get(id)
             if pending is not None and pending.item.trace is not None:
-                pending.item.trace.declined(replica, pending.open.get(replica))
+                asked = pending.item.trace.asked
+                if asked.get(replica) == pending.open.get(replica):  # earlier attempts stay
+                    asked.pop(replica, None)
             if is_copy:
                 self._ledger.requests.declined(id, replica)
             if self._replication is not None:

@@ -21,7 +21,6 @@ import contextlib
 import hashlib
 import importlib
 import logging
-import math
 import os
 import threading
 import time
@@ -174,20 +173,6 @@ def request_ids(key: Path, identity: Callable[[Any], Any]) -> Callable[[str, Any
         return hashlib.blake2b(told, key=secret, digest_size=REQUEST_ID_BYTES).digest()
 
     return id_of
-
-
-class Renewal:
-    """Says when to join ROS anew, as another process, because this one was stopped for long."""
-
-    def __init__(self) -> None:
-        self._pauses = Pauses()
-        self._at = math.inf
-
-    def due(self) -> bool:
-        """Whether it is time. Call it every second or more often."""
-        if self._pauses.was_long():
-            self._at = time.monotonic() + RENEWED_AFTER_S
-        return time.monotonic() >= self._at
 
 
 def hand_over(

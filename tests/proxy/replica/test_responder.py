@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
-from fogft.proxy.replica.responder import Responder
-from fogft.proxy.replica.service_queue import EMPTY_REQUEST
+from fogft.proxy.replica.responder import EMPTY_REQUEST, Responder
 from fogft.requests.load import Handling, Load
 from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
 

@@ -120,8 +120,8 @@ def test_the_command_dies_with_a_supervisor_that_is_killed(tmp_path):
     program = (
         "import os, sys, time, pathlib\n"
         "from fogft.proxy.replica.supervisor import Supervisor\n"
-        "s = Supervisor('exec sleep 63', pathlib.Path(sys.argv[1]), os.environ)\n"
-        "s.poll(); print(s.pid, flush=True); time.sleep(60)\n"
+        "s = Supervisor('echo $$; exec sleep 63', pathlib.Path(sys.argv[1]), os.environ)\n"
+        "s.poll(); time.sleep(60)\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True

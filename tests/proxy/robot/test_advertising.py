@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
@@ -10,18 +11,30 @@ from hypothesis import strategies as st
 
 from fogft.model.choices import FallbackSpec
 from fogft.model.spec import Advertise, OnTimeout, ServiceSpec
-from fogft.proxy.robot.proxied_service import HOLD_S, Advertising
+from fogft.proxy.robot.proxied_service import HOLD_S, ProxiedService
 
 SPEC = ServiceSpec("/s", "a/srv/A", timeout_s=10.0)
 steps = st.lists(st.tuples(st.booleans(), st.integers(0, 2), st.floats(0, 20)), max_size=40)
 
 
+class Scene:
+    """A service in ROS, whose dispatcher says what the test says."""
+
+    def __init__(self, spec: ServiceSpec) -> None:
+        self._service = ProxiedService(spec, Mock())
+
+    def offered(self, *, able: bool, waiting: int, now: float) -> bool:
+        self._service.dispatcher.able, self._service.dispatcher.waiting = able, waiting
+        self._service.advertise(Mock(), now)
+        return self._service.server is not None
+
+
 def run(spec: ServiceSpec, steps):
     """Yield, after each step, what it was told and whether the service is offered."""
-    rule, now = Advertising(), 0.0
+    scene, now = Scene(spec), 0.0
     for able, waiting, passed in steps:
         now += passed
-        yield able, now, rule.wanted(spec, able=able, waiting=waiting, now=now)
+        yield able, now, scene.offered(able=able, waiting=waiting, now=now)
 
 
 @given(steps)
@@ -56,24 +69,24 @@ def test_once_ready_is_never_withdrawn(steps):
 
 
 def test_a_request_that_waits_keeps_it_until_its_deadline():
-    rule = Advertising()
-    assert rule.wanted(SPEC, able=True, waiting=0, now=0.0)
-    assert rule.wanted(SPEC, able=False, waiting=1, now=1.0)
-    assert rule.wanted(SPEC, able=False, waiting=1, now=1.0 + HOLD_S)
-    assert not rule.wanted(SPEC, able=False, waiting=0, now=1.0 + HOLD_S)
+    scene = Scene(SPEC)
+    assert scene.offered(able=True, waiting=0, now=0.0)
+    assert scene.offered(able=False, waiting=1, now=1.0)
+    assert scene.offered(able=False, waiting=1, now=1.0 + HOLD_S)
+    assert not scene.offered(able=False, waiting=0, now=1.0 + HOLD_S)
 
 
 def test_a_lone_replica_that_comes_back_soon_was_never_away():
-    rule = Advertising()
-    assert rule.wanted(SPEC, able=True, waiting=0, now=0.0)
-    assert rule.wanted(SPEC, able=False, waiting=0, now=1.0)
-    assert rule.wanted(SPEC, able=True, waiting=0, now=2.0)
-    assert rule.wanted(SPEC, able=False, waiting=0, now=2.0 + HOLD_S)
+    scene = Scene(SPEC)
+    assert scene.offered(able=True, waiting=0, now=0.0)
+    assert scene.offered(able=False, waiting=0, now=1.0)
+    assert scene.offered(able=True, waiting=0, now=2.0)
+    assert scene.offered(able=False, waiting=0, now=2.0 + HOLD_S)
 
 
 def test_always_is_from_the_start():
     spec = replace(SPEC, advertise=Advertise.ALWAYS)
-    assert Advertising().wanted(spec, able=False, waiting=0, now=0.0)
+    assert Scene(spec).offered(able=False, waiting=0, now=0.0)
 
 
 @pytest.mark.parametrize(
