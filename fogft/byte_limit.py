@@ -1,7 +1,4 @@
-"""Bound the bytes of large messages held at once; small ones neither wait for them nor bar them.
-
-Owns: the sum, and what is small. Not here: how many messages there may be: their owner counts.
-"""
+"""Bound the bytes of large messages held at once; small ones neither wait for them nor bar them."""
 
 from __future__ import annotations
 
@@ -9,12 +6,7 @@ SMALL_BYTES = 16 << 10
 
 
 class ByteLimit:
-    """The large messages that are held: within a limit together, or a single one of any size.
-
-    Attributes:
-        limit: In bytes.
-        held: Bytes of the large ones now.
-    """
+    """The large messages held, in bytes: within a limit together, or one of any size."""
 
     def __init__(self, limit: int) -> None:
         self.limit = limit

@@ -1,7 +1,4 @@
-"""Count events by name, and log those that matter to people.
-
-Owns: numbers. Not here: what they are shown as (`fogft.proxy`, `fogft.pool`).
-"""
+"""Count events by name, and log those that matter to people."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
 """Files shared between processes: replaced atomically, private, locked by the kernel.
 
-A reader sees the old file or the new one, never a torn one; a full disk leaves the old one, but for
-a report, which is written over where it lies.
-Locks are flocks: they end with the process that holds them, whatever ends it.
+Locks are flocks: they end with the process that holds them, whatever ends it. Errors: StateError.
 """
 
 from __future__ import annotations
@@ -30,11 +28,7 @@ T = TypeVar("T")
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder that only this user can enter, with its parents.
-
-    Raises:
-        StateError: It cannot be made.
-    """
+    """Create a folder that only this user can enter, with its parents."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -45,11 +39,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> None:
-    """Replace a file at once, mode 0600; with `durable` it survives a power cut (one fsync).
-
-    Raises:
-        StateError: It cannot be written; the old file is as it was.
-    """
+    """Replace a file at once, or leave it; 0600; `durable`: survives a power cut (one fsync)."""
     data = content.encode() if isinstance(content, str) else content
     os.close(_replaced(path, data, durable=durable))
 
@@ -94,7 +84,7 @@ class Report:
         self._open: int | None = None
 
     def write(self, value: Any) -> None:
-        """Replace the file. Raises StateError."""
+        """Replace the file."""
         data = json.dumps(value).encode()
         try:
             new = _replaced(self._path, data, durable=False)
@@ -128,7 +118,7 @@ def to_json(value: Any) -> str:
 
 
 def read_bytes(path: Path) -> bytes | None:
-    """Return what a file holds, or None where there is none. Raises StateError."""
+    """Return what a file holds, or None where there is none."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
@@ -139,7 +129,7 @@ def read_bytes(path: Path) -> bytes | None:
 
 
 def read_json(path: Path, hint: str = "") -> Any:
-    """Return what a JSON file holds, or None where there is no file. Raises StateError."""
+    """Return what a JSON file holds, or None where there is no file."""
     raw = read_bytes(path)
     if raw is None:
         return None
@@ -150,11 +140,7 @@ def read_json(path: Path, hint: str = "") -> Any:
 
 
 def read_as(cls: type[T], path: Path, hint: str = "") -> T | None:
-    """Return the value that a JSON file of ours describes, or None where there is no file.
-
-    Raises:
-        StateError: It cannot be read, or describes none.
-    """
+    """Return the value that a JSON file of ours describes, or None where there is no file."""
     raw = read_json(path, hint)
     return None if raw is None else stored(cls, raw, f"`{path}` is damaged", hint)
 
@@ -184,7 +170,7 @@ class Lock:
         refusal proves nothing: it is tried for a moment.
         """
         until = time.monotonic() + _PATIENCE_S
-        while not self._try(fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB):
+        while not self.take(fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB):
             if time.monotonic() > until:
                 return False
             time.sleep(0.01)
@@ -194,11 +180,8 @@ class Lock:
             os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
         return True
 
-    def take_if_free(self) -> bool:
-        """Take the lock only if it is free now."""
-        return self._try(fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-    def _try(self, how: int) -> bool:
+    def take(self, how: int) -> bool:
+        """Call flock; return False where it is told not to wait, and would have to."""
         try:
             descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
@@ -240,12 +223,12 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def is_locked(path: Path) -> bool:
-    """Return whether a living process holds the lock of this file. Raises StateError."""
+    """Return whether a living process holds the lock of this file."""
     if not path.exists():
         return False
     lock = Lock(path)
     try:
-        if not lock.take_if_free():
+        if not lock.take(fcntl.LOCK_EX | fcntl.LOCK_NB):
             return True
     except FileNotFoundError:  # its folder has just gone
         return False
@@ -288,11 +271,7 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
 
 
 def unwritable(folder: Path) -> str:
-    """Say why the disk of a folder takes nothing more, `full` or `read-only`; empty where it does.
-
-    Raises:
-        OSError: The folder cannot be looked at.
-    """
+    """Say why a folder's disk takes nothing more, `full` or `read-only`; else empty."""
     seen = os.statvfs(folder)
     if seen.f_flag & os.ST_RDONLY:
         return "read-only"
@@ -318,8 +297,6 @@ class Watched:
 
     def changed(self) -> bool:
         """Return whether the file is there and is not the one seen at the last call."""
-        found = version(self.path)
-        if found is None or found == self._seen:
-            return False
-        self._seen = found
-        return True
+        found, before = version(self.path), self._seen
+        self._seen = found or before
+        return found not in (None, before)

@@ -1,8 +1,4 @@
-"""All errors shown to users. Each has a message (what, where) and a hint (what to do).
-
-The command line prints a `FogftError` as ``error:`` and ``hint:``, without a stack
-trace, and exits with status 1. Anything else is a defect of ours and keeps its trace.
-"""
+"""All errors shown to users. Each has a message (what, where) and a hint (what to do)."""
 
 from __future__ import annotations
 
@@ -26,9 +22,7 @@ class FogftError(Exception):
 class SpecError(FogftError):
     """A pool file is wrong. The message begins with ``file:line: key:``.
 
-    Attributes:
-        key: The key that it is about, such as ``fogft.replicas``; empty where it is about none.
-        line: Where, from 1; 0 where it is about no line.
+    `key`, such as ``fogft.replicas``, is empty and `line` 0 where it is about none.
     """
 
     def __init__(
@@ -41,7 +35,7 @@ class SpecError(FogftError):
 
     @classmethod
     def of_key(cls, key: str, what: str, hint: str = "") -> SpecError:
-        """Return the error of a key, for whoever knows the file and its lines to place."""
+        """Return the error of a key, to be placed by whoever knows the file and its lines."""
         return cls(f"{key}: {what}", hint, key=key, what=what)
 
 

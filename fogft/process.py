@@ -1,11 +1,4 @@
-"""What all processes of fogft share: logging, signals, systemd notification, faster start-up.
-
-ROS's types load numpy, whose OpenBLAS starts a thread for each further core. Each spins before it
-sleeps: 30 to 100 ms of processor time of a proxy's start, for arithmetic that a proxy never does.
-
-What a start makes lives as long as the process. To look through it for garbage costs the start
-some 40 ms, and later, now and then, a pause of many milliseconds.
-"""
+"""What all processes of fogft share: logging, signals, systemd notification, faster start-up."""
 
 from __future__ import annotations
 
@@ -88,12 +81,10 @@ class Hanging:
 
     def look(self, pid: int | None) -> bool:
         """Look at a process, or at another one than before; return whether it hangs."""
-        seen = pid, _sleeps(pid)
-        now = self._clock()
+        seen, now = (pid, _sleeps(pid)), self._clock()
         step_s = min(now - self._looked_at, _STEP_S)
-        self._looked_at = now
         self._still_s = self._still_s + step_s if seen[1] and seen == self._seen else 0.0
-        self._seen = seen
+        self._looked_at, self._seen = now, seen
         return self._still_s > self._limit_s
 
     def end(self, pid: int | None) -> bool:
@@ -125,7 +116,8 @@ _THREADS = "OPENBLAS_NUM_THREADS"
 def load_numpy(environ: MutableMapping[str, str] = os.environ) -> None:
     """Load numpy, where there is one, without threads, unless the user has set their number.
 
-    Nothing of it is left in the environment: the user's command may want BLAS.
+    ROS's types load it, and the threads of its OpenBLAS spin before they sleep: 30 to 100 ms of a
+    start. Nothing of it is left in the environment: the user's command may want BLAS.
     """
     if _THREADS in environ:
         return
@@ -138,7 +130,7 @@ def load_numpy(environ: MutableMapping[str, str] = os.environ) -> None:
 
 
 def begin_start() -> None:
-    """Disable garbage collection until `end_start`."""
+    """Disable garbage collection until `end_start`: what a start makes lives on."""
     gc.disable()
 
 

@@ -140,7 +140,6 @@ def _chaos() -> Chaos:
 
 
 def _machine(pool: str | None, slot: int) -> ReplicaId:
-
     identity = composition.store_of(pool).identity()
     machines = composition.cloud_of(identity).machines(identity.uid)
     found = [machine.id for machine in machines if machine.id.slot == slot]

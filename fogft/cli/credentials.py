@@ -22,6 +22,7 @@ from fogft.cli.status_text import utc
 from fogft.errors import CredentialError, FogftError
 from fogft.model.plain import to_plain
 from fogft.pool.commands import composition
+from fogft.pool.folder.paths import home
 
 if TYPE_CHECKING:
     from fogft.model.credentials import Holder, Role
@@ -192,7 +193,6 @@ def join(
     """
     from fogft.pool.commands import joining
     from fogft.pool.credentials.bundle import read_label
-    from fogft.pool.folder.paths import home
 
     label = read_label(joining.read(bundle))
     whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"
@@ -224,7 +224,6 @@ def export(
     this machine's client proxy keep answering.
     """
     from fogft.pool.commands import moving
-    from fogft.pool.folder.paths import home
 
     passphrase, is_new = _chosen_passphrase(passphrase_file)
     store = composition.store_of(pool)
@@ -261,7 +260,6 @@ def import_(
     but one stop once a replica tells them, within a minute.
     """
     from fogft.pool.commands import moving, startup
-    from fogft.pool.folder.paths import home
 
     passphrase = _read_passphrase(passphrase_file)
     disk.make_folder(home())

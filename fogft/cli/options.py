@@ -12,11 +12,10 @@ from typing import Annotated
 import typer
 
 from fogft.pool.commands import composition
+from fogft.pool.folder.paths import PoolPaths
 
 
 def _offer(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
-    """Return a completion that offers what is known and begins as typed."""
-
     def offer(incomplete: str) -> list[str]:
         try:
             return [value for value in known() if value.startswith(incomplete)]
@@ -27,13 +26,11 @@ def _offer(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
 
 
 def _pools() -> list[str]:
-
     return composition.pools()
 
 
 def _slots() -> list[str]:
     from fogft.pool.commands import status
-    from fogft.pool.folder.paths import PoolPaths
 
     every = {slot for pool in _pools() for slot in status.slots(PoolPaths.of(pool))}
     return [str(slot) for slot in sorted(every)]
@@ -41,7 +38,6 @@ def _slots() -> list[str]:
 
 def _locations() -> list[str]:
     from fogft.pool.commands import status
-    from fogft.pool.folder.paths import PoolPaths
 
     seen = [status.read(PoolPaths.of(pool), 0.0).status for pool in _pools()]
     zones = {replica.location for one in seen for replica in one.replicas}
@@ -49,7 +45,6 @@ def _locations() -> list[str]:
 
 
 def _excluded() -> list[str]:
-
     return sorted({x for p in _pools() for x in composition.make_store(p).intent().excluded})
 
 

@@ -15,6 +15,7 @@ from fogft.cli.options import AsJson, PoolArgument, PoolOption
 from fogft.cli.status_text import age, price
 from fogft.errors import PoolNotFound, StateError
 from fogft.pool.commands import composition
+from fogft.pool.folder.paths import home
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -123,7 +124,6 @@ def cost(pool: PoolArgument = None, as_json: AsJson = False, named: PoolOption =
     have ended.
     """
     from fogft.pool.folder.costs import read_all
-    from fogft.pool.folder.paths import home
 
     name = pool or named
     found = [one for one in read_all(home() / "costs") if name in (None, one.pool)]

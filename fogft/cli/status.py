@@ -171,7 +171,6 @@ def logs(
         time.sleep(FOLLOW_EVERY_S)
 
 
-_CHUNK_BYTES = 1 << 16
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?")
 
 
@@ -196,7 +195,6 @@ class Tail:
     def __init__(self, path: Path, last: int | None) -> None:
         self._path = path
         self._last = last
-        self._rest = b""
         self._inode = -1
         self._position = 0
 
@@ -213,10 +211,9 @@ class Tail:
         with file:
             stat = os.fstat(file.fileno())
             if stat.st_ino != self._inode or stat.st_size < self._position:
-                self._inode, self._position, self._rest = stat.st_ino, 0, b""
+                self._inode, self._position = stat.st_ino, 0
             file.seek(self._position)
-            while chunk := file.read(_CHUNK_BYTES):
-                self._position += len(chunk)
-                *whole, self._rest = (self._rest + chunk).split(b"\n")
-                for line in whole:
-                    yield line.decode(errors="replace").rstrip("\r")
+            for line in file:
+                if line.endswith(b"\n"):
+                    self._position += len(line)
+                    yield line[:-1].decode(errors="replace").rstrip("\r")

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from fogft.metrics.outcomes import BUCKETS_S
+from fogft.metrics.outcomes import BUCKETS_S, Outcome
 from fogft.metrics.scrape import counter, gauge, histogram
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
-# How requests end. `pending` is the rest.
-OUTCOMES = ("answered", "fallback", "empty", "silent", "turned_away", "cancelled", "poison")
 _COUNTS = {
     "received": ("fogft_requests_total", "Requests that callers sent."),
     "sent": ("fogft_attempts_total", "Copies of requests that were sent to replicas."),
@@ -102,7 +100,7 @@ def _requests(services: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
         (
             (count[outcome], {"service": s, "outcome": outcome})
             for s, count in services.items()
-            for outcome in OUTCOMES
+            for outcome in (one.value for one in Outcome)
             if outcome in count
         ),
     )

@@ -1,9 +1,8 @@
 """Metrics as `prometheus-client` has them, made at a scrape, and served over plain HTTP.
 
 Nothing is counted through the library: counting on a request's way stays a plain addition. It is
-imported at the first scrape, so that a process that nobody scrapes never loads it. A scraper that
-is slow or hostile occupies a thread, but there are few of those: a newer connection ends the
-oldest. Whatever goes wrong here harms nothing else in the process.
+imported at the first scrape, so that a process that nobody scrapes never loads it. A slow or
+hostile scraper occupies a thread, but there are few: a newer connection ends the oldest.
 """
 
 from __future__ import annotations
@@ -26,8 +25,13 @@ from fogft.model.names import host_and_port
 if TYPE_CHECKING:
     from prometheus_client import CollectorRegistry, Metric
 
+log = logging.getLogger(__name__)
+
 Labels = Mapping[str, str]
 Values = Iterable[tuple[float, Labels]]
+Measure = Callable[[], "Iterable[Metric]"]
+_LIMIT_S = 5.0
+_AT_ONCE = 8
 
 
 def counter(name: str, help: str, values: Values) -> Metric:
@@ -57,14 +61,11 @@ def histogram(
         known, so_far = _printable(labels), 0
         for bound, count in zip((*bounds, math.inf), counts, strict=True):
             so_far += count
-            family.add_sample(f"{name}_bucket", {**known, "le": _bound(bound)}, so_far)
+            within = "+Inf" if bound == math.inf else str(float(bound))
+            family.add_sample(f"{name}_bucket", {**known, "le": within}, so_far)
         family.add_sample(f"{name}_count", known, so_far)
         family.add_sample(f"{name}_sum", known, total)
     return family
-
-
-def _bound(bound: float) -> str:
-    return "+Inf" if bound == math.inf else str(float(bound))
 
 
 def _family(name: str, kind: str, help: str, values: Values, suffix: str = "") -> Metric:
@@ -84,12 +85,11 @@ def _printable(labels: Labels) -> dict[str, str]:
 class _Collector:
     """What one process tells: its families as measured now, each with the process's labels."""
 
-    def __init__(self, measure: Callable[[], Iterable[Metric]], labels: Labels) -> None:
+    def __init__(self, measure: Measure, labels: Labels) -> None:
         self._measure = measure
-        self._labels = dict(labels)
+        self._labels = labels
 
     def collect(self) -> Iterator[Metric]:
-        """Yield what there is to tell; families without samples are left out."""
         yield gauge(
             "fogft_build_info",
             "Version of fogft and of Python.",
@@ -106,21 +106,13 @@ class _Collector:
                 yield family
 
 
-def registry(measure: Callable[[], Iterable[Metric]], labels: Labels) -> CollectorRegistry:
+def registry(measure: Measure, labels: Labels) -> CollectorRegistry:
     """Return a process's metrics registry, collected at each scrape, with these labels."""
     from prometheus_client import CollectorRegistry
 
     made = CollectorRegistry(auto_describe=False)
     made.register(_Collector(measure, labels))
     return made
-
-
-log = logging.getLogger(__name__)
-
-_LIMIT_S = 5.0
-_AT_ONCE = 8
-
-Measure = Callable[[], "Iterable[Metric]"]
 
 
 class Scrape:
@@ -159,9 +151,8 @@ class Scrape:
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))
             return
-        threading.Thread(
-            target=self._server.serve_forever, name="fogft-metrics", daemon=True
-        ).start()
+        serve = self._server.serve_forever
+        threading.Thread(target=serve, name="fogft-metrics", daemon=True).start()
         log.info("metrics_served endpoint=%s", self.endpoint)
 
     def close(self) -> None:
@@ -177,12 +168,10 @@ class _Server(ThreadingMixIn, WSGIServer):
     block_on_close = False
 
     def server_activate(self) -> None:
-        """Begin to listen."""
         self._open: dict[socket.socket, None] = {}  # oldest first
         super().server_activate()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Answer a request in a thread of its own; end the oldest where there are too many."""
         self._open[request] = None
         if len(self._open) > _AT_ONCE:
             oldest = list(self._open)[0]  # noqa: RUF015 - in one step: other threads take theirs out
@@ -192,7 +181,6 @@ class _Server(ThreadingMixIn, WSGIServer):
         super().process_request(request, client_address)
 
     def shutdown_request(self, request: Any) -> None:
-        """A request has ended."""
         self._open.pop(request, None)
         super().shutdown_request(request)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import io
 import itertools
+import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from fogft.cli.options import PoolArgument, PoolOption
 from fogft.cli.status_text import age, milliseconds, price, utc
 from fogft.errors import FogftError
 from fogft.pool.commands import composition
+from fogft.pool.folder.paths import home
 
 if TYPE_CHECKING:
     from fogft.planning.observed.history import Event
@@ -59,12 +61,9 @@ def report(
 
 
 def _page(store: Any, now: float) -> str:
-    import sys
-
     from fogft.cli.overview import event_rows
     from fogft.pool.commands.status import read
     from fogft.pool.folder.costs import read_all
-    from fogft.pool.folder.paths import home
 
     seen = read(store.paths, now)
     status = seen.status
