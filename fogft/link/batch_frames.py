@@ -1,9 +1,7 @@
-"""Several small requests, or several small answers, in one message. Pure.
+"""Several small requests, or several small answers, in one message: the bytes. Pure.
 
-A message costs both ends far more than the few bytes in it, so what leaves a connection at the
-same moment leaves together. Like `frame`, a decoder returns a value or raises `FrameError`.
-
-Owns: the bytes. Not here: what is sent together (`window`, `reply_queue`).
+A message costs both ends far more than the few bytes in it. Like `frame`, a decoder returns a value
+or raises `FrameError`. What is sent together is decided in `window` and `reply_queue`.
 """
 
 from __future__ import annotations
@@ -29,8 +27,8 @@ _STAMPED = len(_FIRST) + STAMP_BYTES
 _REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdBI")  # id, remaining seconds, handling, length
 _ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s{frame.LOAD_BYTES}s?I")  # ..., refusal, length
 
-Requests = Sequence[tuple[bytes, float, int, bytes]]
-Answers = Sequence[tuple[bytes, bytes, bytes, str]]
+Requests = Sequence[tuple[bytes, float, int, bytes]]  # id, remaining seconds, handling, payload
+Answers = Sequence[tuple[bytes, bytes, bytes, str]]  # id, load, payload, refusal
 
 
 def is_batch(header: bytes) -> bool:
@@ -41,11 +39,9 @@ def is_batch(header: bytes) -> bool:
 def encode_requests(
     requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
 ) -> tuple[bytes, bytes]:
-    """Return header and payload for requests: id, remaining seconds, handling and payload.
+    """Return header and payload for at most `LIMIT` requests.
 
-    Args:
-        requests: At most `LIMIT`, of at most `BYTES_LIMIT` bytes together.
-        seen: The stamp of the last answer that the connection has seen.
+    `seen` is the stamp of the last answer that the connection has seen.
     """
     parts = []
     for id, remaining_s, handling, payload in requests:
@@ -55,11 +51,7 @@ def encode_requests(
 
 
 def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
-    """Return the requests of a batch, each with a header of its own.
-
-    Raises:
-        FrameError: It is not one: then none of it is to be believed.
-    """
+    """Return the requests of a batch, each with a header of its own. Raises FrameError."""
     if not is_batch(header):
         raise FrameError("no batch of requests")
     seen = header[1:_STAMPED]
@@ -73,7 +65,7 @@ def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, 
 
 
 def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
-    """Return header and payload for answers: id, load, payload or refusal of each."""
+    """Return header and payload for answers."""
     parts = []
     for id, load, payload, reason in answers:
         said = reason.encode("ascii") if reason else payload

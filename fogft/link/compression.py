@@ -1,15 +1,12 @@
 """Compress payloads on thin uplinks where that pays, and decompress them. No Zenoh.
 
-zlib at its lowest level: it is in every Python, and on the links where compression can pay at
-all it is not what limits. What pays is measured for each service: how far its bytes shrink and
-how long that takes, against how long they would take to leave at the rate that was seen. What
-does not shrink is left alone, and tried again rarely.
+zlib at its lowest level: on the links where compression can pay at all it is not what limits. What
+pays is measured for each service. What does not shrink is left alone, and tried again rarely.
 
 A few kilobytes may become 64 MiB. Zenoh's thread, which brings the bytes of all links, must not
-spend that time; and nobody waits behind what another peer sent. So a thread of each peer's own
-decompresses, from its first payload to its last.
+spend that time, nor may one peer wait behind another: a thread of each peer's own decompresses.
 
-Owns: when and how. Not here: rates (`socket_progress`), headers (`frame`).
+Not here: rates (`socket_progress`), headers (`frame`).
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """The bytes of headers, refusals, greetings and cancellations. Pure.
 
-Whatever bytes come in, a decoder returns a value or raises `FrameError`, nothing else: the
-peer is another process, perhaps of another version. Each frame begins with its version.
-
-Owns: the bytes. Not here: sending them, what they mean, and other frames (`probe_frames`,
-`batch_frames`, `fogft.records.frames`, `fogft.topics.frames`).
+Whatever bytes come in, a decoder returns a value or raises `FrameError`, nothing else: the peer may
+be of another version. Each frame begins with its version. Other frames: `probe_frames`,
+`batch_frames`, `fogft.records.frames`, `fogft.topics.frames`.
 """
 
 from __future__ import annotations
@@ -88,11 +86,7 @@ class Greeting:
 
 
 def origin(robot: str, token: bytes) -> bytes:
-    """Return the prefix of all headers of a connection.
-
-    Raises:
-        ValueError: The token is not 8 bytes, or the name not 1 to 64 printable bytes.
-    """
+    """Return the prefix of all headers of a connection. Raises ValueError: they cannot have it."""
     name = robot.encode()
     if len(token) != TOKEN_BYTES:
         raise ValueError(f"a token has {TOKEN_BYTES} bytes")

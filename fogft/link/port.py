@@ -170,15 +170,11 @@ class LinkEvents(Protocol):
     def answered(self, link: Link, answer: Answer) -> None:
         """An attempt has ended. Called exactly once for each accepted `offer`.
 
-        An attempt whose link dies ends with ``Refusal.LOST``; a later answer of the
-        old connection is dropped by the link.
+        One whose link dies ends with ``Refusal.LOST``; the link drops what comes later.
         """
 
     def late(self, link: Link, answer: Answer) -> None:
-        """A forgotten attempt has ended; its bytes are not needed.
-
-        Of a connection that was given up it may not be told.
-        """
+        """A forgotten attempt has ended. Of a connection that was given up it may not be told."""
 
     def changed(self, link: Link) -> None:
         """The link's `state`, `probe_answer` or room in its window has changed."""
@@ -188,8 +184,7 @@ class LinkEvents(Protocol):
 class Peer:
     """A replica to dial: its endpoint (``host:port``) and the name its certificate must have.
 
-    Attributes:
-        interface: Through which of our network interfaces; empty for whatever the routes say.
+    It is reached through one of our network interfaces; empty for whatever the routes say.
     """
 
     id: ReplicaId
@@ -262,10 +257,7 @@ class Link(Protocol):
         """Flush requests that were offered with `more`. Cheap; never blocks."""
 
     def forget(self, request_id: bytes) -> None:
-        """Free the window of a request whose answer is no longer wanted. Unknown ids are fine.
-
-        The replica is told: at once if the request has been out for a while, else by `flush`.
-        """
+        """Free the window of a request whose answer is no longer wanted; the replica is told."""
 
     def flush(self) -> None:
         """Send cancellations for forgotten, unanswered requests. Cheap; never blocks."""
@@ -296,10 +288,7 @@ class Dialer(Protocol):
         """Return newer records that replicas sent in reply; nothing is verified."""
 
     def certificate(self) -> str:
-        """Return the common name of the certificate that every link uses.
-
-        Empty while some still use another one, and where there are no certificates.
-        """
+        """Return the common name of the certificate of every link; empty while they differ."""
 
     def close(self) -> None:
         """Close every link."""

@@ -36,11 +36,8 @@ def decode_probe(frame: bytes) -> Probe:
 def encode_probe_answer(answer: ProbeAnswer) -> bytes:
     """Return a probe's answer as compact JSON; a long `detail` is cut.
 
-    Where it does not fit, definitions of types are left out, then the later half of what is
-    behind, then the next.
-
-    Raises:
-        ValueError: It names more services than any pool file may.
+    Where it does not fit, definitions of types are left out, then the later half of what is behind,
+    then the next. Raises ValueError: it names more services than any pool file may.
     """
     behind = tuple(_shortened(one) for one in answer.behind)
     written = replace(answer, detail=_cut(answer.detail, DETAIL_LIMIT), behind=behind)

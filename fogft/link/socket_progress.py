@@ -1,17 +1,14 @@
 """How fast one connection drains, since when it does not, and what cannot arrive in time over it.
 
-A send that takes long is no fault on a thin uplink: 1 MB needs eight seconds at 1 Mbit/s. It is
-one when nothing moves. The kernel knows: it counts the bytes that the peer has acknowledged. So
-how long a link may take follows from what is measured, and no time-out has to be guessed.
+1 MB needs eight seconds at 1 Mbit/s: a send that takes long is a fault only where nothing moves.
+The kernel counts what the peer has acknowledged, so no time-out has to be guessed.
 
-Where more is asked of a thin link than it carries, each request leaves after those before it, with
-too little of its time left: every one arrives too late, and none in time. So the window follows
-from the rate that the link was seen to carry and from the time that is left; who is declined at
-once may be sent on another uplink, or to another replica. The rate is known for ten seconds only:
-then a request is let through again, by which the link is measured anew.
+Where more is asked of a thin link than it carries, each request leaves after those before it, and
+every one arrives too late. So what would be too late at the rate that was seen is declined at once,
+and may go elsewhere. The rate is known for ten seconds only: then a request is let through again,
+by which the link is measured anew.
 
-Owns: the rate, what counts as progress, and that judgement. `now` is an argument.
-Not here: where the counts come from (`sockets`), the bounds by bytes and by count (`window`).
+`now` is an argument. Not here: where the counts come from (`sockets`), the bounds (`window`).
 """
 
 from __future__ import annotations
@@ -34,9 +31,7 @@ KEPT_S = 10.0  # then a link is measured anew
 class Throughput:
     """The throughput of one connection. Times are monotonic seconds.
 
-    Attributes:
-        steady_bytes_per_s: What two spans in a row carried at best, until more is seen; None
-            before that.
+    `steady_bytes_per_s` is what two spans in a row carried at best, until more is seen.
     """
 
     def __init__(self) -> None:
@@ -112,14 +107,10 @@ class Flow:
 
 
 class SocketProgress:
-    """The progress of one connection. Times are monotonic seconds.
-
-    Attributes:
-        throughput: What it was seen to carry over some time.
-    """
+    """The progress of one connection. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self.throughput = Throughput()
+        self.throughput = Throughput()  # over some time
         self._last: Flow | None = None
         self._last_at = 0.0
         self._progress_at: float | None = None  # None: nothing is outstanding
@@ -130,10 +121,8 @@ class SocketProgress:
     def look(self, flow: Flow, now: float, sending_for_s: float = 0.0) -> float:
         """Take a new count; return for how many seconds since the last one data moved.
 
-        These are not to be held against the peer: whatever it says queues behind that.
-
-        Args:
-            sending_for_s: For how long something large has been on its way into the kernel.
+        These are not to be held against the peer: whatever it says queues behind that. Something
+        large has been on its way into the kernel for `sending_for_s`.
         """
         last, since_s = self._last, now - self._last_at
         if last is not None and since_s < _SHORTEST_LOOK_S:
@@ -176,9 +165,8 @@ class SocketProgress:
     def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
         """Whether the queue has been still for longer than pauses of this path explain.
 
-        Args:
-            shortest_s: However quick the path: its peer's processor may be busy.
-            longest_s: However slow the path, no longer than that.
+        At least for `shortest_s`: the peer's processor may be busy. However slow the path, no
+        longer than `longest_s`.
         """
         last = self._last
         if last is None or last.outstanding < BULK_BYTES:

@@ -1,11 +1,8 @@
 """Several uplinks at once: a link for each replica *and* interface, combined into one.
 
-Whoever uses it sees one link to one replica. A request goes out on one uplink or on all, as
-its service's policy says, under one id: the replica runs it once, whichever copies arrive.
-When an uplink is lost with requests on it, they go out on another one, without the caller's
-policy hearing of it. Only when no uplink is left an attempt ends as lost.
-
-Owns: which uplinks an attempt is on. Not here: the links themselves (`link`).
+A request goes out on one uplink or on all, as its service's policy says, under one id: the replica
+runs it once. When an uplink is lost with requests on it, they go out on another one. Only when no
+uplink is left an attempt ends as lost.
 """
 
 from __future__ import annotations
@@ -253,10 +250,7 @@ class UplinksLink:
         self._events.answered(self, answer)
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Report wasted work, once: a second copy of an answer is not one.
-
-        That it was dropped on one uplink says nothing while another may tell more.
-        """
+        """Report wasted work, once, unless another uplink may tell more."""
         id = answer.request_id
         with self._lock:
             may_tell = self._forgotten.get(id, 1)

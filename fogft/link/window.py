@@ -1,20 +1,16 @@
 """What a connection keeps of attempts: those open, unanswered, about to leave, or cancelled.
 
-An attempt is in its window from the moment it is accepted until it has ended; whoever removes it
-reports its end, so that each end is reported once. The offering thread, the sender thread
-and Zenoh's threads meet here: each step holds one short lock. No clock, no Zenoh.
+Whoever removes an attempt from its window reports its end, so that each end is reported once. The
+offering thread, the sender thread and Zenoh's threads meet here: each step holds one short lock.
 
 On a thin uplink attempts wait for seconds until they are sent. Of a service that wants the latest,
-the newest takes the turn of the oldest; the others keep waiting, and are sent while their time
-lasts. Between services the order is that of arrival.
+the newest takes the turn of the oldest; the others are sent while their time lasts.
 
-To tell a replica that a request was cancelled costs a message, and is worth it only where there is
-work to be saved. A request that was sent a moment ago is most likely answered before the message is
-there. So it is told at once if the request has been out for `WORTH_S` and the replica was told
-nothing for `EVERY_S`, else with the next flush, and not at all if the answer comes first.
+To tell a replica that a request was cancelled costs a message. So it is told at once only if the
+request has been out for `WORTH_S` and the replica was told nothing for `EVERY_S`, else with the
+next flush, and not at all if the answer comes first.
 
-Owns: which attempts are open, whether there is room, the order of sending, and which ids are to be
-told. Not here: sending (`attempts`), deadlines.
+Not here: sending (`attempts`), deadlines.
 """
 
 from __future__ import annotations
@@ -65,12 +61,7 @@ class OpenAttempt:
 class LinkWindow:
     """The attempts open on one connection.
 
-    Args:
-        standing: As many more have room: pulls of topics, which are open all the time.
-
-    Attributes:
-        limit: How many may be open.
-        large: The bound of their bytes.
+    `standing` more have room: pulls of topics, which are open all the time.
     """
 
     def __init__(self, standing: int = 0) -> None:
@@ -241,10 +232,7 @@ CANCELLED_LIMIT = (
 
 
 class Cancellations:
-    """Ids of cancelled requests of which a replica is still to be told.
-
-    Each step is one operation on a dictionary, which is atomic.
-    """
+    """Ids of cancelled requests of which a replica is still to be told. Any thread."""
 
     def __init__(self) -> None:
         self._ids: dict[bytes, None] = {}
@@ -275,11 +263,7 @@ Waiting = list[tuple[float, int, OpenAttempt]]
 
 
 class SendQueue:
-    """A queue of attempts; None ends the sender thread. Any thread.
-
-    Args:
-        latest: Services of which the newest is preferred.
-    """
+    """A queue of attempts, the newest of `latest` services first. None ends the sender thread."""
 
     def __init__(self, latest: Collection[str] = ()) -> None:
         self._queued: SimpleQueue[OpenAttempt | str | None] = SimpleQueue()

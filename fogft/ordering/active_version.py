@@ -17,11 +17,7 @@ VACANCY_S = 3.0
 
 
 class ActiveVersion:
-    """The active version of one service.
-
-    Args:
-        version: It; None while there never was one.
-    """
+    """The active version of one service; None while there never was one."""
 
     def __init__(self, version: str | None = None) -> None:
         self.version = version

@@ -124,8 +124,7 @@ class CatchingUp:
     def bring(self, replica: int, peer: Peer, *, waited: bool = False) -> None:
         """Have a claimed replica join, from its own state or from the checkpoint.
 
-        Where both are long ago it waits for a new checkpoint, if there is whom to ask; `waited`
-        says that it has.
+        Where both are long ago it waits for a new checkpoint, unless it has `waited`.
         """
         log, promise = self.log, peer.promise
         if log is None or promise is None or peer.open:

@@ -15,11 +15,7 @@ class Checkpoint:
 
 
 class OrderedLog:
-    """Requests by number, consecutive, bounded by count and bytes.
-
-    Args:
-        start: The number after which it begins: all before is part of a state.
-    """
+    """Requests by number, consecutive from `start` + 1, bounded by count and bytes."""
 
     entries_limit = 8192
     bytes_limit = 64 << 20  # of all together; a larger single entry still gets in alone

@@ -116,9 +116,7 @@ def decode_index(payload: bytes) -> int:
 
 
 def encode_snapshot(index: int, state: bytes) -> bytes:
-    """Return a state's own bytes after an index: in a snapshot the one that it stands for, in a
-    restore the last number given until now.
-    """
+    """Return a state after an index: its own, or in a restore the last number until now."""
     return _INDEX.pack(index) + state
 
 

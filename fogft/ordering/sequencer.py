@@ -192,11 +192,9 @@ class Sequencer:
     # -- what replicas say ----------------------------------------------------------------
 
     def replied(self, replica: int, op: Op, index: int, payload: bytes) -> bool:
-        """Take a reply. Return whether it is the answer to a number: return it, after having
-        written down `mark`.
+        """Take a reply. Return whether it is the answer to a number: write down `mark`, return it.
 
-        Raises:
-            OrderError: The bytes are not what this operation is answered with.
+        Raises OrderError: the bytes are not what this operation is answered with.
         """
         peer = self._peers.get(replica)
         if op in (Op.APPLY, Op.RECALL):

@@ -15,9 +15,8 @@ ALARM_S = 1.0  # what is said within it, counted from the first time, is about o
 class Alarms:
     """Which replicas are believed when they report that a request crashed a service.
 
-    A service that dies ends all that it has at once, so what one says in the same moment is one
-    alarm, however many requests it names. It is false where another replica answered one of them,
-    and right where one of them was found to kill services.
+    A service that dies ends all that it has, so what one says in the same moment is one alarm. It
+    is false where another replica answered one of those requests.
     """
 
     def __init__(self) -> None:

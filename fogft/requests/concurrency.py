@@ -30,8 +30,7 @@ class ConcurrencyLimit:
 
     Attributes:
         takes_s: Recent service time of a request, in seconds; 0 before the first.
-        service_s: What a request took lately, divided by how many were at work, seconds; 0
-            before the first.
+        service_s: The same, divided by how many were at work.
     """
 
     def __init__(self, most: int, given: int | None = None) -> None:

@@ -103,11 +103,7 @@ class PendingRequests(Generic[T]):
     def begin(
         self, request: bytes, item: T, able: Sequence[int], *, deadline: float, now: float
     ) -> Sequence[int]:
-        """Add a request; return the replicas it goes to at once.
-
-        Raises:
-            ValueError: The id is under way already.
-        """
+        """Add a request; return the replicas it goes to at once. Raises ValueError: it is there."""
         if request in self._pending:
             raise ValueError("a request with this id is under way already")
         chosen = self.choose.first(request, able, now)
@@ -307,9 +303,7 @@ class PendingRequests(Generic[T]):
     ) -> Verdict:
         """Note a failed attempt. The replica is avoided for a moment, longer each time.
 
-        Args:
-            counts: Whether it counts towards the limit of attempts.
-            bar: Never ask this replica for this request again.
+        It is asked no more if `bar`, or once it has failed too often in a way that `counts`.
         """
         if pending is None or replica not in pending.open:
             return Verdict.LATE

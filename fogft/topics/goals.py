@@ -96,9 +96,8 @@ class _Goal:
 class Goals:
     """The goals of one action, from their request to their result.
 
-    A replica may be given a goal several times: because it came later, did not take it, or may
-    have lost it. Beyond 4 096 goals or 64 MiB of requests the oldest are forgotten, at first those
-    that nobody awaits.
+    Beyond 4 096 goals or 64 MiB of requests the oldest are forgotten, at first those that nobody
+    awaits.
     """
 
     def __init__(self) -> None:

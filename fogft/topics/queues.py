@@ -13,11 +13,7 @@ Numbered = tuple[int, bytes]
 
 
 class Ring:
-    """The last messages that a replica's nodes published.
-
-    Args:
-        latched: Whether a robot that has none yet gets what is kept.
-    """
+    """The last messages that a replica's nodes published; `latched`: a new robot gets them."""
 
     kept_bytes = 64 << 20  # of all together, at most; the newest is kept in any case
 
@@ -61,11 +57,7 @@ class Ring:
 
 
 class Outbox:
-    """The messages of a robot's topic to send to one replica, in order.
-
-    Args:
-        depth: Messages that wait at most; the oldest go first.
-    """
+    """The messages of a robot's topic to send to one replica, in order; at most `depth` wait."""
 
     window = 16  # messages under way at once
     kept_bytes = 64 << 20  # of those that wait, at most; the newest is kept in any case

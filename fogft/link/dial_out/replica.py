@@ -1,9 +1,7 @@
-"""The replica's side of dial-out: it opens the connections to robots and gateways.
+"""The replica's side of dial-out: it keeps two connections waiting at each robot's door.
 
-It keeps two connections waiting at each door. When one is taken into use, it is joined with
-this replica's own listener, and another one takes its place.
-
-Owns: connections to doors. Not here: the door (`robot`), the listener (`listener`).
+One that is taken into use is joined with this replica's own listener, and another one takes its
+place. Not here: the door (`robot`), the listener (`listener`).
 """
 
 from __future__ import annotations
@@ -34,8 +32,7 @@ _GREETING_TIMEOUT_S = 5.0
 class DialOut:
     """Keeps connections open to the dial-in ports of robots, for them to use.
 
-    Args:
-        local: ``host:port`` of this replica's own listener.
+    `local` is the ``host:port`` of this replica's own listener.
     """
 
     def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:

@@ -1,12 +1,9 @@
 """The robot's side of dial-out: a port that replicas connect to if the robot cannot reach them.
 
-A replica dials the door, proves who it is, and waits. A link to that replica dials a port on
-this machine's loopback instead of a far address; the door then joins both connections. From
-there on all is as with a replica that can be reached: the robot is the TLS client, the
-replica the TLS server, end to end, so no certificate needs any other right, and the door can
-neither read nor change what passes.
+A replica dials the door, proves who it is, and waits. A link to that replica dials a port on this
+machine's loopback; the door then joins both connections. The robot is the TLS client, the replica
+the TLS server, end to end, so the door can neither read nor change what passes.
 
-Owns: the door's port, the connections that wait, a loopback port for each replica.
 Not here: the replica's side (`replica`), links (`link`).
 """
 
@@ -55,12 +52,9 @@ class _Waiting:
 
 
 class DialIn:
-    """The dial-in port of one robot or gateway.
+    """The dial-in port of one robot or gateway, at ``host:port``; port 0 for any that is free.
 
-    Args:
-        listen: ``host:port``; port 0 for any that is free.
-        pool_uid: Replicas of other pools are turned away.
-        revoked: Common names that are turned away.
+    Replicas of other pools, and `revoked` common names, are turned away.
 
     Raises:
         WireError: The port cannot be had.
@@ -291,8 +285,7 @@ class DialIn:
 def _drained(link: socket.socket) -> bool:
     """Read signs of life away up to the replica's `GO`, behind which TLS begins.
 
-    A replica sends nothing between its `GO` and the first byte of its service's, and the
-    TLS client speaks first: so nothing behind `GO` can be here yet.
+    The TLS client speaks first, so nothing behind `GO` can be here yet.
     """
     link.settimeout(SILENCE_S)
     try:

@@ -1,8 +1,6 @@
 """Join two TCP connections, and read the first message of whoever connects.
 
 The kernel moves the bytes (`splice`), so a tunnel costs a robot two sleeping threads.
-
-Not here: who is joined, and what a first message says (`robot`, `replica`, `records.frames`).
 """
 
 from __future__ import annotations
@@ -21,10 +19,7 @@ _LEAST_S = 0.01  # a time-out of 0 would mean none
 
 
 def receive(link: socket.socket, limit_bytes: int, within_s: float) -> dict[str, Any]:
-    """Receive the first message; the time limit holds for the whole of it.
-
-    Args:
-        link: The connection. It is left with what remains of the time as its time-out.
+    """Receive the first message, the whole of it within the time. Changes the link's time-out.
 
     Raises:
         OSError: It did not come in time, or the connection broke.

@@ -1,7 +1,6 @@
 """How long a link may take to open, and why it does not, in words. Zenoh says neither.
 
-Asks the endpoint again with plain TCP and TLS. Called after a failure only, never on the
-way to an answer; `fogft doctor` may call it too.
+Asks the endpoint again with plain TCP and TLS, after a failure only.
 
 A certificate begins 24 hours before it was made. So one that is "not yet valid" was made by
 a clock a day ahead of the one that judges it, and TLS's word for it helps nobody.

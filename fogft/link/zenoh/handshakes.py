@@ -1,12 +1,8 @@
 """Count the handshakes that Zenoh refuses, which it reports on standard output only.
 
-One line each: of the target ``zenoh_link_tls`` with TLS's own reason, or, once TLS was
-satisfied, of Zenoh's own handshake. So in a process that
-serves a port, standard output is led into a file in memory, which is read now and then; a
-full pipe could block Zenoh. What the process itself prints, and its children, go where
+So in a process that serves a port, standard output is led into a file in memory, which is read now
+and then; a full pipe could block Zenoh. What the process itself prints, and its children, go where
 standard output went before.
-
-Owns: file descriptor 1 of such a process. Not here: other counters (`reply_queue`).
 """
 
 from __future__ import annotations

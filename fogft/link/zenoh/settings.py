@@ -1,21 +1,15 @@
 """Zenoh's configuration for both ends of a link, with reasons.
 
-Which of Zenoh's tasks run in which threads a variable says, which Zenoh reads once, when its first
-session opens. By default a message passes through three of Zenoh's thread pools on its way, and
-each hop wakes another thread. Callbacks need Python's lock anyway, so all that reads, routes and
-calls back runs in *one* thread, which loses little: a round trip of 8 bytes over loopback took
-168 us with one, 186 us with two and 257 to 271 us by default, and 133, 172 and 181 to 205 us of
-processor time (medians of 3000, on 2 cores). So a callback that blocked would stall every link of
-the process: none may.
+By default a message passes through three of Zenoh's thread pools, and each hop wakes another
+thread. Callbacks need Python's lock anyway, so all that reads, routes and calls back runs in *one*
+thread: a round trip of 8 bytes over loopback took 168 us with one and 257 to 271 us by default
+(medians of 3000, on 2 cores). So a callback that blocked would stall every link of the process.
 
-Sending and closing have threads of their own, although it costs nothing to do without them.
-Whoever sends something large holds a lock of its link while he waits for room there. When that
-link breaks, Zenoh's sending task and its closing of the link wait for that lock, and block their
-thread for up to `wait_before_close`: in the one thread, all other links would stand still as long.
-So each may be blocked by several links, and none by another.
+Sending and closing have threads of their own. Whoever sends something large holds a lock of its
+link while he waits for room; when that link breaks, Zenoh's sending and closing wait for that lock,
+for up to `wait_before_close`: in the one thread, all other links would stand still as long.
 
-Owns: every Zenoh setting of fogft. Not here: sessions, and the certificates' contents
-(`fogft.pool.credentials.authority`).
+Not here: sessions, and the certificates' contents (`fogft.pool.credentials.authority`).
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
 """This process's TCP connections, inspected and closed behind Zenoh's back.
 
-Zenoh opens the sockets and tells nothing of them. The kernel does: it lists the descriptors of
-this process and counts each connection's bytes. Where it does not (no Linux), nothing is found.
-
-Owns: finding and reading sockets.
-Not here: what follows from it (`connection_reaper`, `socket_progress`).
+Zenoh opens the sockets and tells nothing of them. The kernel does: it lists this process's
+descriptors and counts each connection's bytes. Where it does not (no Linux), nothing is found.
 """
 
 from __future__ import annotations
@@ -191,11 +188,9 @@ def keep_short(connection: socket.socket) -> None:
 def end_sending(connection: socket.socket) -> None:
     """Shut down sending on a connection, whatever Zenoh is doing with it.
 
-    What its peer has not taken is dropped when the socket is closed: that is done by a thread of
-    Zenoh's, which would wait for that peer up to 10 s (Zenoh's own SO_LINGER).
-
-    Not both directions: where Zenoh hears of an end before it fails to send, its thread waits for
-    whoever waits for room to send more, and he for that thread (`docs/design/links.md`).
+    What its peer has not taken is dropped when the socket is closed: a thread of Zenoh's would wait
+    for that peer up to 10 s. Not both directions: where Zenoh hears of an end before it fails to
+    send, its thread and whoever waits for room to send wait for each other (docs/design/links.md).
     """
     _drop_when_closed(connection)
     with contextlib.suppress(OSError):  # it ended by itself

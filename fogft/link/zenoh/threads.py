@@ -1,13 +1,11 @@
 """Zenoh's threads, and our threads inside Zenoh when the process exits.
 
 Zenoh's threads, which call our callbacks, must not send what might wait for room: only they can
-make room. They are few, and live as long as the process. So each keeps its Python thread state:
-else every callback makes one, and destroys it.
+make room. Each keeps its Python thread state: else every callback makes one, and destroys it.
 
 A daemon thread that returns from Zenoh while the interpreter shuts down aborts the process
-(SIGABRT: the interpreter ends the thread by unwinding it, which Rust does not allow). So what
-closes a session is waited for at exit, though not for long: towards a frozen peer it takes ten
-seconds.
+(SIGABRT: Rust does not allow to be unwound). So what closes a session is waited for at exit, though
+not for long: towards a frozen peer it takes ten seconds.
 """
 
 from __future__ import annotations

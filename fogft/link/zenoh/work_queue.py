@@ -1,8 +1,4 @@
-"""A worker thread for jobs that Zenoh's threads must not do themselves.
-
-Owns: what waits for it, and how much may. Not here: what there is to do (`control_queries`,
-`fogft.rmw_zenoh`).
-"""
+"""A worker thread for jobs that Zenoh's threads must not do themselves."""
 
 from __future__ import annotations
 
@@ -24,10 +20,7 @@ LANES_LIMIT = 256
 
 
 class WorkQueue:
-    """A thread that runs jobs: lanes take turns, each in its order. Only `join` blocks.
-
-    A lane belongs to whoever queues its jobs, so a busy sender delays only itself.
-    """
+    """A thread that runs jobs: lanes take turns, each in its order. Only `join` blocks."""
 
     def __init__(self, name: str, counters: Counters) -> None:
         self._counters = counters

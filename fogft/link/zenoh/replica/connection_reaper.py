@@ -1,16 +1,11 @@
 """Close connections at a replica's port that belong to no admitted robot or are stuck.
 
-Zenoh owns the port. It lets a connection that never says who it is stand for as long as it
-likes, keeps room for 32 of them, and lets nobody else in meanwhile. So we look ourselves at this
-process's own sockets, twice a second and whenever somebody comes: what is connected to the
-port and is no authenticated link is ended or kept out as `door` says, a link of a revoked
-holder is ended at once, as are those of one holder beyond `LINKS_LIMIT`, and one that delivers
-nothing of what it holds after a while. All are counted. Where strangers hold all descriptors that
-the process may have, all of them are ended.
-Who looks sees, too, which links are thin.
-
-Owns: ending connections, and how they drain. Not here: who has to go (`door`), whose requests are
-refused (`sessions`).
+Zenoh keeps room for 32 connections that never say who they are. So we look at this process's own
+sockets, twice a second and whenever somebody comes: strangers are ended or kept out as `door` says,
+a link of a revoked holder is ended at once, as are those of one holder beyond `LINKS_LIMIT`, and
+one that delivers nothing of what it holds after a while. All are counted. Where strangers hold all
+descriptors that the process may have, all of them are ended. Who looks sees, too, which links are
+thin.
 """
 
 from __future__ import annotations
@@ -51,7 +46,7 @@ class DescriptorReserve:
     """File descriptors held in reserve against floods of connections. For one thread.
 
     Without one, nothing tells whose the connections at the port are, no preemption notice is read
-    and no state is written. Zenoh takes of what is given back no more than wait at the port.
+    and no state is written.
     """
 
     def __init__(self) -> None:
@@ -90,18 +85,15 @@ def surplus(links: Mapping[Address, str]) -> list[Address]:
 
 
 class ConnectionReaper:
-    """Watches one port until closed.
+    """Watches one port until closed; `thin` are the holders to whom a link is thin.
 
     Args:
         port: The port that this process listens at.
         links: Returns the peers' addresses of authenticated links, with their common names.
         revoked: Returns the names whose links are to be ended.
-        counters: Counts ``unauthenticated``, ``revoked_links``, ``surplus_links`` and
-            ``stuck_links`` ended, and when the door was shut or no descriptors were left.
+        counters: Counts what was ended, the times when the door was shut or descriptors were short.
+        also: Done at each look.
         stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.
-
-    Attributes:
-        thin: Common names of those to whom a link is thin.
     """
 
     def __init__(
@@ -204,10 +196,7 @@ class ConnectionReaper:
     def _watch(
         self, links: Mapping[Address, str], found: Mapping[Address, socket.socket], now: float
     ) -> None:
-        """See how links drain: find the thin ones, and end those that stand still.
-
-        A peer that has acknowledged nothing for long is frozen, or out of reach.
-        """
+        """See how links drain: find the thin ones, and end those that stand still."""
         thin = set()
         progress = {
             peer: self._progress.get(peer) or SocketProgress() for peer in links if peer in found

@@ -1,9 +1,7 @@
 """Answer a robot's queries other than requests: greetings, probes, records, answer streams.
 
-These are queries. Zenoh's threads only decode them and hand them over; the worker thread
-answers them, and their ends queue behind the replies of their robot.
-
-Owns: who is let in. Not here: requests and their replies (`listener`, `reply_queue`).
+Zenoh's threads only decode them and hand them over; the worker thread answers them, and their ends
+queue behind the replies of their robot. Requests and replies: `listener`, `reply_queue`.
 """
 
 from __future__ import annotations
@@ -36,11 +34,7 @@ _STRANGERS = b""  # in place of a token: replies to whose connection is not know
 
 
 class ControlQueries:
-    """Answers the queries of robots.
-
-    Args:
-        records: What the pool has signed, as far as it is known here.
-    """
+    """Answers the queries of robots; `records` is what the pool has signed, as known here."""
 
     def __init__(
         self,
@@ -143,11 +137,7 @@ class ControlQueries:
             self._queues.end(greeting.token, "probe", asked)
 
     def take(self, offered: Sequence[SignedRecord]) -> list[SignedRecord]:
-        """Apply valid records; return newer ones for those that are out of date.
-
-        Returns:
-            What stands in place of those that are out of date.
-        """
+        """Apply valid records; return what stands in place of those that are out of date."""
         newer: list[SignedRecord] = []
         for one in offered:
             verdict = self._records.offer(one)

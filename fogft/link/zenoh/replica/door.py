@@ -1,12 +1,8 @@
 """Which hosts a replica's port accepts, and which unauthenticated connections it closes. Pure.
 
-A stranger is who has connected and not said who he is: a robot in the midst of its handshake, or
-nobody that is wanted. Zenoh rests for 0.1 s after each handshake that fails, and all that come
-after wait for that. So few strangers are let in of each host, and they are ended one by one.
-
-A host is an IPv4 address, or a network of IPv6.
-
-Owns: the judgement. Not here: the sockets (`connection_reaper`, `listen_filter`).
+A stranger is who has connected and not said who he is. Zenoh rests for 0.1 s after each handshake
+that fails, so few strangers are let in of each host (an IPv4 address, or a network of IPv6), and
+they are ended one by one. The sockets are in `connection_reaper` and `listen_filter`.
 """
 
 from __future__ import annotations

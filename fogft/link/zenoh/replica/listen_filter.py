@@ -1,13 +1,9 @@
 """Drop new connections to a port in the kernel, from some hosts or from all.
 
-Zenoh accepts whatever comes to its port, and rests for 0.1 s after each handshake that fails. So
-from whom too many are under way nothing more is to be accepted. A filter on the listening socket
-(`SO_ATTACH_FILTER`, for which no privilege is needed) drops the first packet of a connection; who
-meant it well sends that again after a second, or tries anew. Links that are open are other sockets:
-they pass no filter that drops their packets, and nothing stands between them and Zenoh.
-
-Owns: the listening socket's filter and its queue. Not here: whose connections are dropped
-(`connection_reaper`).
+A filter on the listening socket (`SO_ATTACH_FILTER`, for which no privilege is needed) drops the
+first packet of a connection; who meant it well sends that again after a second, or tries anew.
+Links that are open are other sockets, and do not notice. Whose connections are dropped is decided
+in `door`.
 """
 
 from __future__ import annotations
@@ -38,11 +34,7 @@ Instruction = tuple[int, int, int, int]
 
 
 class ListenFilter:
-    """The packet filter on one port of this process. For one thread.
-
-    Args:
-        port: Where it listens; where no socket does, nothing is done.
-    """
+    """The packet filter on one port of this process. For one thread."""
 
     def __init__(self, port: int) -> None:
         self._listening = sockets.listening(port)

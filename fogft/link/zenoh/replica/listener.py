@@ -1,14 +1,11 @@
 """A replica's end over Zenoh: receives requests and probes, and queues answers by robot.
 
-Requests are published to us; a connection's answers are the replies to one query of its own,
-which it asks once we have let it in, and which stays open.
+A connection's answers are the replies to one query of its own, which it asks once we have let it
+in, and which stays open. Zenoh's threads only decode and hand over. Replies leave through one
+thread for each connection, because replying to a frozen robot can block; probes are answered by one
+more thread, ahead of all replies.
 
-Zenoh's threads only decode and hand over. Replies leave through one thread for each
-connection of a robot, because replying to a frozen robot can block; probes are answered by
-one more thread, ahead of all replies.
-
-Owns: the session, its queryables, the reply threads. Not here: what a request is worth
-(`fogft.proxy.replica.responder`), duplicates included.
+Not here: what a request is worth (`fogft.proxy.replica.responder`), duplicates included.
 """
 
 from __future__ import annotations

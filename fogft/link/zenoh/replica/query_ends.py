@@ -1,12 +1,9 @@
 """End Zenoh queries, so that their callers do not wait for more replies.
 
-Ending one sends something too, so it may block, and none of Zenoh's threads may do it. And it
-must not be done while Zenoh's own thread still holds that query: then the last to let go would be
-that thread, which would wait for room that only it can make, and with it every link of this
-process would stand still. So a query is ended when that thread has come to the next one
-(`QueryTurns`).
-
-Owns: when a query may be ended. Not here: the thread that does it (`reply_queue`).
+Ending one may block, and none of Zenoh's threads may do it; nor must it be done while Zenoh's own
+thread still holds that query: then that thread would be the last to let go, and would wait for room
+that only it can make. So a query is ended when that thread has come to the next one (`QueryTurns`),
+by the threads of `reply_queue`.
 """
 
 from __future__ import annotations
@@ -39,14 +36,7 @@ class QueryTurns:
 
 
 class QueryEnd:
-    """A query to end, after sending a refusal if there is one.
-
-    Args:
-        turn: When it came, by `QueryTurns`.
-
-    Attributes:
-        refusal: What is said before; empty for nothing.
-    """
+    """A query to end, after sending a refusal if there is one; `turn`: when it came."""
 
     def __init__(self, query: zenoh.Query, turn: int) -> None:
         self.query = query

@@ -1,17 +1,12 @@
 """Requests received over Zenoh until they are answered, and the queues of their replies.
 
-A request is answered once, or refused where it is forgotten. Each connection of a robot has a queue
-and a thread.
-
-A reply to a frozen robot blocks until Zenoh gives that robot's session up. So each
-connection has its own thread; it ends when it has had nothing to do for a while. What cannot
+A request is answered once, or refused where it is forgotten. A reply to a frozen robot blocks until
+Zenoh gives that robot's session up, so each connection has its own queue and thread. What cannot
 block (`reply_streams`) leaves at once, from the thread that brings it, unless that is Zenoh's.
+Queries that are to be ended take the same way. What sends raises `zenoh.ZError` where the session
+is closed.
 
-Queries that are to be ended take the same way: that sends something, too. What sends raises
-`zenoh.ZError` where the session is closed.
-
-Owns: that there is one answer; how replies become messages, their order and bounds. Not here: what
-is replied (`fogft.proxy.replica`).
+Not here: what is replied (`fogft.proxy.replica`).
 """
 
 from __future__ import annotations
@@ -108,8 +103,7 @@ class ReplyQueue:
     def next(self, timeout_s: float) -> list[Reply] | QueryEnd:
         """Wait for the next replies to send together, or query to end; nothing once closed.
 
-        Raises:
-            Empty: Nothing came.
+        Raises queue.Empty: nothing came.
         """
         first = self._taken.pop() if self._taken else self.replies.get(timeout=timeout_s)
         if first is None:
@@ -165,9 +159,8 @@ class ReplyQueues:
     def put(self, token: bytes, robot: str, reply: Reply, *, more: bool) -> None:
         """Send or queue a reply. Never blocks; if the queue is full, the reply is dropped.
 
-        Args:
-            token: The robot's connection: replies of one never wait for another's.
-            more: Others will soon follow, to leave in one message with it.
+        Replies of one connection's `token` never wait for another's. With `more`, others will soon
+        follow, to leave in one message with it.
         """
         may_send = not more and reply.small and not threads.is_this()
         if may_send and not self._closed and self._sent_at_once(reply):
@@ -326,8 +319,7 @@ class ZenohIncoming:
     def __del__(self) -> None:
         """Refuse what its owner forgot: the robot must not wait for it until its deadline.
 
-        The collector may call this anywhere, even while a lock of ours is held; a
-        `SimpleQueue` may be put into from here.
+        The collector may call this while a lock of ours is held; a `SimpleQueue` may be put into.
         """
         if self._streams:
             forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)

@@ -2,19 +2,15 @@
 
 Replying blocks only where the robot takes nothing and all buffers on the way are full. So who must
 not block may reply himself while no more is on the way than those surely hold. What has arrived is
-known by stamps: each reply carries one, and the robot's requests say the last that it has seen.
-Only who has read a reply knows its stamp: no robot can make others wait by saying what is not so.
+known by stamps: each reply carries a random one, and the robot's requests say the last that it has
+seen, so no robot can make others wait by saying what is not so.
 
 All connections of a robot count together: they may share one socket. What was sent over another one
-counts for a minute after it was sent, since that one may be gone; whoever reads more slowly than
-that is known by the `connection_reaper`, and is sent nothing at once.
+counts for a minute after it was sent, since that one may be gone.
 
-A connection asks one query after it has greeted, which stays open: every answer, and every refusal,
-is a reply to it. Whoever asks again under one token, or whose connection is the oldest of too many,
-has its former query ended, and opens another connection.
-
-Owns: stamps, and which query is whose. Not here: who is let in (`sessions`), the threads that may
-block (`reply_queue`).
+Whoever asks again under one token, or whose connection is the oldest of too many, has its former
+query ended, and opens another connection. Not here: who is let in (`sessions`), the threads that
+may block (`reply_queue`).
 """
 
 from __future__ import annotations
@@ -152,8 +148,7 @@ class Stream:
 class Streams:
     """The open queries for answers, by the token of their connection.
 
-    Args:
-        slow: Whether the holder of a certificate is known to read slowly.
+    `slow` tells whether the holder of a certificate is known to read slowly.
     """
 
     limit = 1024  # a replica has 128 sessions; the others are those of connections that are gone

@@ -3,9 +3,7 @@
 TLS has let the connection in; but Zenoh does not tell a listener whose query it hands over.
 So each connection greets: it sends its certificate, and a signature over its own random
 token and this replica's name. From then on the token, which only the two ends know, stands
-for the holder. A holder who is revoked is let in no more, whatever connections are open.
-
-Owns: which tokens are good, and whose. Not here: signatures (`signing`), TLS (`config`).
+for the holder. Not here: signatures (`signing`), TLS (`settings`).
 """
 
 from __future__ import annotations
@@ -37,12 +35,7 @@ class NotAdmittedError(Exception):
 
 
 class AuthenticatedSessions:
-    """The connections that were authenticated. Any thread.
-
-    Args:
-        pool_uid: Holders of other pools are not let in.
-        replica: This replica's common name, which a greeting is made out to.
-    """
+    """The connections that were authenticated, to the replica of this common name. Any thread."""
 
     def __init__(
         self,
@@ -63,11 +56,7 @@ class AuthenticatedSessions:
         self.revoked: frozenset[str] = frozenset()  # common names that are let in no more
 
     def greet(self, greeting: Greeting) -> None:
-        """Admit a connection.
-
-        Raises:
-            NotAdmittedError: Its holder may not ask here.
-        """
+        """Admit a connection. Raises NotAdmittedError: its holder may not ask here."""
         if not greeting.certificate:
             if greeting.token not in self._tokens:
                 raise NotAdmittedError(Refusal.NOT_ADMITTED, "a connection that did not greet")

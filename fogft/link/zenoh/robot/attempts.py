@@ -1,11 +1,8 @@
 """The attempts open on one connection: accepted, sent and ended exactly once.
 
 A request is sent by whoever offers it where that cannot block (`credit`), else by a thread of its
-connection's own, so a peer that takes nothing costs nobody else.
-
-Owns: open attempts, what waits for the sender thread, and that thread. Not here: the session
-(`connection`), which requests there are and what becomes of them
-(`fogft.proxy.robot.dispatcher`).
+connection's own, so a peer that takes nothing costs nobody else. Not here: the session
+(`connection`), what becomes of requests (`fogft.proxy.robot.dispatcher`).
 """
 
 from __future__ import annotations
@@ -71,19 +68,13 @@ class Outlet(Protocol):
 
 @dataclass(frozen=True)
 class Callbacks:
-    """Callbacks from a connection to its link. Called from any thread; none may block.
-
-    Attributes:
-        room: A window that was full has room again.
-        large: Something large is sent, and `Attempts.watched` was not set.
-        lost: The connection is of no more use. Perhaps more than once.
-    """
+    """Callbacks from a connection to its link. Called from any thread; none may block."""
 
     answered: Callable[[Answer], None]
     late: Callable[[Answer], None]
-    room: Callable[[], None]
-    large: Callable[[], None]
-    lost: Callable[[], None]
+    room: Callable[[], None]  # a window that was full has room again
+    large: Callable[[], None]  # something large is sent, and `Attempts.watched` was not set
+    lost: Callable[[], None]  # the connection is of no more use; perhaps more than once
 
 
 class Attempts:
@@ -92,9 +83,6 @@ class Attempts:
     Args:
         origin: What the headers of all its requests say (`frame.origin`).
         cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
-
-    Attributes:
-        watched: Something large was sent lately: the link's thread looks often.
     """
 
     def __init__(
@@ -121,7 +109,7 @@ class Attempts:
         self._on_large = tell.large
         self._ended = ended
         self.window = LinkWindow(standing=len(self._services))
-        self.watched = False
+        self.watched = False  # something large was sent lately: the link's thread looks often
         self._large_since = float("-inf")
         self._sending_since: float | None = None
         self._held_by_zenoh = (0.0, 0)  # since when, so many bytes at most

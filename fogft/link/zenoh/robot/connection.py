@@ -1,16 +1,13 @@
 """One Zenoh session from a robot to one replica, used once and then discarded.
 
-A request is published at its service's key; the answers to all of them come as the replies to
-one query, which stays open for as long as the connection. A query for each request would cost
-a third more (its state, two timers and its end, at both ends), and its time-out at the replica
-would be sent by the one thread that all else there needs, too.
+A request is published at its service's key; all answers come as the replies to one query, which
+stays open for as long as the connection. A query for each request would cost a third more, and its
+time-out at the replica would be sent by the one thread that all else there needs, too.
 
-Everything of Zenoh's that can block (`put`, `close`) is called by the sender thread of its
-attempts, so a peer that takes nothing costs nobody else. Callbacks come from Zenoh's threads. What
-sends raises `zenoh.ZError` where the session is closed.
+What can block (`put`, `close`) is called by the sender thread of its attempts, so a peer that takes
+nothing costs nobody else. What sends raises `zenoh.ZError` where the session is closed.
 
-Owns: a session, and what those of one robot share. Not here: the requests open on it (`attempts`),
-when to open and when to give up (`link`).
+Not here: the requests open on it (`attempts`), when to open and when to give up (`link`).
 """
 
 from __future__ import annotations
@@ -46,14 +43,7 @@ from fogft.records.signing import Signer
 
 @dataclass
 class Shared:
-    """What all links of one robot share. Written by the dialer, read by its links.
-
-    Attributes:
-        suspect_after_s: Probes unanswered for so long make a link suspect.
-        tell_losers: Whether replicas are told which requests are no longer wanted.
-        records: Signed records for every replica, packed; empty for none.
-        newer: Slot -> what its replica said last in place of records that are out of date.
-    """
+    """What all links of one robot share. Written by the dialer, read by its links."""
 
     credentials: CredentialPaths
     robot: str
@@ -62,8 +52,8 @@ class Shared:
     tell_losers: bool
     options: SendOptions = DEFAULT_OPTIONS
     gate: LargeSendGate = field(default_factory=LargeSendGate)
-    records: bytes = b""
-    newer: dict[int, bytes] = field(default_factory=dict)
+    records: bytes = b""  # signed, for every replica, packed; empty for none
+    newer: dict[int, bytes] = field(default_factory=dict)  # slot -> what its replica said instead
     _signer: Signer | None = None
 
     @property
@@ -100,8 +90,6 @@ class Connection:
     Attributes:
         certificate: Ours (DER), which it uses.
         lost_because: Why it is of no more use; empty while it is.
-        told: The records that the replica has taken from us.
-        told_at: When it last has.
 
     Raises:
         zenoh.ZError: Nothing was reached.
@@ -129,7 +117,7 @@ class Connection:
         key = partial(names.slot_key, peer.id.pool_uid, peer.id.slot)
         self._cancel_key, self._answers_key = zenoh.KeyExpr(key(names.CANCEL)), key(names.ANSWERS)
         self.lost_because = ""
-        self.told, self.told_at = b"", 0.0
+        self.told, self.told_at = b"", 0.0  # the records that the replica has taken, and when
         self._session = zenoh.open(config)
         try:
             self._listener = self._session.info.declare_link_events_listener(
@@ -265,10 +253,7 @@ class Connection:
         self.lose(words)
 
     def tell_records(self, key: str, records: bytes, newer: Callable[[bytes], object]) -> None:
-        """Send signed records; `told` is them once the replica has taken them.
-
-        `newer` is given what it says in place of those that are out of date, from any thread.
-        """
+        """Send signed records; `newer` is given what stands in place of outdated ones."""
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:

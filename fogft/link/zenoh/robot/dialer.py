@@ -1,8 +1,4 @@
-"""Creates links over Zenoh, and holds what all links of a robot share.
-
-Owns: the robot's credentials in use, what its replicas are to be told. Not here: a link's
-life (`link`).
-"""
+"""Creates links over Zenoh, and holds what all links of a robot share."""
 
 from __future__ import annotations
 
@@ -59,11 +55,7 @@ class ZenohDialer:
         self._shared.options = options
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
-        """Start a link; return at once, in state CONNECTING.
-
-        Raises:
-            WireError: The peer belongs to another pool.
-        """
+        """Start a link; return at once. Raises WireError: the peer belongs to another pool."""
         if peer.id.pool_uid != self._pool_uid:
             raise WireError(f"replica `{peer.id}` belongs to another pool than this robot")
         link = ZenohLink(self._shared, peer, services, events, self._closed)

@@ -1,11 +1,10 @@
 """Links over Zenoh: connect to a replica, probe it, and reconnect when it falls silent.
 
-A thread of each link (`fogft-keep-...`) opens the connection, sends probes, and replaces the
-connection when it is lost or when probes go unanswered: never because a service is slow.
-`offer` only puts the attempt into the connection's queue.
+A thread of each link (`fogft-keep-...`) replaces the connection when it is lost or when probes go
+unanswered: never because a service is slow.
 
-Owns: the state of a link. Not here: sessions (`connection`), attempts (`attempts`), what a
-replica's silence means for the pool (`fogft.planning`).
+Not here: sessions (`connection`), attempts (`attempts`), what a replica's silence means for the
+pool (`fogft.planning`).
 """
 
 from __future__ import annotations
@@ -207,9 +206,7 @@ class ZenohLink:
     def _succeed(self, old: Connection) -> Connection:
         """Open a connection beside one that is up, and return it once it is up too.
 
-        Whatever goes wrong with the new one, the old one stays, and it is tried again. Requests
-        go to the new one from the moment that it is up; what is under way on the old one ends
-        there.
+        Whatever goes wrong with the new one, the old one stays, and it is tried again.
         """
         self._renew.clear()
         new = self._open()
@@ -260,8 +257,7 @@ class ZenohLink:
     def _attend(self, connection: Connection, *, until_up: bool = False) -> bool:
         """Probe a connection until it is lost, suspect or not wanted; return whether it was up.
 
-        Also ends where another connection shall succeed it, or at once when it is up where
-        that is all that is asked.
+        Also ends where another connection shall succeed it, and with `until_up` once it is up.
         """
         up = False
         self._woke_at = next_probe = time.monotonic()
@@ -321,10 +317,7 @@ class ZenohLink:
         return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
 
     def _tell_records(self, connection: Connection) -> None:
-        """Send what the replica has not taken yet, with each probe until it has.
-
-        And now and then again: it answers with what another manager has signed since.
-        """
+        """Send what the replica has not taken, and all now and then: it may have newer."""
         records, id = self._shared.records, self.peer.id
         again = bool(records) and time.monotonic() - connection.told_at > _TELL_AGAIN_S
         if again or records != connection.told:
@@ -347,11 +340,7 @@ class ZenohLink:
             connection.lost_because = "the connection was lost"
 
     def _listen(self, connection: Connection) -> bool:
-        """Take what was heard; return whether the link is up by it.
-
-        Raises:
-            WireError: Another replica answers here, or nothing that can be read.
-        """
+        """Take what was heard; return whether the link is up by it. Raises WireError."""
         up = False
         for heard in self._probing.heard(connection):
             if connection.begin():

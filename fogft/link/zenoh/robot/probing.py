@@ -1,8 +1,7 @@
 """The probes of a link: the replica's answers, and for how long it has been silent.
 
-Owns: two silences, that of the replica over all connections, which people see, and that of the
-present connection, by which it is given up. Not here: when to probe, and what becomes of the link
-(`link`); how a probe travels (`connection`).
+There are two silences: that of the replica over all connections, which people see, and that of the
+present connection, by which it is given up. When to probe is `link`'s to say.
 """
 
 from __future__ import annotations
@@ -71,11 +70,6 @@ class Probing:
 
     Args:
         came: Called, from any thread, when an answer came.
-
-    Attributes:
-        answer: The last answer; None before the first.
-        heard_at: When that came, monotonic seconds.
-        rtt_s: What the last probe's round trip took, in seconds.
     """
 
     def __init__(self, peer: Peer, came: Callable[[], None]) -> None:
@@ -89,9 +83,9 @@ class Probing:
         self._of_connection = Silence()
         self._doubted = False
         self._content = b""  # of the last answer: what is idle says the same again and again
-        self.answer: ProbeAnswer | None = None
-        self.heard_at: float | None = None
-        self.rtt_s: float | None = None
+        self.answer: ProbeAnswer | None = None  # the last one
+        self.heard_at: float | None = None  # when that came, monotonic seconds
+        self.rtt_s: float | None = None  # what that took
 
     # -- asking and hearing ---------------------------------------------------------------
 
@@ -117,11 +111,7 @@ class Probing:
                 yield heard
 
     def take(self, heard: Heard) -> ProbeAnswer:
-        """Take an answer, which ends the silence, and return it.
-
-        Raises:
-            WireError: Another replica answers here, or nothing that can be read.
-        """
+        """Take an answer, which ends the silence. Raises WireError: it is not the peer's."""
         answer = self._read(heard.content)
         self._of_connection.ended()
         self._of_replica.ended()
@@ -165,7 +155,7 @@ class Probing:
     def late(self, now: float) -> tuple[bool, float]:
         """Return whether an answer is late (true once per silence), and the time left until then.
 
-        The second is infinite once it is late, and while none is awaited.
+        Infinite once it is late, and while none is awaited.
         """
         if not self._of_replica.lasts:
             self._doubted = False
