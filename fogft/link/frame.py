@@ -47,23 +47,13 @@ _ORIGIN_AT = _REQUEST.size
 
 
 class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass costs thrice as much
-    """The header of a request.
+    """The header of a request."""
 
-    Attributes:
-        request_id: 16 bytes, made by the client proxy.
-        remaining_s: Time left when it was sent, in seconds.
-        token: Names the robot's connection, so that replies queue apart.
-        seen: The stamp of the last answer that its connection has seen.
-        may_pack: The answer may be compressed.
-        reads_packed: It may be where the replica itself finds the link to be thin.
-        handling: What the replica is asked to do with it.
-    """
-
-    request_id: bytes
-    remaining_s: float
-    token: bytes
+    request_id: bytes  # 16 bytes, made by the client proxy
+    remaining_s: float  # when it was sent
+    token: bytes  # names the robot's connection, so that replies queue apart
     robot: str
-    seen: bytes = NO_STAMP
+    seen: bytes = NO_STAMP  # of the last answer that its connection has seen
     packed: bool = False
     may_pack: bool = False
     reads_packed: bool = False
@@ -72,17 +62,11 @@ class RequestHeader(NamedTuple):  # made for each request: a frozen dataclass co
 
 @dataclass(frozen=True)
 class Greeting:
-    """Sent with a probe to authenticate the connection.
+    """Sent with a probe to authenticate the connection."""
 
-    Attributes:
-        token: Names the robot's connection; requests under it are the greeter's.
-        certificate: The robot's (DER), with the first probe; empty once it was answered.
-        signature: Over `greeted_bytes`, with that certificate's key (DER).
-    """
-
-    token: bytes
-    certificate: bytes = b""
-    signature: bytes = b""
+    token: bytes  # names the connection; requests under it are the greeter's
+    certificate: bytes = b""  # the robot's (DER), with the first probe; empty once it was answered
+    signature: bytes = b""  # over `greeted_bytes`, with that certificate's key (DER)
 
 
 def origin(robot: str, token: bytes) -> bytes:

@@ -28,17 +28,12 @@ from fogft.requests.load import Handling, Load
 
 @dataclass(frozen=True)
 class SendOptions:
-    """Services that want the newest request first, no compression, or deadlines on the link.
-
-    Attributes:
-        latest: Those of which the newest request goes first.
-        plain: Those whose payloads are never compressed.
-        timed: Those whose requests nobody wants after their time. Of others, such as topics and the
-            orders of a stateful service, it only says when they are sent again.
-    """
+    """Services that want the newest request first, no compression, or deadlines on the link."""
 
     latest: frozenset[str] = frozenset()
     plain: frozenset[str] = frozenset()
+    # Of others, such as topics and the orders of a stateful service, a request's time only says
+    # when it is sent again.
     timed: frozenset[str] = frozenset()
 
     @classmethod
@@ -57,16 +52,11 @@ DEFAULT_OPTIONS = SendOptions()
 
 @dataclass(frozen=True)
 class Probe:
-    """The content of a robot's probe.
-
-    Attributes:
-        describe: The answer shall tell the definitions of the services' types.
-        version: Of fogft on the robot; empty before 0.2.0.
-    """
+    """The content of a robot's probe."""
 
     robot: Line
-    describe: bool = False
-    version: Line = ""
+    describe: bool = False  # the answer shall tell the definitions of the services' types
+    version: Line = ""  # of fogft on the robot; empty before 0.2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,19 +138,13 @@ class ProbeAnswer(ReplicaWord):
 
 
 class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
-    """The end of one attempt: `payload` if the service answered, else a `refusal`.
-
-    Attributes:
-        service: The name given to `Link.offer`.
-        detail: What belongs to a refusal of its kind.
-        load: What the replica has to do, if it says so.
-    """
+    """The end of one attempt: `payload` if the service answered, else a `refusal`."""
 
     request_id: bytes
     payload: bytes | None = None
     refusal: Refusal | None = None
-    service: str = ""
-    detail: str = ""
+    service: str = ""  # the name given to `Link.offer`
+    detail: str = ""  # what belongs to a refusal of its kind
     load: Load | None = None
 
 
@@ -195,12 +179,7 @@ class Peer:
 
 @dataclass(frozen=True)
 class LinkStatus:
-    """A snapshot of a link. Durations in seconds.
-
-    Attributes:
-        uplinks: How each uplink does, where there are several, for people.
-        ignores: It takes requests and never ends them, though others answer them.
-    """
+    """A snapshot of a link. Durations in seconds."""
 
     state: LinkState
     probe_answer: ProbeAnswer | None
@@ -210,8 +189,8 @@ class LinkStatus:
     in_flight: int
     reopened: int
     detail: str
-    uplinks: tuple[Mapping[str, Any], ...] = ()
-    ignores: bool = False
+    uplinks: tuple[Mapping[str, Any], ...] = ()  # how each does, where there are several
+    ignores: bool = False  # it takes requests and never ends them, though others answer them
 
 
 class Link(Protocol):
@@ -295,19 +274,12 @@ class Dialer(Protocol):
 
 
 class Incoming(Protocol):
-    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing.
-
-    Attributes:
-        request_id: 16 bytes, made by the client proxy.
-        robot: Who asks; replies to one robot never wait for another.
-        remaining_s: Time that was left when the robot sent it.
-        handling: What this replica is asked to do with it.
-    """
+    """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing."""
 
     service: str
-    request_id: bytes
-    robot: str
-    remaining_s: float
+    request_id: bytes  # 16 bytes, made by the client proxy
+    robot: str  # who asks; replies to one robot never wait for another
+    remaining_s: float  # when the robot sent it
     handling: Handling
     payload: bytes
 

@@ -89,21 +89,13 @@ _SHORTEST_LOOK_S = 0.05
 
 @dataclass(frozen=True)
 class Flow:
-    """The kernel's counters of one connection.
+    """The kernel's counters of one connection."""
 
-    Attributes:
-        acknowledged: Bytes that the peer's kernel has acknowledged so far.
-        received: Bytes that came from the peer so far.
-        outstanding: Bytes handed to the kernel that are not acknowledged.
-        round_trip_s: The smoothed time to an acknowledgement, with four times its variation.
-        unsent: Bytes among the outstanding ones that have not left: the path takes no more now.
-    """
-
-    acknowledged: int
-    received: int
-    outstanding: int
-    round_trip_s: float = 0.0
-    unsent: int = 0
+    acknowledged: int  # bytes that the peer's kernel has acknowledged so far
+    received: int  # bytes that came from the peer so far
+    outstanding: int  # bytes handed to the kernel that are not acknowledged
+    round_trip_s: float = 0.0  # to an acknowledgement, smoothed, with four times its variation
+    unsent: int = 0  # of those outstanding, what has not left: the path takes no more now
 
 
 class SocketProgress:
@@ -183,10 +175,9 @@ class DeadlineFilter:
 
     Args:
         timed: Services whose requests are of no use after their time.
-        carries: Returns what the link carries, by the clock, in bytes a second; None where that is
-            not known.
+        carries: Returns what the link carries, by the clock, in bytes a second; None for not known.
         left: Returns how many bytes sent before have not arrived, by the clock and that rate.
-        packs: Returns a service's compression; None where its payloads leave as they are.
+        packs: Returns a service's compression, if any.
     """
 
     def __init__(

@@ -34,28 +34,19 @@ BYTES_LIMIT = 64 << 20
 
 @dataclass(slots=True, eq=False)
 class OpenAttempt:
-    """A request on one connection.
-
-    Attributes:
-        payload: None once it was sent, or is not wanted.
-        offered: When, and until when it is of use, in monotonic seconds.
-        mark: What the connection had sent once this was sent (`credit`).
-        reads_packed: The answer may be compressed.
-        elsewhere: It was sent, and another replica answered its request in time.
-        forgotten: It is not wanted any more, and was not sent.
-    """
+    """A request on one connection. Moments are monotonic seconds."""
 
     service: str
     request_id: bytes
-    payload: bytes | None
+    payload: bytes | None  # None once it was sent, or is not wanted
     size: int
     offered: float
     deadline: float
     handling: Handling = Handling.NORMAL
-    mark: int = 0
-    reads_packed: bool = False
-    elsewhere: bool = False
-    forgotten: bool = False
+    mark: int = 0  # what the connection had sent once this was sent (`credit`)
+    reads_packed: bool = False  # the answer may be compressed
+    elsewhere: bool = False  # it was sent, and another replica answered its request in time
+    forgotten: bool = False  # it is not wanted any more, and was not sent
 
 
 class LinkWindow:
@@ -226,9 +217,7 @@ class BatchBuffer:
 
 WORTH_S = 0.005
 EVERY_S = 0.01  # under load each answer has a loser: they are told together
-CANCELLED_LIMIT = (
-    4096  # what one message carries; further ones are not told, and their work is not saved
-)
+CANCELLED_LIMIT = 4096  # what one message carries; of further ones nobody is told
 
 
 class Cancellations:

@@ -39,11 +39,7 @@ class Refuse(Generic[T]):
 
 @dataclass(frozen=True)
 class Begin:
-    """Call the service, or its state service; its end is reported by the serial.
-
-    Attributes:
-        op: `APPLY`: call the service. `SNAPSHOT`, `RESTORE`: call those of the pool file.
-    """
+    """Call the service (`APPLY`), or its state service; its end is reported by the serial."""
 
     op: Op
     serial: int

@@ -27,15 +27,10 @@ CHECK_EVERY_S = 1.0
 
 @dataclass(frozen=True)
 class Handover:
-    """The start of a term with another active version: all earlier requests are applied.
+    """The start of a term with another active version: all earlier requests are applied."""
 
-    Attributes:
-        version: The one that becomes active.
-        at: The state that it takes over: every number given before has been applied there.
-    """
-
-    version: str
-    at: Position
+    version: str  # the one that becomes active
+    at: Position  # the state that it takes over
     state: bytes
 
 
@@ -47,12 +42,6 @@ class Sequencer:
         mark: The position of the last answer that was returned, in whatever term.
         holder: The version that returned it; None where nobody knows.
         begin: What the term begins from, where a version takes over from another.
-
-    Attributes:
-        active: Whose answers count.
-        deposed_by: A later term that more replicas obey than this one.
-        held_by: Another robot whose order they obey.
-        handover: This term's end: the next begins from it.
     """
 
     def __init__(
@@ -66,10 +55,10 @@ class Sequencer:
         self.epoch = epoch
         self.mark = mark
         self.active = ActiveVersion(begin.version if begin else holder)
-        self.deposed_by: int | None = None
+        self.deposed_by: int | None = None  # a later term that more replicas obey
         self._fenced: dict[int, int] = {}  # who says that it obeys a later term, and which
-        self.held_by = ""
-        self.handover: Handover | None = None
+        self.held_by = ""  # another robot, whose order they obey
+        self.handover: Handover | None = None  # this term's end: the next begins from it
         self._versions: Mapping[int, str] = {}
         self._leaving: frozenset[int] = frozenset()
         self._change_to: str | None = None  # no number is given meanwhile

@@ -24,34 +24,24 @@ T = TypeVar("T")
 
 @dataclass
 class Pending(Generic[T]):
-    """A request that awaits its answer.
+    """A request that awaits its answer. Moments are monotonic seconds.
 
-    Attributes:
-        item: What the caller keeps with it (payload, handle).
-        open: Replicas that work on it now, each with the moment when it was asked.
-        barred: Replicas that must not be asked again.
-        failures: How often an attempt at each replica has failed, those that count.
-        waits: Until when a replica that failed it is left alone, and that wait, in seconds.
-        rejection: The last response that was real but not ok.
-        deaths: How often a service died while it worked on this: those that died together over
-            copies of it, and of other requests, count as one.
-        died_at: The replicas where they died.
-        alone_at: The replicas that got it with nothing beside it, since a service has died.
-        alone_until: When another one is asked, if none of these has answered: half of the time left
-            is over then.
+    `deaths` counts how often a service died while it worked on this: those that died together over
+    copies of it, and of other requests, count as one.
     """
 
     deadline: float
-    item: T
-    open: dict[int, float] = field(default_factory=dict)
-    barred: set[int] = field(default_factory=set)
-    failures: dict[int, int] = field(default_factory=dict)
+    item: T  # what the caller keeps with it (payload, handle)
+    open: dict[int, float] = field(default_factory=dict)  # who works on it, and since when
+    barred: set[int] = field(default_factory=set)  # replicas that must not be asked again
+    failures: dict[int, int] = field(default_factory=dict)  # those that count, by replica
+    # Until when a replica that failed it is left alone, and that wait.
     waits: dict[int, tuple[float, float]] = field(default_factory=dict)
-    rejection: bytes | None = None
+    rejection: bytes | None = None  # the last response that was real but not ok
     deaths: int = 0
-    alone_at: set[int] = field(default_factory=set)
-    alone_until: float = 0.0
-    died_at: set[int] = field(default_factory=set)
+    alone_at: set[int] = field(default_factory=set)  # who got it with nothing beside it since
+    alone_until: float = 0.0  # then another one is asked: half of the time left is over
+    died_at: set[int] = field(default_factory=set)  # replicas where services died over it
 
 
 class Means(Enum):
@@ -69,18 +59,13 @@ Judgement = Means | Refusal  # a refusal: as if the replica had refused the requ
 
 
 class Send(NamedTuple):
-    """Something to send to a replica, such as a copy of a caller's request.
-
-    Attributes:
-        timeout_s: How long it is good for.
-        is_copy: It is a copy of a caller's request, and counted as one.
-    """
+    """Something to send to a replica, such as a copy of a caller's request."""
 
     replica: int
     id: bytes
     payload: bytes
     timeout_s: float
-    is_copy: bool = False
+    is_copy: bool = False  # of a caller's request, and counted as one
 
 
 class Reachable(NamedTuple):

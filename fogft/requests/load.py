@@ -43,21 +43,13 @@ class Handling(IntFlag):
 
 
 class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
-    """The load of one service, reported by a replica with each answer and refusal.
+    """The load of one service, reported by a replica with each answer and refusal."""
 
-    Attributes:
-        waiting: Requests that wait for their turn.
-        running: Requests that the service has now.
-        slots: How many it works on at once; 0 where that is not known yet.
-        service_s: What it lately took for a request, divided by how many it had at once.
-        spent_s: How long the request of this answer was at the replica.
-    """
-
-    waiting: int
-    running: int
-    slots: int
-    service_s: float
-    spent_s: float
+    waiting: int  # requests that wait for their turn
+    running: int  # requests that the service has now
+    slots: int  # how many it works on at once; 0 where that is not known yet
+    service_s: float  # what it lately took for a request, divided by how many it had at once
+    spent_s: float  # how long the request of this answer was at the replica
 
 
 class Demand:
@@ -81,20 +73,13 @@ class Demand:
 
 
 class ReplicaLoad:
-    """One robot's estimate of a replica's load. Not thread-safe: its owner holds a lock.
-
-    Attributes:
-        service_s: How long it works on a request, as far as is known.
-        delay_s: After how long an attempt takes unusually long.
-        doubted: An attempt is overdue, and it has ended none since that one began.
-        ended_at: When it last ended an attempt, with an answer or too late for one.
-    """
+    """One robot's estimate of a replica's load. Not thread-safe: its owner holds a lock."""
 
     def __init__(self) -> None:
         self.latencies = Latencies()
-        self.service_s = 0.0
-        self.doubted = False
-        self.ended_at = -NEVER
+        self.service_s = 0.0  # how long it works on a request, as far as is known
+        self.doubted = False  # an attempt is overdue, and it has ended none since that one began
+        self.ended_at = -NEVER  # when it last ended an attempt, with an answer or too late for one
         self.asked_at = -NEVER
         # Our attempts that it has not ended, oldest first: when each began, and is overdue.
         self._at_work: dict[bytes, tuple[float, float]] = {}
@@ -104,7 +89,7 @@ class ReplicaLoad:
         self._others_until = -NEVER
         self._avoided_s = 0.0
         self._avoided_until = -NEVER
-        self.delay_s = UNKNOWN_DELAY_S
+        self.delay_s = UNKNOWN_DELAY_S  # after it an attempt takes unusually long
         self._delay_holds_until = _SAMPLES_NEEDED
 
     # -- what is believed -----------------------------------------------------------------
@@ -141,15 +126,11 @@ class ReplicaLoad:
         return self.doubted or now < self._avoided_until
 
     def expected_s(self, now: float, typical_s: float) -> float:
-        """Return the expected latency of a request sent now.
+        """Return the expected latency of a request sent now; 0 where nothing is known: it is tried.
 
         Round trip, and one service time for it and for each request before it, less what the one at
-        work has had; one that takes far too long is taken to go on for as long again. 0 for a
-        replica of which nothing is known: it is tried.
-
-        Args:
-            typical_s: The service time of most replicas. One that is not four times as slow or
-                as quick is taken for equal: where times vary, a few answers say no more.
+        work has had; one that takes far too long is taken to go on for as long again. A replica
+        that is not four times as slow or quick as `typical_s`, that of most, is taken for equal.
         """
         service_s = self.service_s
         if typical_s / _ALIKE < service_s < typical_s * _ALIKE:
@@ -172,8 +153,8 @@ class ReplicaLoad:
     def doubtful_at(self, begun: float) -> float:
         """Return when an attempt that began then is long overdue.
 
-        Not as soon as it takes unusually long: one in twenty does, and what is sent elsewhere for
-        it is work. Of one that has answered little nothing is unusual for seconds.
+        Not as soon as it takes unusually long: one in twenty does. Of one that has answered little
+        nothing is unusual for seconds.
         """
         if self.latencies.samples < _SAMPLES_NEEDED:
             return begun + _UNKNOWN_DOUBT_S

@@ -61,21 +61,15 @@ _NO_WAIT = (0.0, RETRY_FIRST_S / 2)
 class PendingRequests(Generic[T]):
     """The unanswered requests of one service.
 
-    Args:
-        counts_deaths: Whether a request may be blamed for the death of a service that has it.
-
-    Attributes:
-        fallback: When the fallback is asked; None where there never was one.
-        held_bytes: Of all payloads together.
-        soonest_deadline: Of the requests, or sooner.
+    With `counts_deaths` a request may be blamed for the death of a service that has it.
     """
 
     def __init__(self, choose: Choose, decide: Decide, *, counts_deaths: bool = False) -> None:
-        self.held_bytes = 0
+        self.held_bytes = 0  # of all payloads together
         self.choose = choose
         self.decide = decide
         self.fallback: FallbackTimer[Pending[T]] | None = None
-        self.soonest_deadline = NEVER
+        self.soonest_deadline = NEVER  # of the requests, or sooner
         self._pending: dict[bytes, Pending[T]] = {}
         # Those that some replica may have to be asked for, as far as is known, and from when on.
         self._short: dict[bytes, float] = {}

@@ -40,9 +40,7 @@ class Quorum(Decide):
     """``quorum: k``: an answer with which k replicas agree; see `decide.Decide`.
 
     Replicas go on working on a request that has its answer: what they say tells a wrong one.
-
-    Args:
-        newly_flagged: Called with a replica that has disagreed once too often, and how often.
+    `newly_flagged` is told who has disagreed once too often, and how often.
     """
 
     kept = 256  # final answers, to judge late ballots by

@@ -68,18 +68,11 @@ def names_one(cancel: bytes) -> bool:
 
 @dataclass(frozen=True)
 class _Word:
-    """What a replica has said of a goal that it was given. Times on the caller's clock, seconds.
+    """What a replica has said of a goal. Times on the caller's clock, seconds."""
 
-    Attributes:
-        until: When to give it the goal again, if it says nothing more.
-        since: From when on it is to be believed that it does not know the goal: it has taken or
-            refused it by then.
-        again_s: For how long it was left alone when it did not look at it.
-    """
-
-    until: float
-    since: float = math.inf
-    again_s: float = 0.0
+    until: float  # when to give it the goal again, if it says nothing more
+    since: float = math.inf  # from then on it has taken or refused it: to know nothing counts
+    again_s: float = 0.0  # for how long it was left alone when it did not look at it
 
 
 @dataclass

@@ -34,19 +34,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True, eq=False)
 class Reply:
-    """One answer: a refusal if that is not empty, else a payload.
-
-    Attributes:
-        load: What the replica has to do, as `frame.encode_load` writes it.
-        may_pack: It may be compressed: its robot's link was seen to be thin.
-    """
+    """One answer: a refusal if that is not empty, else a payload."""
 
     stream: Stream
     request_id: bytes
     payload: bytes
     refusal: str
-    load: bytes = frame.NO_LOAD
-    may_pack: bool = False
+    load: bytes = frame.NO_LOAD  # what the replica has to do
+    may_pack: bool = False  # it may be compressed: its robot's link was seen to be thin
 
     @property
     def joins(self) -> bool:
