@@ -217,7 +217,7 @@ class Key:
 
 
 class Entry(NamedTuple):
-    """One key of a dataclass, and the name of its field."""
+    """One field of a dataclass, by its name there and in files."""
 
     field: str
     name: str
@@ -248,18 +248,26 @@ def key(
     return field(metadata=said, kw_only=kw_only)
 
 
+ORDINARY = Key(Free(""), "")
+"""Of a field that is no key of the pool file: any value of its type is right."""
+
+
+def entries_of(cls: Any) -> list[Entry]:
+    """Return all fields of a dataclass, in order, by the names they have in files."""
+    found = []
+    for one in dataclasses.fields(cls):
+        said: Key = one.metadata.get("key", ORDINARY)
+        made = one.default if one.default_factory is MISSING else one.default_factory()
+        found.append(Entry(one.name, said.name or one.name, said, made))
+    return found
+
+
 _KNOWN: dict[type, tuple[Entry, ...]] = {}
 
 
 def keys_of(cls: type) -> tuple[Entry, ...]:
     """Return the keys of a dataclass, in order; required ones first."""
-    if cls in _KNOWN:
-        return _KNOWN[cls]
-    found = []
-    for one in dataclasses.fields(cls):
-        if "key" in one.metadata:
-            said: Key = one.metadata["key"]
-            made = one.default if one.default_factory is MISSING else one.default_factory()
-            found.append(Entry(one.name, said.name or one.name, said, made))
-    _KNOWN[cls] = tuple(sorted(found, key=lambda entry: not entry.required))
+    if cls not in _KNOWN:
+        found = [entry for entry in entries_of(cls) if entry.key is not ORDINARY]
+        _KNOWN[cls] = tuple(sorted(found, key=lambda entry: not entry.required))
     return _KNOWN[cls]

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
 from functools import partial
 from pathlib import Path, PurePath
-from typing import Annotated, Any, NamedTuple, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from fogft.errors import StateError
 from fogft.model import keys
@@ -82,7 +82,7 @@ def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
         return str(value)
     if dataclasses.is_dataclass(value):
         omits = omit_defaults or getattr(value, "omits_defaults", False)
-        held = [(one, getattr(value, one.field)) for one in _entries(type(value))]
+        held = [(one, getattr(value, one.field)) for one in keys.entries_of(type(value))]
         kept = [(one, it) for one, it in held if not omits or it != one.default]
         return {one.name: again(it) for one, it in kept}
     if isinstance(value, Mapping):
@@ -115,25 +115,6 @@ def stored(cls: type[T], raw: Any, what: str, hint: str = "") -> T:
         return from_plain(cls, raw)
     except ValueError as error:
         raise StateError(f"{what}: {error}", hint) from error
-
-
-class _Entry(NamedTuple):
-    name: str
-    field: str
-    default: Any
-    form: keys.Form | None
-
-
-def _entries(cls: Any) -> list[_Entry]:
-    found = []
-    for one in dataclasses.fields(cls):
-        key: keys.Key | None = one.metadata.get("key")
-        default = one.default
-        if one.default_factory is not dataclasses.MISSING:
-            default = one.default_factory()
-        name, form = (one.name, None) if key is None else (key.name or one.name, key.form)
-        found.append(_Entry(name, one.name, default, form))
-    return found
 
 
 def _reader(hint: Any) -> Read:
@@ -243,27 +224,27 @@ def _items(raw: Any) -> Iterable[tuple[Any, Any]]:
 
 def _class(cls: Any) -> Read:
     hints = typing.get_type_hints(cls, include_extras=True)
-    entries = {one.name: one for one in _entries(cls)}
+    entries = {one.name: one for one in keys.entries_of(cls)}
     reads = {one.name: _of_key(one, _reader(hints[one.field])) for one in entries.values()}
 
     def read(raw: Any) -> Any:
         found = {n: _at(n, reads[n], value) for n, value in _items(raw) if n in reads}
         for name, one in entries.items():
-            if one.default is dataclasses.MISSING and name not in found:
+            if one.required and name not in found:
                 raise Misfit((name,), "is missing")
         return cls(**{entries[name].field: value for name, value in found.items()})
 
     return read
 
 
-def _of_key(entry: _Entry, read: Read) -> Read:
+def _of_key(entry: keys.Entry, read: Read) -> Read:
     """Return a reader that keeps to what a pool file may say, or to the key's default."""
-    form = entry.form
-    if form is None:
+    form, default = entry.key.form, entry.default
+    if entry.key is keys.ORDINARY:
         return read
 
     def checked(raw: Any) -> Any:
         value = read(raw)
-        return value if value is None or value == entry.default else keys.checked(form, value)
+        return value if value is None or value == default else keys.checked(form, value)
 
     return checked

@@ -22,7 +22,7 @@ from fogft.planning.observed.hazard import EVERY_S, as_of
 from fogft.planning.observed.health import LONE_SILENCE_FACTOR
 from fogft.planning.observed.history import Event, History, compacted
 from fogft.planning.rollout import Trial
-from fogft.pool.folder.store import Identity
+from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager.reconciler import Reconciler, Tick
 from fogft.simulation.world import NEVER, TICK_S, UNSEEN, Target, World
 
@@ -31,8 +31,8 @@ LOOK_EVERY_S = 6 * 3600.0  # a safety net: tests show that the results do not de
 _COMPACT_AFTER = 2_000
 
 
-class _Memory:
-    """Implements `fogft.pool.folder.store.Store`, of a pool file that never changes."""
+class _Memory(PoolStore):
+    """What the reconciler uses of a store, in memory: of a pool file that never changes."""
 
     def __init__(self, spec: PoolSpec, now: float) -> None:
         self.the_spec = spec

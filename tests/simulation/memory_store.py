@@ -14,7 +14,7 @@ from fogft.pool.folder.store import Identity
 
 
 class MemoryStore:
-    """Implements `fogft.pool.folder.store.Store`; `crash_point` is called around every write."""
+    """What the reconciler uses of `PoolStore`; `crash_point` is called around every write."""
 
     def __init__(self, identity: Identity, spec: PoolSpec) -> None:
         self._identity = identity

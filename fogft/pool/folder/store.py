@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Protocol
+from typing import Annotated
 
 from fogft import disk
 from fogft.errors import PoolBusy, PoolNotFound, SpecError, StateError
@@ -58,46 +58,6 @@ class GatewayPlace:
     """Where the launched gateway is; empty until that is known."""
 
     host: str = ""
-
-
-class Store(Protocol):
-    """The state that the reconciler reads and writes."""
-
-    def identity(self) -> Identity:
-        """Return the pool's identity."""
-
-    def spec(self) -> PoolSpec:
-        """Return the pool file in force: as applied last, or the good one after a rollback."""
-
-    def applied(self) -> str:
-        """Return the digest of the pool file that was applied last."""
-
-    def good(self) -> PoolSpec | None:
-        """Return the last file with which all replicas were ready; None for none yet."""
-
-    def keep_good(self, spec: PoolSpec) -> bool:
-        """Store the file of `spec` as the last good one, if it was the last one read."""
-
-    def trial(self) -> Trial:
-        """Return the trial of the last applied file, or of an earlier one."""
-
-    def write_trial(self, trial: Trial) -> None:
-        """Store the trial of the applied file."""
-
-    def intent(self) -> Intent:
-        """Return the user's changes besides the file."""
-
-    def history(self) -> History:
-        """Return the history so far, `append`ed events included."""
-
-    def append(self, event: Event) -> None:
-        """Append an event; it survives a crash once this returns."""
-
-    def membership(self) -> Membership | None:
-        """Return the last written membership."""
-
-    def write_membership(self, membership: Membership) -> None:
-        """Publish a membership."""
 
 
 class PoolStore:

@@ -45,7 +45,7 @@ from fogft.planning.observed.history import EventKind, History, fault_of
 from fogft.planning.observed.refresh import Silent
 from fogft.planning.planner import Plan, PlannedLaunch, plan
 from fogft.planning.rollout import Update
-from fogft.pool.folder.store import Identity, Store
+from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import offers
 from fogft.pool.manager.launched_gateway import LaunchedGateway
 from fogft.pool.manager.operations import Operations, Submit
@@ -114,7 +114,7 @@ class Reconciler:
     def __init__(
         self,
         cloud: Cloud,
-        store: Store,
+        store: PoolStore,
         *,
         clock: Callable[[], float],
         reading: Callable[[], Reading] | None = None,

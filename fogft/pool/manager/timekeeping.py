@@ -20,7 +20,7 @@ from fogft.model.replica import Observed, ReplicaId
 from fogft.planning.observed.clock_jumps import Reading, Watch
 from fogft.planning.observed.health import Health, Verdict
 from fogft.planning.observed.history import Event, EventKind, History
-from fogft.pool.folder.store import Store
+from fogft.pool.folder.store import PoolStore
 from fogft.pool.manager.updating import Updating
 from fogft.reason_words import words
 
@@ -28,7 +28,7 @@ from fogft.reason_words import words
 class Remembering:
     """Adds to a pool's history. Events are on disk before a method returns, or `StateError`."""
 
-    def __init__(self, store: Store, clock: Callable[[], float]) -> None:
+    def __init__(self, store: PoolStore, clock: Callable[[], float]) -> None:
         self._store = store
         self._clock = clock
         self._leaving: dict[ReplicaId, Reason] = {}  # when they were judged last
@@ -112,7 +112,7 @@ class Timekeeping:
 
     def __init__(
         self,
-        store: Store,
+        store: PoolStore,
         updating: Updating,
         clock: Callable[[], float],
         reading: Callable[[], Reading] | None,

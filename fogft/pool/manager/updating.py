@@ -19,7 +19,7 @@ from fogft.planning import rollout
 from fogft.planning.observed.health import Health, judge
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.rollout import Trial, Update
-from fogft.pool.folder.store import Store
+from fogft.pool.folder.store import PoolStore
 from fogft.reason_words import words
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 class Updating:
     """The updates of one pool. Raises `StateError` if the state cannot be stored."""
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: PoolStore) -> None:
         self._store = store
 
     def look(self, uid: str, observed: Observed, history: History) -> tuple[PoolSpec, Trial]:
