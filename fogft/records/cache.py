@@ -69,5 +69,5 @@ def restore(path: Path, records: RecordSet, ca: Path) -> bool:
         return False
     any_time = Verifier(ca, any_time=True)
     for one in known:
-        records.restore(one, any_time)
+        records.offer(one, any_time)
     return True

@@ -23,7 +23,7 @@ from fogft.errors import StateError, WireError
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import is_endpoint
 from fogft.records.cache import restore, write
-from fogft.records.dialling import Caller
+from fogft.records.dialling import connect
 from fogft.records.exchange import Exchange
 from fogft.records.record import Record, RecordError, RecordKind, sign_record
 from fogft.records.record_set import RecordSet, Verdict
@@ -172,11 +172,12 @@ class RendezvousClient:
 
     async def _call(self, endpoint: str) -> None:
         """Keep one rendezvous connected for ever."""
-        caller = Caller(endpoint, self._credentials, self._signer, self._records.pool_uid)
         while True:
             began = time.monotonic()
             try:
-                connection, seen_host = await caller.connect()
+                connection, seen_host = await connect(
+                    endpoint, self._credentials, self._signer, self._records.pool_uid
+                )
             except (WireError, RecordError, OSError, EOFError, asyncio.TimeoutError) as error:
                 words = error.message if isinstance(error, WireError) else str(error)
                 self._detail(endpoint, words or "it does not answer")

@@ -13,6 +13,7 @@ import asyncio
 import os
 import socket
 import ssl
+from pathlib import Path
 from typing import Any
 
 from fogft.errors import CredentialError, WireError
@@ -28,112 +29,104 @@ _ATTEMPT_TIMEOUT_S = 3.0
 _GREETING_TIMEOUT_S = 5.0
 
 
-class Caller:
-    """Connects one process to one rendezvous of its pool; looks the name up on each attempt."""
+async def connect(
+    endpoint: str, credentials: CredentialPaths, signer: Signer, pool_uid: str
+) -> tuple[Connection, str]:
+    """Return an authenticated connection to a rendezvous, and our address as seen there.
 
-    def __init__(
-        self, endpoint: str, credentials: CredentialPaths, signer: Signer, pool_uid: str
-    ) -> None:
-        self._endpoint = endpoint
-        self._address = host_and_port(endpoint)
-        self._credentials = credentials
-        self._signer = signer
-        self._pool_uid = pool_uid
+    Raises:
+        WireError: Somebody else is there, or it does not let us in.
+        RecordError: What it says is no greeting.
+        OSError: It cannot be reached, or TLS fails.
+    """
+    raw = await _reach(endpoint)
+    try:
+        greeted = _greet(raw, endpoint, credentials.ca, signer, pool_uid)
+        return await asyncio.wait_for(greeted, _GREETING_TIMEOUT_S)
+    except BaseException:
+        raw.close()
+        raise
 
-    async def connect(self) -> tuple[Connection, str]:
-        """Return an authenticated connection, and our address as seen there.
 
-        Raises:
-            WireError: Somebody else is there, or it does not let us in.
-            RecordError: What it says is no greeting.
-            OSError: It cannot be reached, or TLS fails.
-        """
-        raw = await self._reach()
-        try:
-            return await asyncio.wait_for(self._greet(raw), _GREETING_TIMEOUT_S)
-        except BaseException:
-            raw.close()
-            raise
+async def _reach(endpoint: str) -> socket.socket:
+    """Return the first of several overlapping attempts that gets through."""
+    attempts: set[asyncio.Task[socket.socket]] = set()
+    loop = asyncio.get_running_loop()
+    try:
+        while True:
+            attempts.add(loop.create_task(_attempt(endpoint)))
+            tick = loop.create_task(asyncio.sleep(ATTEMPT_EVERY_S))
+            try:
+                await asyncio.wait({*attempts, tick}, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                tick.cancel()
+            for attempt in [a for a in attempts if a.done()]:
+                attempts.discard(attempt)
+                return attempt.result()  # an error, too: it is told, then tried again
+    finally:
+        for attempt in attempts:
+            attempt.cancel()
+        for late in await asyncio.gather(*attempts, return_exceptions=True):
+            if isinstance(late, socket.socket):
+                late.close()
 
-    async def _reach(self) -> socket.socket:
-        """Return the first of several overlapping attempts that gets through."""
-        attempts: set[asyncio.Task[socket.socket]] = set()
-        loop = asyncio.get_running_loop()
-        try:
-            while True:
-                attempts.add(loop.create_task(self._attempt()))
-                tick = loop.create_task(asyncio.sleep(ATTEMPT_EVERY_S))
-                try:
-                    await asyncio.wait({*attempts, tick}, return_when=asyncio.FIRST_COMPLETED)
-                finally:
-                    tick.cancel()
-                for attempt in [a for a in attempts if a.done()]:
-                    attempts.discard(attempt)
-                    return attempt.result()  # an error, too: it is told, then tried again
-        finally:
-            for attempt in attempts:
-                attempt.cancel()
-            for late in await asyncio.gather(*attempts, return_exceptions=True):
-                if isinstance(late, socket.socket):
-                    late.close()
 
-    async def _attempt(self) -> socket.socket:
-        loop = asyncio.get_running_loop()
-        host, port = self._address
-        found = await asyncio.wait_for(
-            loop.getaddrinfo(host, port, type=socket.SOCK_STREAM), _ATTEMPT_TIMEOUT_S
-        )
-        family, kind, protocol, _, address = found[0]
-        raw = socket.socket(family, kind, protocol)
-        try:
-            raw.setblocking(False)
-            raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            await asyncio.wait_for(loop.sock_connect(raw, address), _ATTEMPT_TIMEOUT_S)
-        except asyncio.TimeoutError:
-            raw.close()
-            raise WireError(f"`{self._endpoint}` does not answer") from None
-        except OSError as error:
-            raw.close()
+async def _attempt(endpoint: str) -> socket.socket:
+    loop = asyncio.get_running_loop()
+    host, port = host_and_port(endpoint)
+    found = await asyncio.wait_for(
+        loop.getaddrinfo(host, port, type=socket.SOCK_STREAM), _ATTEMPT_TIMEOUT_S
+    )
+    family, kind, protocol, _, address = found[0]
+    raw = socket.socket(family, kind, protocol)
+    try:
+        raw.setblocking(False)
+        raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        await asyncio.wait_for(loop.sock_connect(raw, address), _ATTEMPT_TIMEOUT_S)
+    except BaseException as error:
+        raw.close()
+        if isinstance(error, asyncio.TimeoutError):
+            raise WireError(f"`{endpoint}` does not answer") from None
+        if isinstance(error, OSError):
             words = os.strerror(error.errno).lower() if error.errno else str(error)
-            raise WireError(f"`{self._endpoint}`: {words}") from error
-        except BaseException:
-            raw.close()
-            raise
-        return raw
+            raise WireError(f"`{endpoint}`: {words}") from error
+        raise
+    return raw
 
-    async def _greet(self, raw: socket.socket) -> tuple[Connection, str]:
-        reader, writer = await asyncio.open_connection(
-            sock=raw, ssl=self._context(), server_hostname=""
+
+async def _greet(
+    raw: socket.socket, endpoint: str, ca: Path, signer: Signer, pool_uid: str
+) -> tuple[Connection, str]:
+    reader, writer = await asyncio.open_connection(sock=raw, ssl=_context(ca), server_hostname="")
+    try:
+        binding = _check(writer.get_extra_info("ssl_object"), endpoint, pool_uid)
+        unframer = frames.Unframer()
+        nonce, seen_host = frames.read_challenge(
+            await asyncio.wait_for(first_message(reader, unframer), SILENCE_S)
         )
-        try:
-            binding = self._check(writer.get_extra_info("ssl_object"))
-            unframer = frames.Unframer()
-            nonce, seen_host = frames.read_challenge(
-                await asyncio.wait_for(first_message(reader, unframer), SILENCE_S)
-            )
-            proof = frames.proof_bytes(PURPOSE, nonce, binding)
-            writer.write(frames.greeting(*self._signer(proof)))
-        except BaseException:
-            writer.transport.abort()
-            raise
-        return Connection(reader, writer, unframer, self._endpoint), seen_host
+        proof = frames.proof_bytes(PURPOSE, nonce, binding)
+        writer.write(frames.greeting(*signer(proof)))
+    except BaseException:
+        writer.transport.abort()
+        raise
+    return Connection(reader, writer, unframer, endpoint), seen_host
 
-    def _context(self) -> ssl.SSLContext:
-        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        context.minimum_version = ssl.TLSVersion.TLSv1_3
-        context.check_hostname = False  # its role and pool are what must be right, not its host
-        try:
-            context.load_verify_locations(self._credentials.ca)
-        except (OSError, ssl.SSLError):
-            raise CredentialError(f"the CA `{self._credentials.ca}` cannot be used") from None
-        return context
 
-    def _check(self, link: Any) -> bytes:
-        """See that a rendezvous of our pool is there; return what ties our greeting to it."""
-        subject = dict(entry for part in link.getpeercert()["subject"] for entry in part)
-        name, role = subject.get("commonName", ""), subject.get("organizationalUnitName", "")
-        if role != "rendezvous" or not name.endswith(f".{self._pool_uid}"):
-            raise WireError(
-                f"`{self._endpoint}` has the certificate of `{name}`, not of a rendezvous"
-            )
-        return binding_of(link.getpeercert(binary_form=True))
+def _context(ca: Path) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    context.check_hostname = False  # its role and pool are what must be right, not its host
+    try:
+        context.load_verify_locations(ca)
+    except (OSError, ssl.SSLError):
+        raise CredentialError(f"the CA `{ca}` cannot be used") from None
+    return context
+
+
+def _check(link: Any, endpoint: str, pool_uid: str) -> bytes:
+    """See that a rendezvous of our pool is there; return what ties our greeting to it."""
+    subject = dict(entry for part in link.getpeercert()["subject"] for entry in part)
+    name, role = subject.get("commonName", ""), subject.get("organizationalUnitName", "")
+    if role != "rendezvous" or not name.endswith(f".{pool_uid}"):
+        raise WireError(f"`{endpoint}` has the certificate of `{name}`, not of a rendezvous")
+    return binding_of(link.getpeercert(binary_form=True))

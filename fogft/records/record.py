@@ -115,15 +115,10 @@ class SignedRecord:
 
 @dataclass(frozen=True)
 class Writer:
-    """The writer of a record, by a verified certificate.
-
-    Attributes:
-        serial: The certificate's serial number, lower-case hexadecimal.
-    """
+    """The writer of a record, by a verified certificate."""
 
     role: str
     common_name: str
-    serial: str
 
 
 # Takes certificate, signature and the bytes that were signed; raises `RecordError`.

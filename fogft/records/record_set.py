@@ -64,10 +64,10 @@ class RecordSet:
 
     # -- merging ----------------------------------------------------------------------------
 
-    def offer(self, signed: SignedRecord) -> Verdict:
-        """Add a record if it is valid and newer than the current one of its key."""
+    def offer(self, signed: SignedRecord, verify: Verify | None = None) -> Verdict:
+        """Add a record if it is valid, by `verify` or the usual check, and newer than its key's."""
         try:
-            verdict = self._judge(signed)
+            verdict = self._judge(signed, verify or self._verify)
         except RecordError as error:
             self.counts[f"refused_{error.reason}"] += 1
             self.last_refusal = str(error)
@@ -75,15 +75,7 @@ class RecordSet:
         self.counts[verdict.value] += 1
         return verdict
 
-    def restore(self, signed: SignedRecord, verify: Verify) -> Verdict:
-        """Add records that were accepted before, checked by another `verify`."""
-        usual, self._verify = self._verify, verify
-        try:
-            return self.offer(signed)
-        finally:
-            self._verify = usual
-
-    def _judge(self, signed: SignedRecord) -> Verdict:
+    def _judge(self, signed: SignedRecord, verify: Verify) -> Verdict:
         record = read_body(signed)
         if record.pool_uid != self.pool_uid:
             raise RecordError("pool", "a record of another pool")
@@ -96,7 +88,7 @@ class RecordSet:
         if held is None and len(self._held) >= self._limit:
             raise RecordError("full", f"a record beyond the {self._limit} that are kept")
         # Last, being the costly step: a flood of old records costs no signature checks.
-        writer = verified_writer(record, signed, self._verify)
+        writer = verified_writer(record, signed, verify)
         if writer.common_name in self._revoked:
             raise RecordError("revoked", f"the certificate of `{writer.common_name}` is revoked")
         self._held[record.key] = _Held(record, signed, writer)

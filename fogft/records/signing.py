@@ -93,6 +93,7 @@ class Verifier:
 
     Args:
         any_time: Accept certificates out of their time: for what was verified before.
+        lazy: Read the CA on first use; one that cannot be used is a `RecordError` then.
     """
 
     def __init__(
@@ -101,13 +102,10 @@ class Verifier:
         *,
         now: Callable[[], datetime.datetime] = lambda: datetime.datetime.now(datetime.timezone.utc),
         any_time: bool = False,
+        lazy: bool = False,
     ) -> None:
-        from cryptography import x509
-
-        try:
-            self._authorities = x509.load_pem_x509_certificates(ca.read_bytes())
-        except (OSError, ValueError):
-            raise CredentialError(f"the CA `{ca}` cannot be used") from None
+        self._ca = ca
+        self._authorities = [] if lazy else _read_authorities(ca)
         self._now = now
         self._any_time = any_time
         self._known: dict[bytes, x509.Certificate] = {}
@@ -127,16 +125,16 @@ class Verifier:
             key.verify(signature, message, ec.ECDSA(hashes.SHA256()))
         except InvalidSignature:
             raise RecordError("forged", "a signature that is wrong") from None
-        return Writer(
-            role=_attribute(known, "OU"),
-            common_name=_attribute(known, "CN"),
-            serial=f"{known.serial_number:x}",
-        )
+        return Writer(_attribute(known, "OU"), _attribute(known, "CN"))
 
     def _judged(self, der: bytes) -> x509.Certificate:
         from cryptography import x509
         from cryptography.hazmat.primitives.asymmetric import ec
 
+        try:
+            self._authorities = self._authorities or _read_authorities(self._ca)
+        except CredentialError as error:
+            raise RecordError("authority", error.message) from error
         try:
             certificate = x509.load_der_x509_certificate(der)
             constraints = certificate.extensions.get_extension_for_class(x509.BasicConstraints)
@@ -160,21 +158,13 @@ class Verifier:
             raise RecordError("expired", f"the certificate of `{name}` has expired")
 
 
-class LazyVerifier:
-    """A `Verifier` that reads the CA on first use."""
+def _read_authorities(ca: Path) -> list[x509.Certificate]:
+    from cryptography import x509
 
-    def __init__(self, ca: Path) -> None:
-        self._ca = ca
-        self._verifier: Verifier | None = None
-
-    def __call__(self, certificate: bytes, signature: bytes, message: bytes) -> Writer:
-        """Return who signed `message`; see `Verifier`."""
-        if self._verifier is None:
-            try:
-                self._verifier = Verifier(self._ca)
-            except CredentialError as error:
-                raise RecordError("authority", error.message) from error
-        return self._verifier(certificate, signature, message)
+    try:
+        return x509.load_pem_x509_certificates(ca.read_bytes())
+    except (OSError, ValueError):
+        raise CredentialError(f"the CA `{ca}` cannot be used") from None
 
 
 def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:

@@ -37,8 +37,8 @@ def verify(certificate: bytes, signature: bytes, message: bytes) -> Writer:
     """Check a signature of `signer`."""
     if hashlib.sha256(certificate + message).digest() != signature:
         raise RecordError("forged", "a signature that is wrong")
-    role, common_name, serial = certificate.decode().split("|")
-    return Writer(role, common_name, serial)
+    role, common_name, _ = certificate.decode().split("|")
+    return Writer(role, common_name)
 
 
 def signed(record: Record) -> SignedRecord:

@@ -22,7 +22,7 @@ from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import Membership
 from fogft.pool.credentials.authority import Role
 from fogft.records import frames
-from fogft.records.dialling import Caller
+from fogft.records.dialling import connect
 from fogft.records.record import (
     Record,
     RecordError,
@@ -354,10 +354,9 @@ def test_a_caller_survives_whatever_answers(authority):
             server = await asyncio.start_server(talk, "127.0.0.1", 0, ssl=tls)
             port = server.sockets[0].getsockname()[1]
             signer = Signer(robot.certificate, robot.key)
-            caller = Caller(f"127.0.0.1:{port}", robot, signer, POOL_UID)
             for _ in range(5):
                 with pytest.raises((OSError, RecordError)):
-                    await caller.connect()
+                    await connect(f"127.0.0.1:{port}", robot, signer, POOL_UID)
             server.close()
 
     asyncio.run(serve())

@@ -28,7 +28,7 @@ from fogft.records import roster
 from fogft.records.client import Known, RendezvousClient
 from fogft.records.record import RecordKind, SignedRecord
 from fogft.records.record_set import RecordSet
-from fogft.records.signing import LazyVerifier, Signer, Verifier
+from fogft.records.signing import Signer, Verifier
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +51,7 @@ class Following:
         self._changed = threading.Event()
         self._client: RendezvousClient | None = None
         self.door: DialIn | None = None
-        self._signed = RecordSet(config.pool_uid, LazyVerifier(config.credentials.ca))
+        self._signed = RecordSet(config.pool_uid, Verifier(config.credentials.ca, lazy=True))
         self._open_door()
         self._call()
 

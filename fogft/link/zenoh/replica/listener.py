@@ -41,7 +41,7 @@ from fogft.model.replica import ReplicaId
 from fogft.records.listening import listening
 from fogft.records.record import Record, RecordKind
 from fogft.records.record_set import RecordSet
-from fogft.records.signing import LazyVerifier
+from fogft.records.signing import Verifier
 
 log = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ class ZenohListener:
         self._sessions = AuthenticatedSessions(
             id.pool_uid,
             certificate_name or id.certificate_name,
-            LazyVerifier(credentials.ca),
+            Verifier(credentials.ca, lazy=True),
         )
         self._counters = Counters()
         self._turns = QueryTurns()
@@ -94,7 +94,7 @@ class ZenohListener:
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
         self.streams = Streams(slow=self._slow)
-        self._records = RecordSet(id.pool_uid, LazyVerifier(credentials.ca))
+        self._records = RecordSet(id.pool_uid, Verifier(credentials.ca, lazy=True))
         self._control = ControlQueries(
             sessions=self._sessions,
             records=self._records,
