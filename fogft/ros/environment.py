@@ -16,7 +16,6 @@ import re
 import shutil
 import sys
 from collections.abc import Mapping, MutableMapping
-from importlib import metadata
 from pathlib import Path
 
 from fogft import template_files
@@ -182,6 +181,8 @@ def _shared_memory_free_bytes() -> int:
 
 
 def _rclpy_version(place: Path) -> str:
+    from importlib import metadata  # late: it loads Python's email package
+
     for name in ("ros-rclpy", "rclpy"):  # a wheel has rclpy's own record too, of another version
         for distribution in metadata.distributions(name=name, path=[str(place.parent)]):
             return distribution.version

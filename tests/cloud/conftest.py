@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cloud.local import LocalCloud, processes
+from fogft.cloud.local import processes
 from fogft.cloud.local.chaos import Chaos
+from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.port import Launch
 from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 from tests.cloud.waiting import wait_for

@@ -14,7 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from fogft.cloud.local import LocalCloud
+from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.port import Launch
 from fogft.errors import CloudError
 from fogft.model.replica import Placement, ReplicaId

@@ -13,8 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fogft.cloud.local import LocalCloud, processes
+from fogft.cloud.local import processes
 from fogft.cloud.local.chaos import Chaos
+from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.port import Cloud, Launch
 from fogft.cloud.sky.naming import cluster_name
 from fogft.errors import CloudUnreachable

@@ -2,7 +2,3 @@
 
 Not here: what they run (`fogft.proxy.replica`). See docs/design/local-cloud.md.
 """
-
-from fogft.cloud.local.cloud import LocalCloud
-
-__all__ = ["LocalCloud"]
