@@ -35,6 +35,9 @@ hypothesis.settings.load_profile("fogft")
 # Set before any test imports rclpy; child processes inherit it.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
+# numpy's OpenBLAS starts a thread in each process that loads it, which spins before it sleeps.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # The tests start some thousand processes: half of what each costs is compiling the package anew.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False

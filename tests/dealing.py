@@ -4,8 +4,9 @@
 left at the end of theirs. A long test at the end would be waited for alone. Long is a test that
 sets a time limit of its own: it starts a whole pool.
 
-The last block has no long test: beside pools, it waits for what else needs no processor. What does
-nothing but compute comes when the pools have gone.
+Three blocks have long tests, as two cores can bear three pools. The others wait beside them for
+what needs little of a processor, and then take what does nothing but compute, which fills the time
+in which all pools wait.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 T = TypeVar("T")
+POOLS = 3  # at a time
 
 
 def dealt(
@@ -33,7 +35,7 @@ def dealt(
     """
     long = sorted(filter(limit_s, tests), key=limit_s, reverse=True)
     others = sorted((test for test in tests if not limit_s(test)), key=computes, reverse=True)
-    for_long = max(1, workers - 1)
+    for_long = max(1, min(POOLS, workers - 1))
     out: list[T] = []
     for worker in range(workers):
         block = (len(tests) - len(out)) // (workers - worker)
