@@ -62,11 +62,11 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
         "replicas": [
             {
                 "slot": replica.slot,
-                "group": replica.group,
+                "group": replica.offer.group,
                 **_machine_json(replica.offer),
                 "usd_per_hour": replica.offer.usd_per_hour,
                 "extras_usd_per_hour": replica.offer.extras_usd_per_hour,
-                "rtt_s": replica.rtt_s,
+                "rtt_s": plan.rtt_s(replica.offer),
                 "services": names,
             }
             for replica in plan.replicas
@@ -146,7 +146,7 @@ def _summary(shown: PlanShown) -> list[str]:
     plan = shown.explanation
     count = len(plan.replicas)
     out = [f"replicas      {count} of {plan.wanted} wanted"]
-    out += [f"  slot {one.slot} ({one.group})" for one in plan.replicas if one.group]
+    out += [f"  slot {one.slot} ({one.offer.group})" for one in plan.replicas if one.offer.group]
     cap = "" if plan.cap is None else f"; the cap is ${plan.cap:.2f}/h"
     out.append(f"cost          {_money(plan.cost)}{cap}")
     extras = sum(replica.offer.extras_usd_per_hour for replica in plan.replicas)

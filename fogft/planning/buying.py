@@ -197,7 +197,8 @@ class Buyer:
 
     def score(self, placement: Placement, usd_per_hour: float) -> float:
         """Return the score of a placement: price, distance and losses. Lower is better."""
-        found = self.scale.score_of(usd_per_hour, self.scale.latency(placement))
+        found = self.scale.of_price(usd_per_hour)
+        found += self.scale.of_distance(self.scale.latency(placement))
         if placement.spot:
             found += penalty(self.losses_per_hour(placement)) - penalty(UNKNOWN)
         return found

@@ -58,16 +58,6 @@ class Considered:
 
 
 @dataclass(frozen=True)
-class Replica:
-    """A replica that would be launched."""
-
-    slot: int
-    group: str
-    offer: Offer
-    rtt_s: float | None
-
-
-@dataclass(frozen=True)
 class Explanation:
     """A plan that people can read.
 
@@ -85,7 +75,7 @@ class Explanation:
     """
 
     considered: tuple[Considered, ...]
-    replicas: tuple[Replica, ...]
+    replicas: tuple[PlannedLaunch, ...]
     wanted: int
     cap: float | None
     assumed: Assumption
@@ -115,7 +105,12 @@ class Explanation:
     @property
     def round_trips_s(self) -> list[float]:
         """Round trips to the replicas where known, the shortest first."""
-        return sorted(r.rtt_s for r in self.replicas if r.rtt_s is not None)
+        known = [self.rtt_s(planned.offer) for planned in self.replicas]
+        return sorted(rtt_s for rtt_s in known if rtt_s is not None)
+
+    def rtt_s(self, offer: Offer) -> float | None:
+        """Return the round trip to an offer that was considered; None for not known."""
+        return next(one.rtt_s for one in self.considered if one.offer == offer)
 
 
 def explain(
@@ -141,16 +136,8 @@ def explain(
     intent = replace(intent, stopping=False)
     planned = plan(NO_POOL, spec, intent, world, history.places_alone())
     sized = size(spec, intent, world)
-    scale = Scale(spec.placement.latency_weight, observed.rtt_s)
-    reasons = _Reasons(
-        spec,
-        intent,
-        world,
-        history,
-        launches=planned.launches,
-        scale=scale,
-        cap=sized.max_usd_per_hour,
-    )
+    cap = sized.max_usd_per_hour
+    reasons = _Reasons(spec, intent, world, history, launches=planned.launches, cap=cap)
     assumed: Assumption = spec.availability or Assumption()
     if recovery_s is not None and assumed.recovery_s == Assumption().recovery_s:
         assumed = replace(assumed, recovery_s=recovery_s)
@@ -164,17 +151,9 @@ def explain(
     )
     return Explanation(
         considered=tuple(reasons.of(offer) for offer in observed.offers),
-        replicas=tuple(
-            Replica(
-                launch.slot,
-                launch.offer.group,
-                launch.offer,
-                scale.latency(launch.offer.placement),
-            )
-            for launch in planned.launches
-        ),
+        replicas=planned.launches,
         wanted=planned.wanted,
-        cap=sized.max_usd_per_hour,
+        cap=cap,
         assumed=assumed,
         expected=expected(places, assumed, sold),
         with_fallback=_with_fallback(planned.launches, assumed, full, cheapest) if full else None,
@@ -212,7 +191,6 @@ class _Reasons:
         history: History,
         *,
         launches: Sequence[PlannedLaunch],
-        scale: Scale,
         cap: float | None,
     ) -> None:
         self._now = observed.now
@@ -220,7 +198,7 @@ class _Reasons:
         self._losses: Mapping[str, list[float]] = history.losses
         self._backing_off = backing_off(history, observed.now)
         self._hazards = hazards(history, observed.now)
-        self._scale = scale
+        self._scale = Scale(rtt_s=observed.rtt_s)
         self._picks: dict[str, list[_Pick]] = {}
         self._slots: dict[Offer, list[int]] = {}
         taken: list[Placement] = []

@@ -39,8 +39,10 @@ def stand_ins(machines: Classification) -> list[Assessment]:
     return [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
 
 
-def held(group: Group, wanted: int, history: History, now: float) -> int:
-    """Return how many stand-ins replace spot machines, for which no search is made then.
+def held(
+    group: Group, wanted: int, standing_in: Sequence[Assessment], history: History, now: float
+) -> int:
+    """Return how many of a group's stand-ins replace spot machines, for which no search is made.
 
     One, where `OFTEN` were lost within `OFTEN_S`. None in place of a lone one: that would be to
     give up spot machines.
@@ -48,7 +50,7 @@ def held(group: Group, wanted: int, history: History, now: float) -> int:
     spot = wanted - group.on_demand.base
     if not group.on_demand.fallback or spot < 2:
         return 0
-    return int(len(losses_of_late(history, now)) >= OFTEN)
+    return int(bool(standing_in) and len(losses_of_late(history, now)) >= OFTEN)
 
 
 def losses_of_late(history: History, now: float) -> list[float]:
@@ -130,7 +132,4 @@ def _racing(wanted: int, surge: int, standing_in: Sequence[Assessment]) -> int:
 
 def has_served(replica: Assessment, for_s: float, now: float) -> bool:
     """Whether a replica serves, and was first ready at least this long ago."""
-    record = replica.record
-    if not replica.serving or record is None or record.first_ready_at is None:
-        return False
-    return now - record.first_ready_at >= for_s
+    return replica.serving and replica.was_ready_for(for_s, now)

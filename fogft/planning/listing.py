@@ -52,14 +52,6 @@ class Scale:
         """Return the round trip to a placement's region in seconds; None if it is not known."""
         return self.rtt_s.get(f"{placement.cloud}/{placement.region}")
 
-    def score(self, offer: Offer) -> float:
-        """Return an offer's score; lower is better."""
-        return self.score_of(offer.usd_per_hour, self.latency(offer.placement))
-
-    def score_of(self, usd_per_hour: float, rtt_s: float | None) -> float:
-        """Return the score of a price and a round trip (None: not known)."""
-        return self.of_price(usd_per_hour) + self.of_distance(rtt_s)
-
     def of_price(self, usd_per_hour: float) -> float:
         """Return a price's part of the score."""
         return math.log(max(usd_per_hour, PRICE_FLOOR_USD))
@@ -68,11 +60,6 @@ class Scale:
         """Return a round trip's part of the score."""
         known = UNKNOWN_RTT_S if rtt_s is None else rtt_s
         return self.weight * math.log(max(known, LATENCY_FLOOR_S))
-
-
-def gain(before: float, after: float) -> float:
-    """Return how much better a score is, as a fraction in (-inf, 1): 0.3 is 30 % less."""
-    return 1.0 - math.exp(after - before)
 
 
 without_offer = itemgetter(slice(0, 8))

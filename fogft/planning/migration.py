@@ -19,18 +19,19 @@ Not here: carrying it out, which is a replacement like any other (`needs`, `buyi
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import math
+from collections.abc import Collection
 from dataclasses import dataclass
 
+from fogft.model.choices import MigrationSpec
 from fogft.model.groups import group_of
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
 from fogft.planning.buying import Buyer
 from fogft.planning.classification import Classification
-from fogft.planning.listing import gain
 from fogft.planning.observed.hazard import UNKNOWN
 from fogft.planning.observed.health import Assessment, Health
-from fogft.planning.placement import Choice, Crowd, crowding
+from fogft.planning.placement import crowding
 
 
 def is_quiet(machines: Classification, health: Health) -> bool:
@@ -62,8 +63,8 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
     backs off no longer sells has been in question already. Neither time nor events come into it, so
     the last answer is kept: a quiet pool asks the same again and again.
     """
-    spec, observed = buyer.spec, buyer.observed
-    if spec.migration is None:
+    spec, observed, rules = buyer.spec, buyer.observed, buyer.spec.migration
+    if rules is None:
         return frozenset()
     running = [replica.machine for replica in buyer.machines.good]
     question = (
@@ -76,59 +77,46 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
     )
     offers, asked, answer = spec.derived.get("restless", ((), None, frozenset()))
     if offers is not observed.offers or asked != question:
-        answer = frozenset(s.id for s in buyer.machines.good if _would_move(buyer, s))
+        good = buyer.machines.good
+        answer = frozenset(s.id for s in good if _move(buyer, rules, s, at_most=True))
         spec.derived["restless"] = observed.offers, question, answer
     found: frozenset[ReplicaId] = answer
     return found
 
 
-def _would_move(buyer: Buyer, replica: Assessment) -> bool:
-    kind = buyer.kind(group_of(buyer.groups, replica.slot), replica)
-    market = buyer.whole_market(group_of(buyer.groups, replica.slot), kind)
-    count = crowding(buyer.places(replica))
-    choice = market.choose(count, budget_usd_per_hour=buyer.budget)
-    return _is_better(buyer, replica, choice, count, at_most=True) is not None
-
-
 def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | None:
-    """Return the replica that should move; None if none should.
+    """Return the replica that should move, the one that gains most first; None if none should.
 
-    The pool is quiet. The one that gains most goes first.
+    The pool is quiet.
     """
-    found = _moves(buyer, now, restless)
-    return min(found, key=lambda move: (move.urgency, move.replica.id), default=None)
-
-
-def _moves(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Iterator[Move]:
-    """Yield those that would be better off elsewhere, with how much."""
     rules = buyer.spec.migration
     if rules is None:
-        return
-    for replica in buyer.machines.good:
-        if replica.id not in restless or not _stayed(replica, rules.stay_s, now):
-            continue
-        count = crowding(buyer.places(replica))
-        group = group_of(buyer.groups, replica.slot)
-        market = buyer.market(group, buyer.kind(group, replica), at_leisure=True)
-        choice = market.choose(count, budget_usd_per_hour=buyer.budget)
-        move = _is_better(buyer, replica, choice, count)
-        if move is not None:
-            yield move
+        return None
+    found = [
+        _move(buyer, rules, replica, at_most=False)
+        for replica in buyer.machines.good
+        if replica.id in restless and replica.was_ready_for(rules.stay_s, now)
+    ]
+    moves = [move for move in found if move is not None]
+    return min(moves, key=lambda move: (move.urgency, move.replica.id), default=None)
 
 
-def _is_better(
-    buyer: Buyer, replica: Assessment, choice: Choice, count: Crowd, *, at_most: bool = False
-) -> Move | None:
-    """Return the move to a place if that is so much better.
+def _move(buyer: Buyer, rules: MigrationSpec, replica: Assessment, *, at_most: bool) -> Move | None:
+    """Return the move to the best place if that is so much better.
 
     Args:
-        at_most: It is the best of all: could it, or one that is less good, be worth a move?
+        at_most: If no location backed off: could that place, or a worse one, be worth a move?
     """
-    rules, placement = buyer.spec.migration, replica.placement
+    group, placement = group_of(buyer.groups, replica.slot), replica.placement
+    kind = buyer.kind(group, replica)
+    market = (
+        buyer.whole_market(group, kind) if at_most else buyer.market(group, kind, at_leisure=True)
+    )
+    count = crowding(buyer.places(replica))
+    choice = market.choose(count, budget_usd_per_hour=buyer.budget)
     offer, (avoided, *there) = choice.offer, choice.rank
-    if rules is None or offer is None or avoided or offer.placement == placement:
+    if offer is None or avoided or offer.placement == placement:
         return None
-    kind = buyer.kind(group_of(buyer.groups, replica.slot), replica)
     if kind is not None and kind != placement.spot:
         cause = Cause.SPOT_AGAIN if kind else Cause.ON_DEMAND_AGAIN
         return Move(replica, Reason(cause, location=offer.placement.location), (-1.0,))
@@ -137,18 +125,9 @@ def _is_better(
     if there < here and (at_most or losses_there <= losses + UNKNOWN):
         why = Reason(Cause.BETTER_SPREAD, location=offer.placement.location)
         return Move(replica, why, (0.0, *there))
-    better = gain(
-        buyer.score(placement, buyer.price(replica)),
-        buyer.score(offer.placement, offer.usd_per_hour),
-    )
+    score = buyer.score(placement, buyer.price(replica))
+    better = 1.0 - math.exp(buyer.score(offer.placement, offer.usd_per_hour) - score)
     if there == here and better >= rules.gain:
         why = Reason(Cause.BETTER_SCORE, location=offer.placement.location, share=better)
         return Move(replica, why, (1.0, -better))
     return None
-
-
-def _stayed(replica: Assessment, stay_s: float, now: float) -> bool:
-    record = replica.record
-    if record is None or record.first_ready_at is None:
-        return False
-    return now - record.first_ready_at >= stay_s

@@ -13,6 +13,7 @@ Not here: the order within a rank (`listing`), how long a location is avoided
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -40,21 +41,9 @@ class Choice(NamedTuple):
     rank: Rank = (False, 0, 0, 0)
 
 
-class Crowd(dict[str, int]):
-    """The number of replicas in each failure domain; 0 if not listed."""
-
-    def __missing__(self, domain: str) -> int:
-        return 0
-
-
-def crowding(taken: Iterable[Placement]) -> Crowd:
+def crowding(taken: Iterable[Placement]) -> Counter[str]:
     """Count replicas in each failure domain."""
-    crowd = Crowd()
-    count = crowd.get
-    for placement in taken:
-        for domain in placement.domains:
-            crowd[domain] = count(domain, 0) + 1
-    return crowd
+    return Counter(domain for placement in taken for domain in placement.domains)
 
 
 class Market:
@@ -108,7 +97,7 @@ class Market:
 
     def choose(
         self,
-        taken: Iterable[Placement] | Crowd,
+        taken: Iterable[Placement] | Counter[str],
         *,
         avoid: Collection[str] = (),
         budget_usd_per_hour: float | None = None,
@@ -122,7 +111,7 @@ class Market:
         """
         if self._nothing:
             return Choice(None, self._nothing)
-        count = (taken if isinstance(taken, Crowd) else crowding(taken)).get
+        count = (taken if isinstance(taken, Counter) else crowding(taken)).get
         avoided = self._avoid.union(avoid)
         limit = math.inf if budget_usd_per_hour is None else budget_usd_per_hour + EPSILON_USD
         ideal = (False, min([count(cloud, 0) for cloud in self._clouds]), 0, 0)

@@ -12,8 +12,7 @@ Not here: the steps: how many (`sizing`), who is ill (`health`), who is what
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from fogft.model.groups import Group, group_of
@@ -134,6 +133,23 @@ def _changes(decided: Plan, history: History) -> bool:
     return not marked.issuperset((id.slot, id.generation) for id in decided.draining)
 
 
+class _Part(NamedTuple):
+    """A group's share of what is wanted and of the machines.
+
+    Attributes:
+        others: Its machines but for `standing_in`.
+        held: So many of those that stand in are kept in place of spot machines.
+        surge: So many more stand-ins boot while nobody serves.
+    """
+
+    group: Group
+    wanted: int
+    others: Classification
+    standing_in: Sequence[Assessment]
+    held: int
+    surge: int
+
+
 def plan_once(
     spec: PoolSpec,
     intent: Intent,
@@ -165,7 +181,14 @@ def plan_once(
         standing_in=standing_in,
     )
     settling = bool(others.replaced) and rollout.is_settling(others, observed.now)
-    held = _held(sized.groups, counts, standing_in, history, observed.now)
+    of_groups = [
+        [s for s in standing_in if group_of(sized.groups, s.slot) is group]
+        for group in sized.groups
+    ]
+    held = [
+        fallback.held(group, count, mine, history, observed.now)
+        for group, count, mine in zip(sized.groups, counts, of_groups, strict=True)
+    ]
     sought = [count - kept for count, kept in zip(counts, held, strict=True)]
     needs = needed_launches(sized.groups, sought, others, history, settling=settling)
     may_move = not needs and not standing_in and len(machines.good) == wanted and spec.max_surge > 0
@@ -180,23 +203,23 @@ def plan_once(
     room = wanted + spec.max_surge - machines.live
     first: Assessment | None = None
     safe = fallback.is_safe(machines)
-    begun = {
-        need.slot
+    begun = [
+        need
         for need in needs
         if fallback.is_first(need.slot, buyer.next_generation(need.slot), history, safe=safe)
-    }
-    stand_ins_missing = partial(
-        _stand_ins_missing,
-        sized.groups,
-        counts,
-        others,
-        standing_in,
-        history=history,
-        surge=spec.max_surge,
-        safe=safe,
-    )
-    short = stand_ins_missing(begun)
-    kept_free = _urgent_first(buyer, short, room)
+    ]
+    parts = [
+        _Part(
+            group,
+            count,
+            others.part(sized.groups, group),
+            mine,
+            kept,
+            fallback.surge_of(group, count, spec.max_surge),
+        )
+        for group, count, mine, kept in zip(sized.groups, counts, of_groups, held, strict=True)
+    ]
+    kept_free = _urgent_first(buyer, _stand_ins_missing(parts, begun, history, safe), room)
     for need in needs:
         if not buyer.buy(need, room=room - kept_free):
             first = _first_to_go(need, buyer, wanted, spec.max_surge)
@@ -204,35 +227,34 @@ def plan_once(
             waits = True
             break
     ordered = {launch.slot for launch in buyer.launches}
-    for need in stand_ins_missing(begun & ordered):
+    begun = [need for need in begun if need.slot in ordered]
+    for need in _stand_ins_missing(parts, begun, history, safe):
         if need.slot not in ordered:
             buyer.buy(need, room=room)
     outdated = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
     staying = outdated if settling else []
     endings = Endings()
     # No group's surplus is another's.
-    for group, count, kept in zip(sized.groups, counts, held, strict=True):
-        here = others.part(sized.groups, group)
-        mine = [s for s in standing_in if group_of(sized.groups, s.slot) is group]
-        makes_room = first is not None and group_of(sized.groups, first.slot) is group
+    for part in parts:
+        makes_room = first is not None and group_of(sized.groups, first.slot) is part.group
         endings.add(
             choose_endings(
-                count,
-                here,
+                part.wanted,
+                part.others,
                 health,
                 history,
                 now=observed.now,
                 dear_first=bool(excess),
                 held=staying,
                 first=first if makes_room else None,
-                standing_in=mine,
+                standing_in=part.standing_in,
                 spare=fallback.spare(
-                    count,
-                    here,
-                    mine,
+                    part.wanted,
+                    part.others,
+                    part.standing_in,
                     observed.now,
-                    surge=fallback.surge_of(group, count, spec.max_surge),
-                    held=kept,
+                    surge=part.surge,
+                    held=part.held,
                 ),
             )
         )
@@ -278,49 +300,21 @@ def _urgent_first(buyer: Buyer, short: Sequence[Need], room: int) -> int:
     return 0 if buyer.standing_in else max(0, min(most, len(short), room - 1))
 
 
-def _held(
-    groups: Sequence[Group],
-    counts: Sequence[int],
-    standing_in: Sequence[Assessment],
-    history: History,
-    now: float,
-) -> list[int]:
-    """Return how many of each group's stand-ins are kept in place of spot machines."""
-    return [
-        min(
-            fallback.held(group, count, history, now),
-            sum(group_of(groups, s.slot) is group for s in standing_in),
-        )
-        for group, count in zip(groups, counts, strict=True)
-    ]
-
-
 def _stand_ins_missing(
-    groups: Sequence[Group],
-    counts: Sequence[int],
-    others: Classification,
-    standing_in: Sequence[Assessment],
-    begun: Collection[int],
-    *,
-    history: History,
-    surge: int,
-    safe: bool,
+    parts: Sequence[_Part], begun: Sequence[Need], history: History, safe: bool
 ) -> list[Need]:
     """Return the stand-ins called for, where some slots get their first machine now."""
     needs: list[Need] = []
-    used = {s.slot for s in (*others.everyone(), *standing_in)}
-    for group, count in zip(groups, counts, strict=True):
+    for group, wanted, others, standing_in, _, surge in parts:
         if not group.on_demand.fallback:
             continue
-        here = [s for s in standing_in if group_of(groups, s.slot) is group and not s.unwanted]
-        mine = others.part(groups, group)
-        first = sum(group_of(groups, slot) is group for slot in begun)
-        wanted = count - first
-        more = fallback.surge_of(group, count, surge)
-        for _ in range(fallback.missing(wanted, mine, here, history, surge=more, safe=safe)):
-            need = stand_in(group, used)
-            used.add(need.slot)
-            needs.append(need)
+        here = [s for s in standing_in if not s.unwanted]
+        used = {s.slot for s in (*others.everyone(), *standing_in)}
+        first = sum(need.group is group for need in begun)
+        count = fallback.missing(wanted - first, others, here, history, surge=surge, safe=safe)
+        for _ in range(count):
+            needs.append(stand_in(group, used))
+            used.add(needs[-1].slot)
     return needs
 
 

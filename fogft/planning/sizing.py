@@ -13,7 +13,6 @@ Not here: what is missing (`planner`), the arithmetic (`availability`).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 from fogft.model.choices import MAX_REPLICAS
@@ -24,7 +23,7 @@ from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.schedule import Wish, wish
 from fogft.model.spec import PoolSpec
 from fogft.planning.availability import expected, full_together, replicas_needed, unavailability_of
-from fogft.planning.listing import Scale, catalogue
+from fogft.planning.listing import Listing, Scale, catalogue
 from fogft.planning.placement import Market
 
 # Where a target is out of reach, no replica is had that would take away less of the outages.
@@ -86,70 +85,40 @@ def spot_sold(spec: PoolSpec, intent: Intent, observed: Observed) -> list[Placem
     groups = groups_of(spec)
     if any(group.on_demand.fallback for group in groups):
         return []
-    scale = Scale(spec.placement.latency_weight, observed.rtt_s, spec.name)
-    sold = catalogue(observed.offers)
-    rows = (
-        row
-        for group in groups
-        for row in sold.listing(group.name, True, intent.excluded, scale).rows
-    )
+    rows = (row for group in groups for row in _listing(spec, intent, observed, group, True).rows)
     return list({row.location: row.offer.placement for row in rows}.values())
 
 
-def layout(
-    groups: Sequence[Group],
-    counts: Sequence[int],
-    markets: Markets,
-    cap: float | None,
-) -> list[tuple[Group, Offer]]:
-    """Return the placements of a pool started from scratch, as far as offers allow."""
-    out: list[tuple[Group, Offer]] = []
-    for group, count in zip(groups, counts, strict=True):
+def _listing(
+    spec: PoolSpec, intent: Intent, observed: Observed, group: Group, spot: bool | None
+) -> Listing:
+    scale = Scale(spec.placement.latency_weight, observed.rtt_s, spec.name)
+    return catalogue(observed.offers).listing(group.name, spot, intent.excluded, scale)
+
+
+def _layout(
+    spec: PoolSpec, intent: Intent, observed: Observed, cap: float | None
+) -> list[Placement]:
+    """Return the placements of the largest pool started from scratch, as far as offers allow."""
+    chosen: list[Offer] = []
+    groups = groups_of(spec)
+    for group, count in zip(groups, shares(groups, MAX_REPLICAS), strict=True):
+        base, fallback = group.on_demand.base, group.on_demand.fallback
+        kinds = (True, False) if fallback else (True,) if base else (None,)
+        markets = {
+            spot: Market(_listing(spec, intent, observed, group, spot)) for spot in (False, *kinds)
+        }
         for mine in range(count):
-            budget = None if cap is None else cap - sum(o.usd_per_hour for _, o in out)
-            on_demand = mine < group.on_demand.base
-            choice = markets.choose(group, out, budget, on_demand=on_demand)
-            if choice is None:
+            budget = None if cap is None else cap - sum(o.usd_per_hour for o in chosen)
+            places = [offer.placement for offer in chosen]
+            for spot in (False,) if mine < base else kinds:
+                offer = markets[spot].choose(places, budget_usd_per_hour=budget).offer
+                if offer is not None:
+                    chosen.append(offer)
+                    break
+            else:
                 break
-            out.append((group, choice))
-    return out
-
-
-class Markets:
-    """The offers of each group, split into spot and on-demand if the group distinguishes them."""
-
-    def __init__(self, offers: Sequence[Offer], scale: Scale, excluded: Iterable[str]) -> None:
-        self._catalogue = catalogue(offers)
-        self._scale = scale
-        self._excluded = frozenset(excluded)
-        self._made: dict[tuple[str, bool | None], Market] = {}
-
-    def choose(
-        self,
-        group: Group,
-        taken: Sequence[tuple[Group, Offer]],
-        budget: float | None,
-        *,
-        on_demand: bool,
-    ) -> Offer | None:
-        """Return the offer for a group's next replica; None without one."""
-        kinds: tuple[bool | None, ...] = (None,)
-        if group.on_demand.base or group.on_demand.fallback:
-            kinds = (False,) if on_demand else (True, False)
-            kinds = kinds if group.on_demand.fallback else kinds[:1]
-        places = [offer.placement for _, offer in taken]
-        for spot in kinds:
-            found = self._market(group.name, spot).choose(places, budget_usd_per_hour=budget)
-            if found.offer is not None:
-                return found.offer
-        return None
-
-    def _market(self, name: str, spot: bool | None) -> Market:
-        key = (name, spot)
-        if key not in self._made:
-            found = self._catalogue.listing(name, spot, self._excluded, self._scale)
-            self._made[key] = Market(found)
-        return self._made[key]
+    return [offer.placement for offer in chosen]
 
 
 def _for_target(
@@ -159,16 +128,14 @@ def _for_target(
 
     The reason says why the target cannot be reached; None where it can.
     """
-    asked, groups = spec.availability, groups_of(spec)
+    asked = spec.availability
     if asked is None:
         return spec.replicas, None
     if not observed.offers:
         one = 1.0 - unavailability_of(asked, spot=True)
         needed = replicas_needed(one, asked.target, limit=10_000)
         return min(MAX_REPLICAS, max(spec.replicas, running, needed)), None
-    scale = Scale(spec.placement.latency_weight, observed.rtt_s, spec.name)
-    markets = Markets(observed.offers, scale, intent.excluded)
-    laid = [o.placement for _, o in layout(groups, shares(groups, MAX_REPLICAS), markets, cap)]
+    laid = _layout(spec, intent, observed, cap)
     down: list[float] = []
     sold = spot_sold(spec, intent, observed)
     for count in range(1, len(laid) + 1):

@@ -106,6 +106,10 @@ class Assessment(NamedTuple):
         """When it first served; None for never."""
         return self.record.first_ready_at if self.record is not None else None
 
+    def was_ready_for(self, seconds: float, now: float) -> bool:
+        """Whether it first served at least so long ago."""
+        return self.ready_at is not None and now - self.ready_at >= seconds
+
     @property
     def ever_ready(self) -> bool:
         """Whether it ever served."""
