@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fogft.doctor import machine, pools, ros
-from fogft.doctor.finding import Check, Finding, Situation, run
+from fogft.doctor.finding import Finding, Situation, run
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 from fogft.poolfile.file import read
 
-ALL: tuple[Check, ...] = (*machine.CHECKS, *ros.CHECKS, *pools.CHECKS)
+ALL = (*machine.CHECKS, *ros.CHECKS, *pools.CHECKS)
 
 
 def examine(file: Path | None = None) -> Iterator[Finding]:

@@ -57,14 +57,11 @@ def fail(check: str, text: str, advice: str) -> Finding:
 
 
 def run(checks: Iterable[Check], situation: Situation) -> Iterator[Finding]:
-    """Run checks one after the other and yield what they find as they find it."""
+    """Run checks and yield what they find as they find it, also of one that fails itself."""
     for check in checks:
         try:
             yield from check(situation)
         except Exception as error:
-            name = check.__name__.replace("_", " ")
-            yield fail(
-                name,
-                f"the check itself failed: {type(error).__name__}: {error}",
-                "report this as a bug in `fogft doctor`",
-            )
+            what = f"the check itself failed: {type(error).__name__}: {error}"
+            advice = "report this as a bug in `fogft doctor`"
+            yield fail(check.__name__.replace("_", " "), what, advice)

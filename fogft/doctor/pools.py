@@ -1,7 +1,4 @@
-"""Checks of a pool file and of the pools on this machine: credentials, manager, proxy, links.
-
-And of what forgotten pools and faults on purpose left behind.
-"""
+"""Checks of a pool file, of the pools on this machine, and of what lost pools left behind."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
 """Checks of ROS 2: installed, its middleware, its domain, its profile, and that it works.
 
-rclpy is never imported here but in processes of their own: it may be broken, and a
-broken one can end the process that imports it.
+rclpy is imported in processes of their own only: a broken one can end the process.
 """
 
 from __future__ import annotations
@@ -49,10 +48,8 @@ def rclpy(_: Situation) -> Iterator[Finding]:
             "`pip install 'fogft[ros]'`",
         )
         return
-    yield ok(
-        "rclpy",
-        f"ROS 2 {described['distribution'].capitalize()}, rclpy {described['rclpy']}",
-    )
+    name = described["distribution"].capitalize()
+    yield ok("rclpy", f"ROS 2 {name}, rclpy {described['rclpy']}")
     yield judge_middleware(described["rmw"])
 
 
@@ -67,13 +64,8 @@ def judge_middleware(rmw: str) -> Finding:
     )
 
 
-def domain(_: Situation) -> Iterator[Finding]:
+def domain(_: Situation, environ: Mapping[str, str] = os.environ) -> Iterator[Finding]:
     """The ROS domain and the discovery range are valid."""
-    yield from judge_domain(os.environ)
-
-
-def judge_domain(environ: Mapping[str, str]) -> Iterator[Finding]:
-    """Judge the environment variables that control ROS discovery."""
     text = environ.get("ROS_DOMAIN_ID", "") or "0"
     if not text.isdecimal() or int(text) > _LAST_DOMAIN:
         yield fail(
@@ -139,10 +131,7 @@ def profile(_: Situation) -> Iterator[Finding]:
 
 
 def judge_segment(segment_bytes: int, variable: str, ours: str) -> Finding:
-    """Judge the shared memory that a node maps in fogft's environment.
-
-    `ours` is the shipped profile, where fogft sets the variable to it for its own processes.
-    """
+    """Judge the shared memory that a node maps; `ours` is the shipped profile, if fogft sets it."""
     if environment.profile_in_force(segment_bytes):
         if ours:
             return warn(

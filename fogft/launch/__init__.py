@@ -1,9 +1,6 @@
 """Launch files with nodes in the cloud: `FogPool` and `CloudNode`, in Python, XML and YAML.
 
-Needs ROS 2's `launch` and `launch_ros`, which are loaded when a name is first used::
-
-    from fogft.launch import CloudNode, FogPool
-
+Needs ROS 2's `launch` and `launch_ros`, which are loaded when a name is first used.
 Not here: what starting and ending a pool means (`fogft.pool.commands`).
 """
 

@@ -1,11 +1,7 @@
 """The launch actions `fog_pool` and `cloud_node`, for ROS 2's launch files in any format.
 
-Needs `launch` and `launch_ros`: import `fogft.launch` instead, which loads this lazily.
-`cloud:=false` on the command line of ``ros2 launch`` runs everything here; ``cloud:=NAME``
+``cloud:=false`` on the command line of ``ros2 launch`` runs everything here; ``cloud:=NAME``
 picks a cloud.
-
-Owns: evaluating what a launch file says, and when its local nodes start.
-Not here: the pool file's text (`pool_file`), the pool (`run_pool`).
 """
 
 from __future__ import annotations
@@ -51,12 +47,9 @@ _POOL_KEYS = (
 class CloudNode(Node):  # type: ignore[misc]
     """A node that runs on every replica of the fog pool that contains it.
 
-    Takes what `launch_ros.actions.Node` takes. Name, namespace, parameters, remappings,
-    environment and arguments are kept; `output` and `respawn` have no effect: replicas'
-    logs are always shown, and their nodes always restarted.
-
-    Raises:
-        FogftError: An argument cannot be carried to another machine.
+    Takes what `launch_ros.actions.Node` takes, or raises FogftError for what another machine
+    cannot do; `output` and `respawn` have no effect: replicas' logs are always shown, and their
+    nodes always restarted.
     """
 
     def __init__(self, **arguments: Any) -> None:
@@ -93,14 +86,13 @@ class CloudNode(Node):  # type: ignore[misc]
             files,
         )
 
-    def execute(self, context: LaunchContext) -> list[Action] | None:
+    def execute(self, context: LaunchContext) -> Any:
         """Run it on this machine, in a fog pool that stays here."""
-        if not _stays_here(context):
+        if _cloud(context) != "false":
             raise FogftError(
                 "a cloud node is outside any fog pool", "put it into a `FogPool` (`fog_pool`)"
             )
-        result: list[Action] | None = super().execute(context)
-        return result
+        return super().execute(context)
 
 
 @expose_action("fog_pool")
@@ -139,7 +131,8 @@ class FogPool(Action):  # type: ignore[misc]
 
     def execute(self, context: LaunchContext) -> list[Action]:
         """Write the pool file, run the pool, and start the local actions when it answers."""
-        if _stays_here(context):
+        cloud = _cloud(context)
+        if cloud == "false":
             return self._actions
         asked = {key: _evaluated(context, value) for key, value in self._given.items()}
         if asked["on_exit"] not in ("", "leave", "down"):
@@ -150,9 +143,8 @@ class FogPool(Action):  # type: ignore[misc]
         local = [action for action in self._actions if not isinstance(action, CloudNode)]
         chosen = [n for n in nodes if n.condition is None or n.condition.evaluate(context)]
         tree = _tree(asked, [node.command(context) for node in chosen])
-        return _running(
-            _written(tree), tree["name"], asked, _cloud(context) or asked["cloud"], local
-        )
+        cloud = asked["cloud"] if cloud in ("", "true") else cloud
+        return _running(_written(tree), tree["name"], asked, cloud, local)
 
 
 def _tree(asked: Mapping[str, Any], nodes: Sequence[NodeCommand]) -> dict[str, Any]:
@@ -211,7 +203,7 @@ def _running(
     waiting = list(local)
 
     def heard(event: Any) -> list[Action]:
-        if READY.encode() not in event.text or not waiting:
+        if READY.encode() not in event.text:
             return []
         begun, waiting[:] = list(waiting), []
         return begun
@@ -229,13 +221,7 @@ def _running(
 
 
 def _cloud(context: LaunchContext) -> str:
-    """Return what the launch argument `cloud` picks; empty for what the file says."""
-    value = str(context.launch_configurations.get("cloud", "")).lower()
-    return "" if value in ("", "true", "false") else value
-
-
-def _stays_here(context: LaunchContext) -> bool:
-    return str(context.launch_configurations.get("cloud", "")).lower() == "false"
+    return str(context.launch_configurations.get("cloud", "")).lower()
 
 
 def _evaluated(context: LaunchContext, value: Any) -> Any:

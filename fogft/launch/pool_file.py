@@ -1,8 +1,4 @@
-"""Turn a launch file's nodes and pool into a pool file.
-
-Owns: the `run` command of a replica, and how a base file and a launch file merge.
-Not here: substitutions and conditions (`actions`), what a pool file may say (`fogft.poolfile`).
-"""
+"""Turn a launch file's nodes and pool into a pool file."""
 
 from __future__ import annotations
 
@@ -41,9 +37,6 @@ def run_text(nodes: Sequence[NodeCommand]) -> str:
 
     One node replaces the shell. Of several, the end of one ends all, so that they are
     started again together.
-
-    Raises:
-        FogftError: There is no node, or a parameter file is too large to be carried.
     """
     if not nodes:
         raise FogftError("a fog pool contains no cloud node", "move a node into it as a cloud node")
@@ -96,11 +89,7 @@ def pool_tree(
     task: Mapping[str, Any],
     fogft: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return a pool file's tree: a base file overridden by the launch file.
-
-    Raises:
-        FogftError: The base runs something itself, or there is no name.
-    """
+    """Return a pool file's tree: a base file overridden by the launch file."""
     if base.get("run"):
         raise FogftError(
             "the pool file of a fog pool has its own `run`",

@@ -2,8 +2,6 @@
 
 Starts the pool, prints a line that the launch file waits for, then shows the logs of the
 replicas. On a signal it ends, and with `--down` it ends the pool first.
-
-Owns: that sequence. Not here: pools (all is done by the ``fogft`` command).
 """
 
 from __future__ import annotations
@@ -18,6 +16,7 @@ from types import FrameType
 
 from fogft.child import tied
 
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 READY = "fogft_pool_ready"  # a line of stdout, for the launch file
 
 
@@ -36,18 +35,19 @@ def main(arguments: Sequence[str]) -> int:
         "--down", action="store_true", help="Shut the pool down when this process exits."
     )
     asked = parser.parse_args(arguments)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    for number in _ENDING:
         signal.signal(number, _interrupt)
+    status = 0
     try:
         return _run(asked)
     except _Interrupted:
-        status = 0
+        pass
     finally:
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        for number in _ENDING:
             signal.signal(number, signal.SIG_IGN)  # launch repeats itself; `down` takes its time
         if asked.down:
-            ended = _fogft("down", asked.pool, "--yes").wait()
-    return ended if asked.down else status
+            status = _fogft("down", asked.pool, "--yes").wait()
+    return status
 
 
 def _run(asked: argparse.Namespace) -> int:

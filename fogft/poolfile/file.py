@@ -1,4 +1,4 @@
-"""Read a pool file from disk. The only place that knows it is YAML is `yaml_tree`."""
+"""Read a pool file from disk."""
 
 from __future__ import annotations
 
@@ -31,11 +31,9 @@ def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
 def parse(
     source: str, file: str, checks: Checks = UNCHECKED, folder: Path | None = None
 ) -> PoolSpec:
-    """Return the spec in a pool file's text.
+    """Return the spec in a pool file's text; `workdir` is looked for in `folder`, if given.
 
-    Args:
-        file: Its name, for messages; its stem names the pool where the text does not.
-        folder: Where `workdir` is looked for; None to leave it unjudged.
+    The stem of `file` names the pool where the text does not.
     """
     if len(source) > MAX_BYTES:
         raise _too_large(file)

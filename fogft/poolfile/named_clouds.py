@@ -26,9 +26,7 @@ def located(error: SpecError, source: str, file: Path) -> SpecError:
 def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) -> str | None:
     """Return the cloud adapter for a pool file's resources; None if they name no cloud.
 
-    Args:
-        spec: The pool file, which is read from `source`, the text of `file`.
-        names: Each name that it may use -> the adapter that it stands for.
+    `names` are those that it may use, each with the adapter that it stands for.
     """
     named = dict(_named_in(spec))
     for cloud, key in named.items():

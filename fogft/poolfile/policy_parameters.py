@@ -1,8 +1,4 @@
-"""A service's policy as ROS parameters. Pure.
-
-A value is judged by the pool file's own reader, so a parameter can bring about nothing that a
-pool file could not.
-"""
+"""A service's policy as ROS parameters, each judged by the pool file's own reader. Pure."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Check a pool file and turn it into a `PoolSpec`. Pure: tree and type checks are passed in.
 
-A pool file is a SkyPilot task with a `fogft` section. Ours is checked to the last key; of
-SkyPilot's keys only the names are, and what a pool cannot do. The rest passes untouched.
+The `fogft` section is checked to the last key; of SkyPilot's keys only the names are, and what a
+pool cannot do.
 """
 
 from __future__ import annotations
@@ -51,11 +51,6 @@ class Checks:
 UNCHECKED = Checks()
 
 
-def pool_spec(root: Node, file: str, checks: Checks = UNCHECKED) -> PoolSpec:
-    """Return the spec in a pool file."""
-    return _judged(root, file, checks, Mistakes())
-
-
 def mistakes_in(root: Node, file: str, checks: Checks = UNCHECKED) -> list[SpecError]:
     """Return all mistakes in a pool file, by line.
 
@@ -63,11 +58,15 @@ def mistakes_in(root: Node, file: str, checks: Checks = UNCHECKED) -> list[SpecE
     """
     found = Mistakes(keep=True)
     with found.step():
-        _judged(root, file, checks, found)
+        pool_spec(root, file, checks, found)
     return sorted(found.found, key=lambda error: error.line)
 
 
-def _judged(root: Node, file: str, checks: Checks, mistakes: Mistakes) -> PoolSpec:
+def pool_spec(
+    root: Node, file: str, checks: Checks = UNCHECKED, mistakes: Mistakes | None = None
+) -> PoolSpec:
+    """Return the spec in a pool file; without `mistakes` the first one is raised."""
+    mistakes = mistakes or Mistakes()
     top = Section(file, "", root, "write a SkyPilot task with a `fogft` section")
     task = {key: plain(node) for key, node in top.children.items() if key != "fogft"}
 
@@ -90,7 +89,6 @@ def _judged(root: Node, file: str, checks: Checks, mistakes: Mistakes) -> PoolSp
 def _judge_here(
     top: Section, ours: Section, spec: PoolSpec, checks: Checks, mistakes: Mistakes
 ) -> None:
-    """Judge what only this machine can tell, and what is about the whole pool."""
     workdir = spec.task.get("workdir")
     if isinstance(workdir, str):
         with mistakes.step():
@@ -203,7 +201,6 @@ def _topics_key(ours: Section) -> str:
 
 
 def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> None:
-    """Refuse a quorum that can never be reached, or at some time of the week cannot."""
     windows = spec.schedule.windows if spec.schedule else ()
     fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas is not None)])
     if service.quorum > fewest:

@@ -1,8 +1,4 @@
-"""Read a map of keys into the dataclass that describes them. Pure.
-
-The same table (`fogft.model.keys`) reads the pool file and the proxies' configuration files. The
-first mistake ends it, as one `SpecError` that begins with ``file:line: key:``.
-"""
+"""Read a map of keys into the dataclass that describes them. Pure."""
 
 from __future__ import annotations
 
@@ -33,7 +29,7 @@ class Reader:
         below = [e.name for e in entries if e.key.advanced]
         known = [e.name for e in entries if not e.key.advanced]
         allowed = [*known, ADVANCED] if below else known
-        hints, elsewhere = removed.hints(cls), removed.places(cls)
+        hints, elsewhere = removed.HINTS.get(cls), removed.places(cls)
         values: dict[str, Any] = {}
         with self._mistakes.whole():
             self._mistakes.add(section.unknown(allowed, hints=hints, elsewhere=elsewhere))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from fogft.model.choices import (
     AvailabilitySpec,
     FallbackSpec,
@@ -36,7 +34,7 @@ def _renamed(name: str, instead: str = "") -> Hint:
     return f"is now called `{name}`", f"write {instead or 'that'}"
 
 
-_HINTS: dict[type, dict[str, Hint]] = {
+HINTS: dict[type, dict[str, Hint]] = {
     PoolSpec: {
         **_AUTOSCALE,
         "orphan_after_s": _renamed("unmanaged_max_hours", "that, in hours"),
@@ -67,21 +65,9 @@ _HINTS: dict[type, dict[str, Hint]] = {
     Gateway: {"through": _renamed("upstream")},
     RobotRoute: {"through": _renamed("gateways")},
 }
-
-
-_VALUES: dict[tuple[type, str], str] = {
+VALUE_HINTS: dict[tuple[type, str], str] = {
     (HedgingMode, "adaptive"): "is now called `auto`, which is the default"
 }
-
-
-def value_hint(kind: type, text: str) -> str:
-    """Return the hint for a removed value of an enumeration."""
-    return _VALUES.get((kind, text), "")
-
-
-def hints(cls: type) -> Mapping[str, Hint]:
-    """Return the hints for removed and future keys of a map."""
-    return _HINTS.get(cls, {})
 
 
 def places(cls: type | None) -> dict[str, str]:

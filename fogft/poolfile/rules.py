@@ -1,6 +1,6 @@
 """Rules for combinations of keys in a pool file. Pure.
 
-Each rule judges one map after its keys were read, and may return another value for it.
+Each judges one map after its keys were read, and may return another value for it.
 """
 
 from __future__ import annotations
@@ -10,12 +10,7 @@ from dataclasses import replace
 from typing import Any
 
 from fogft.model import schedule, state
-from fogft.model.choices import (
-    MetricsSpec,
-    OnDemandSpec,
-    ScheduleSpec,
-    WindowSpec,
-)
+from fogft.model.choices import MetricsSpec, OnDemandSpec, ScheduleSpec, WindowSpec
 from fogft.model.groups import FIRST_BY_HAND
 from fogft.model.names import gateway_slot
 from fogft.model.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec

@@ -1,7 +1,4 @@
-"""The JSON Schema (draft 2020-12) of the pool file, for completion in editors. Pure.
-
-It comes from the same table as the reader. Rules between keys are the reader's alone.
-"""
+"""The JSON Schema (draft 2020-12) of the pool file, for completion in editors. Pure."""
 
 from __future__ import annotations
 
@@ -60,7 +57,7 @@ def _map(cls: type, definitions: dict[str, Any]) -> dict[str, Any]:
     return {"$ref": f"#/$defs/{cls.__name__}"}
 
 
-def _form(form: Form, definitions: dict[str, Any]) -> dict[str, Any]:  # noqa: PLR0911, PLR0912
+def _form(form: Form, definitions: dict[str, Any]) -> dict[str, Any]:  # noqa: PLR0911
     match form:
         case keys.Number(most, _, from_zero):
             least = {"minimum": 0} if from_zero else {"exclusiveMinimum": 0}
@@ -79,20 +76,13 @@ def _form(form: Form, definitions: dict[str, Any]) -> dict[str, Any]:  # noqa: P
         case keys.Table(of):
             return {"type": "object", "additionalProperties": _form(of, definitions)}
         case keys.Map(of, _, short, off):
-            choices = [_map(of, definitions)]
-            for entry in keys_of(of):
-                if entry.name in short[:1]:
-                    choices.append(_form(entry.key.form, definitions))
-            if off:
-                choices.append({"const": False})
+            forms = [entry.key.form for entry in keys_of(of) if entry.name in short[:1]]
+            choices = [_map(of, definitions), *(_form(one, definitions) for one in forms)]
+            choices += [{"const": False}] if off else []
             return choices[0] if len(choices) == 1 else {"anyOf": choices}
         case keys.Maps(of, _, most):
-            return {
-                "type": "array",
-                "items": _map(of, definitions),
-                "minItems": 1,
-                "maxItems": most,
-            }
+            items = _map(of, definitions)
+            return {"type": "array", "items": items, "minItems": 1, "maxItems": most}
         case keys.Free():
             return {"type": "object"}
         case keys.Special():

@@ -1,7 +1,4 @@
-"""Check the SkyPilot part of a pool file: names of keys, and what no pool can do.
-
-Not here: what stands in SkyPilot's own keys (SkyPilot judges that).
-"""
+"""Check the SkyPilot part of a pool file: names of keys, and what no pool can do."""
 
 from __future__ import annotations
 
@@ -46,7 +43,7 @@ def check_task(top: Section, mistakes: Mistakes) -> None:
         for key, reason in REFUSED_TASK_KEYS.items()
         if key in top.children
     )
-    known, hints = (*TASK_KEYS, *REFUSED_TASK_KEYS, "fogft"), removed.hints(PoolSpec)
+    known, hints = (*TASK_KEYS, *REFUSED_TASK_KEYS, "fogft"), removed.HINTS[PoolSpec]
     mistakes.add(top.unknown(known, hints=hints, elsewhere=removed.places(None)))
     with mistakes.step():
         if "fogft" not in top.children:

@@ -1,7 +1,6 @@
 """A pool file as a tree that remembers its lines, and typed access to it.
 
-`fogft.poolfile.yaml_tree` makes the tree; `reader` says what must be in it. Every
-complaint is one `SpecError` that begins with ``file:line: key:`` and is one line long,
+Every complaint is one `SpecError` that begins with ``file:line: key:`` and is one line long,
 whatever the file holds; its hint says what would be right.
 """
 
@@ -16,7 +15,7 @@ from enum import Enum
 from typing import Any, TypeVar
 
 from fogft.errors import SpecError
-from fogft.poolfile.removed import Hint, value_hint
+from fogft.poolfile.removed import VALUE_HINTS, Hint
 
 SMALLEST = 1e-12  # of a number above 0: a smaller one is a slip of the pen
 Choice = TypeVar("Choice", bound=Enum)
@@ -120,11 +119,7 @@ class Section:
         hints: Mapping[str, Hint] | None = None,
         elsewhere: Mapping[str, str] | None = None,
     ) -> Iterator[SpecError]:
-        """Yield an error for each key that is not known.
-
-        Args:
-            hints: Keys that are no longer or not yet there: what is to be said, and what to do.
-        """
+        """Yield an error for each key that is not known; `hints` are for past and future ones."""
         allowed = set(known)
         for key in [key for key in self.children if key not in allowed]:
             if hints and key in hints:
@@ -140,8 +135,7 @@ class Section:
         """Whether the key is there with a value, here or under `advanced`."""
         if key in self.children:
             return self.children[key].value is not None
-        advanced = self.children.get("advanced")
-        below = advanced.value if advanced is not None else None
+        below = self.children["advanced"].value if "advanced" in self.children else None
         return isinstance(below, Mapping) and key in below and below[key].value is not None
 
     def text(self, key: str, hint: str) -> str:
@@ -182,10 +176,7 @@ class Section:
     def number(
         self, key: str, high: float, unit: str, default: float | None = None, *, zero: bool = False
     ) -> float:
-        """Return a number above 0 (with `zero`: or 0) and at most `high`.
-
-        Without a default it is required.
-        """
+        """Return a number above 0 (with `zero`: or 0) and at most `high`."""
         if key not in self.children and default is not None:
             return default
         node = self.children[key]
@@ -207,7 +198,7 @@ class Section:
         allowed = " or ".join(f"`{value}`" for value in by_value)
         text = self.text(key, f"write {allowed}")
         if text not in by_value:
-            hint = value_hint(type(members[0]), text) or nearest(text, by_value)
+            hint = VALUE_HINTS.get((type(members[0]), text)) or nearest(text, by_value)
             raise self.error(key, f"must be {allowed}, not {shown(text)}", hint)
         return by_value[text]
 
@@ -282,11 +273,7 @@ class Mistakes:
 
     @contextmanager
     def whole(self) -> Iterator[None]:
-        """Check all parts of one value; with a mistake there is no value.
-
-        Raises:
-            Incomplete: Something was found within.
-        """
+        """Check all parts of one value. Raises Incomplete: something was found within."""
         before = len(self.found)
         yield
         if len(self.found) > before:

@@ -162,8 +162,9 @@ def test_a_state_folder_that_others_read_is_found(tmp_path):
         ({"ROS_LOCALHOST_ONLY": "1"}, Verdict.OK, Verdict.WARN),
     ],
 )
-def test_the_domain_and_the_range_are_judged(environ, domain, reach):
-    assert [f.verdict for f in ros.judge_domain(environ)] == [domain, reach]
+def test_the_domain_and_the_range_are_judged(tmp_path, environ, domain, reach):
+    found = ros.domain(situation(tmp_path), environ)
+    assert [f.verdict for f in found] == [domain, reach]
 
 
 def test_a_profile_that_is_no_xml_is_found(tmp_path, monkeypatch):
