@@ -35,10 +35,6 @@ RUSH_LIMIT = 2  # so many new ones since the last look
 # Of one holder, the newest: a robot has one an uplink, and another while it takes a new certificate
 # into use. Zenoh has room for 128 of all holders together.
 LINKS_LIMIT = 16
-# A robot that is out of reach has long opened another link by then.
-STUCK_AFTER_S = 15.0
-
-
 _RESERVE = 32  # descriptors
 
 
@@ -103,8 +99,8 @@ class ConnectionReaper:
         revoked: Callable[[], Collection[str]],
         counters: Counters,
         *,
-        also: Callable[[], None] = lambda: None,
-        stuck_after_s: float = STUCK_AFTER_S,
+        also: Callable[[], None],
+        stuck_after_s: float,
     ) -> None:
         self._port = port
         self._links = links

@@ -67,7 +67,7 @@ class ControlQueries:
             return
         holder = self._sessions.holder(token)
         for gone, query in self._streams.opened(token, asked.query, holder):
-            self._queues.end(gone, "gone", QueryEnd(query, asked.turn))
+            self._queues.end(gone, "gone", QueryEnd(query, asked.turns))
 
     def probe(self, on_probe: Callable[[Probe], ProbeAnswer], asked: QueryEnd) -> None:
         """Handle a probe, which may carry a greeting."""

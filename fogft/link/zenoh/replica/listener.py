@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import zenoh
 from zenoh import handlers
@@ -89,7 +89,7 @@ class ZenohListener:
         self._turns = QueryTurns()
         self.revoke = self._sessions.revoke  # let these holders in no more
         self._work_queue = WorkQueue("fogft-probes", self._counters)
-        self._queues = ReplyQueues(self._counters, self._turns, later=self._work_queue.add)
+        self._queues = ReplyQueues(self._counters, later=self._work_queue.add)
         self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
@@ -173,18 +173,18 @@ class ZenohListener:
 
     def _declare(self, session: zenoh.Session, key: str, asked: Callable[[QueryEnd], None]) -> None:
         def heard(query: zenoh.Query) -> None:
-            asked(QueryEnd(query, self._turns.last))
+            asked(QueryEnd(query, self._turns))
 
-        callback = handlers.Callback(self._taken(f"query at {key}", heard), indirect=False)
+        callback = self._callback(f"query at {key}", heard)
         self._declared.append(session.declare_queryable(key, callback, complete=True))
 
     def _hear(
         self, session: zenoh.Session, key: str, heard: Callable[[zenoh.Sample], None]
     ) -> None:
-        callback = handlers.Callback(self._taken(f"message at {key}", heard), indirect=False)
+        callback = self._callback(f"message at {key}", heard)
         self._declared.append(session.declare_subscriber(key, callback))
 
-    def _taken(self, what: str, heard: Callable[[Heard], None]) -> Callable[[Heard], None]:
+    def _callback(self, what: str, heard: Callable[[Heard], None]) -> Any:
         """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
 
         def guarded(one: Heard) -> None:
@@ -196,7 +196,7 @@ class ZenohListener:
                 self._counters.add("failed")
                 log.exception("not_taken what=%r", what)
 
-        return guarded
+        return handlers.Callback(guarded, indirect=False)
 
     # -- Zenoh's threads ------------------------------------------------------------------
 
@@ -294,12 +294,7 @@ class ZenohListener:
         return self._records.get(RecordKind.LEASE)
 
     def counters(self) -> Mapping[str, int]:
-        """Counts since the start: ``requests``, ``probes``, ``replies``, ``refused``,
-        ``malformed``, ``records``, ``records_refused``, ``records_older``, ``not_admitted``,
-        ``handshakes_refused``, ``unauthenticated``, ``kept_out``, ``revoked_links``,
-        ``surplus_links``, ``stuck_links``, ``reply_dropped``, ``failed``, ``cancellations``,
-        ``control_queries_dropped``.
-        """
+        """Return counts since the start, by event."""
         return self._counters.snapshot()
 
     def refusals(self) -> Mapping[str, int]:

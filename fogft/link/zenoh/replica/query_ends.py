@@ -25,59 +25,29 @@ class QueryTurns:
     def __init__(self) -> None:
         self.last = 0
 
-    def came(self) -> int:
+    def came(self) -> None:
         """Count a query. Called first by Zenoh's thread."""
         self.last += 1
-        return self.last
-
-    def over(self, turn: int) -> bool:
-        """Whether Zenoh's thread has finished with a query."""
-        return turn < self.last
 
 
 class QueryEnd:
-    """A query to end, after sending a refusal if there is one; `turn`: when it came."""
+    """A query to end, after sending a refusal if there is one. Made by Zenoh's thread."""
 
-    def __init__(self, query: zenoh.Query, turn: int) -> None:
+    def __init__(self, query: zenoh.Query, turns: QueryTurns) -> None:
         self.query = query
-        self.turn = turn
         self.refusal = ""
-        self._ended = False
+        self.turns = turns
+        self._turn = turns.last
+        self._came_at = time.monotonic()
 
     def say(self) -> None:
         """Send the refusal. May block while the robot does not read. Raises zenoh.ZError."""
         if self.refusal:
             self.query.reply_err(frame.encode_refusal(frame.NO_STAMP, _NO_REQUEST, self.refusal))
 
-    def end(self) -> None:
-        """End the query. May block like `say`."""
-        if not self._ended:
-            self._ended = True
+    def ended(self) -> bool:
+        """End the query if that may be done by now; return whether. May block like `say`."""
+        held = self.turns.last == self._turn and time.monotonic() - self._came_at <= _ANYWAY_S
+        if not held:
             self.query.drop()  # type: ignore[no-untyped-call]
-
-
-class Unended:
-    """The queries that one thread has yet to end."""
-
-    def __init__(self, turns: QueryTurns) -> None:
-        self._turns = turns
-        self._ends: list[tuple[float, QueryEnd]] = []
-
-    def __bool__(self) -> bool:
-        return bool(self._ends)
-
-    def add(self, one: QueryEnd) -> None:
-        """End a query now, or as soon as it may be."""
-        if self._turns.over(one.turn):
-            one.end()
-        else:
-            self._ends.append((time.monotonic(), one))
-
-    def look(self) -> None:
-        """End all queries that may be ended by now."""
-        waiting, self._ends = self._ends, []
-        for since, one in waiting:
-            if self._turns.over(one.turn) or time.monotonic() - since > _ANYWAY_S:
-                one.end()
-            else:
-                self._ends.append((since, one))
+        return not held

@@ -24,7 +24,7 @@ from fogft.link import batch_frames, frame
 from fogft.link.compression import Compression
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
-from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns, Unended
+from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.model.refusal import Refusal
 from fogft.requests.load import Load
@@ -136,14 +136,12 @@ class ReplyQueues:
     def __init__(
         self,
         counters: Counters,
-        turns: QueryTurns | None = None,
         *,
         later: Callable[[Callable[[], None]], None] = lambda job: job(),
     ) -> None:
         self.later = later
         self._counters = counters
         self.refusals = Counters()
-        self._turns = turns or QueryTurns()
         self._lock = threading.Lock()
         self._queues: dict[bytes, ReplyQueue] = {}
         self._closed = False
@@ -211,13 +209,13 @@ class ReplyQueues:
         return queue
 
     def _run(self, token: bytes, queue: ReplyQueue) -> None:
-        unended = Unended(self._turns)
+        unended: list[QueryEnd] = []
         while True:
             try:
                 taken = queue.next(_END_LOOK_S if unended else self.idle_s)
             except Empty:
                 if unended:
-                    self._guarded(unended.look)
+                    unended = [one for one in unended if not self._ended(one)]
                     continue
                 with self._lock:
                     if queue.waiting:
@@ -226,7 +224,7 @@ class ReplyQueues:
                     return
             if isinstance(taken, QueryEnd):
                 self._guarded(taken.say)
-                self._guarded(partial(unended.add, taken))
+                unended.append(taken)
                 sizes = [0]
             elif taken:
                 sizes = [len(reply.payload) for reply in taken]
@@ -234,12 +232,19 @@ class ReplyQueues:
             else:
                 return
             if unended:
-                self._guarded(unended.look)
+                unended = [one for one in unended if not self._ended(one)]
             with self._lock:
                 queue.waiting -= len(sizes)
                 for size in sizes:
                     queue.large.remove(size)
             del taken  # its payloads, while this thread waits
+
+    def _ended(self, one: QueryEnd) -> bool:
+        try:
+            return one.ended()
+        except Exception as error:
+            self._failed(error)
+            return True
 
     def _guarded(self, step: Callable[[], None]) -> None:
         try:

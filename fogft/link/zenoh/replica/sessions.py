@@ -65,13 +65,10 @@ class AuthenticatedSessions:
         try:
             writer = self._verify(greeting.certificate, greeting.signature, message)
             holder = holder_of(writer.common_name)
-        except RecordError as error:
-            expired = error.reason == "expired"
-            raise NotAdmittedError(
-                Refusal.EXPIRED_CERTIFICATE if expired else Refusal.NOT_ADMITTED, str(error)
-            ) from error
         except ValueError as error:
-            raise NotAdmittedError(Refusal.NOT_ADMITTED, str(error)) from error
+            expired = isinstance(error, RecordError) and error.reason == "expired"
+            refusal = Refusal.EXPIRED_CERTIFICATE if expired else Refusal.NOT_ADMITTED
+            raise NotAdmittedError(refusal, str(error)) from error
         if holder.role.value != writer.role or holder.role not in _MAY_ASK:
             words = f"`{writer.common_name}` may not send requests"
             raise NotAdmittedError(Refusal.NOT_ADMITTED, words)

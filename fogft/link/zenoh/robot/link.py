@@ -189,7 +189,7 @@ class ZenohLink:
             connection = self._open()
             while connection is not None:
                 was_up = self._attend(connection) or was_up
-                if not self._is_good(connection):
+                if connection is not self._live or self._closed or connection.lost_because:
                     break
                 connection = self._succeed(connection)  # it makes way for one with new credentials
         except Exception as error:  # a mistake of ours must not end the link for good
@@ -199,9 +199,6 @@ class ZenohLink:
         if connection is not None:
             self._part(connection)
         return was_up
-
-    def _is_good(self, connection: Connection) -> bool:
-        return connection is self._live and not self._closed and not connection.lost_because
 
     def _succeed(self, old: Connection) -> Connection:
         """Open a connection beside one that is up, and return it once it is up too.
@@ -231,15 +228,11 @@ class ZenohLink:
 
     def _open(self) -> Connection | None:
         began = time.monotonic()
+        open_timeout_ms = round(self._opening.timeout_s * 1e3)
+        config = self._config | {"transport/unicast/open_timeout": open_timeout_ms}
         try:
             connection = Connection(
-                settings.to_zenoh(
-                    {**self._config, **settings.open_within(self._opening.timeout_s)}
-                ),
-                self.peer,
-                self._services,
-                self._shared,
-                self._tell,
+                settings.to_zenoh(config), self.peer, self._services, self._shared, self._tell
             )
         except (WireError, CredentialError) as error:
             self._say(error.message)

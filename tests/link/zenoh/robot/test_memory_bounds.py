@@ -95,13 +95,14 @@ def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authorit
         sessions=AuthenticatedSessions(POOL_UID, "replica", verifier),
         records=RecordSet(POOL_UID, verifier),
         streams=Streams(),
-        queues=ReplyQueues(counters, turns),
+        queues=ReplyQueues(counters),
         work=work,
         counters=counters,
     )
-    for turn in range(3000):
+    for _ in range(3000):
+        asked = QueryEnd(Query(), turns)
         turns.came()
-        control.later(Greeting(bytes(8)), lambda: None, QueryEnd(Query(), turn))
+        control.later(Greeting(bytes(8)), lambda: None, asked)
     dropped = counters.snapshot()["control_queries_dropped"]
     assert 0 < len(work) == 3000 - dropped <= LIMIT
     wait_for(lambda: Query.ended == dropped)
