@@ -79,10 +79,8 @@ class Throughput:
         return median_high(rates) if len(rates) >= ENOUGH else None
 
 
-# A frozen peer's kernel acknowledges probes and small requests; only more than these is a queue.
-BULK_BYTES = 16 << 10
-# Less than that in one look is no flow: probes' answers are a few hundred bytes.
-_TRICKLE_BYTES = 2048
+BULK_BYTES = 16 << 10  # only more is a queue: a frozen peer's kernel takes what is small
+_TRICKLE_BYTES = 2048  # less in one look is no flow: probes' answers are a few hundred bytes
 _SHARE_OF_NEW = 0.3  # in the average of the rate
 _SHORTEST_LOOK_S = 0.05
 

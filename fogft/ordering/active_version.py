@@ -11,9 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable
 
-# So long no replica may be of the active version before another one becomes active without a
-# snapshot: links that come up one after the other, and a service that restarts, shall not decide.
-VACANCY_S = 3.0
+VACANCY_S = 3.0  # longer than links take to come up one after the other, or a service to restart
 
 
 class ActiveVersion:

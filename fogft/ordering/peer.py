@@ -14,8 +14,7 @@ from fogft.ordering.orders import Op, Promise
 
 RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.5
-# Further behind than this, a replica is given a new snapshot rather than every request since.
-LAG_LIMIT = 256
+LAG_LIMIT = 256  # further behind, a replica is given a snapshot rather than every request since
 RESTORE_FIRST_S = 2.0
 RESTORE_LONGEST_S = 16.0
 

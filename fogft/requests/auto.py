@@ -82,10 +82,8 @@ class Auto(Learning):
         self._tokens = BUDGET_CAPACITY  # for late hedges; each request brings a share of one
         self._spares = Spares()
         self._demand = Demand()
-        # When a spare was first, by the copy that it beat, until that has ended.
-        self._beaten: dict[tuple[bytes, int], float] = {}
-        # Requests that get another spare as soon as a replica is free, oldest first.
-        self._wanting: dict[bytes, None] = {}
+        self._beaten: dict[tuple[bytes, int], float] = {}  # copies, and when a spare was first
+        self._wanting: dict[bytes, None] = {}  # requests that get a spare once a replica is free
         self.hedges = 0
 
     # -- choices --------------------------------------------------------------------------

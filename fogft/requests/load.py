@@ -15,10 +15,8 @@ from fogft.requests.latency import Latencies
 LATE_SHARE = 0.95
 SHORTEST_DELAY_S = 0.001
 UNKNOWN_DELAY_S = 0.1
-# With fewer samples the 95 % quantile is but the longest one, which must do.
-_SAMPLES_NEEDED = 5
-# What a replica said of other robots' requests holds for so long.
-_WORD_HOLDS_S = 1.0
+_SAMPLES_NEEDED = 5  # with fewer, the 95 % quantile is but the longest one
+_WORD_HOLDS_S = 1.0  # of a replica, about other robots' requests
 _RTT_GAIN = 0.1
 NEARLY = 0.8  # of what it usually takes
 _ALIKE = 4.0

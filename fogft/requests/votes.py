@@ -10,20 +10,13 @@ from __future__ import annotations
 
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from fogft.model.replica import short
 from fogft.requests.decide import Decide, Judgement, Means, Pending
 
 WINDOW = 20  # judged answers of a replica that count
 LIMIT = 3  # disagreements among them that make it flagged
-
-
-class Ballot(NamedTuple):
-    """One replica's answer to one request."""
-
-    replica: int
-    value: Any
 
 
 class Comparison(Protocol):
@@ -58,7 +51,7 @@ class Quorum(Decide):
         self._agree = comparison.agree
         self._read = comparison.read
         self._newly_flagged = newly_flagged
-        self._open: dict[bytes, list[Ballot]] = {}
+        self._open: dict[bytes, dict[int, Any]] = {}  # each replica's answer
         self._final: OrderedDict[bytes, Any] = OrderedDict()
         self._record: dict[int, deque[bool]] = {}
 
@@ -72,32 +65,32 @@ class Quorum(Decide):
         """Take a vote; it is a success if it completes a quorum."""
         if pending is None and id not in self._final:
             return Means.UNDECIDED  # it has expired
-        return Means.SUCCESS if self.vote(id, Ballot(replica, reading)) else Means.UNDECIDED
+        return Means.SUCCESS if self.vote(id, replica, reading) else Means.UNDECIDED
 
-    def vote(self, request: bytes, ballot: Ballot) -> bool:
+    def vote(self, request: bytes, replica: int, answer: Any) -> bool:
         """Take an answer; return whether it decides. Answers of flagged replicas do not count."""
         if request in self._final:
-            self._judge(ballot, self._final[request])
+            self._judge(replica, answer, self._final[request])
             return False
-        ballots = self._open.setdefault(request, [])
-        if any(other.replica == ballot.replica for other in ballots):
+        ballots = self._open.setdefault(request, {})
+        if replica in ballots:
             return False  # a copy: one replica has one vote
-        ballots.append(ballot)
-        if ballot.replica in self.flagged:
+        ballots[replica] = answer
+        if replica in self.flagged:
             return False
-        counted = [b for b in ballots if b.replica not in self.flagged]
-        if sum(self._agree(b.value, ballot.value) for b in counted) < self._quorum:
+        counted = [other for voter, other in ballots.items() if voter not in self.flagged]
+        if sum(self._agree(other, answer) for other in counted) < self._quorum:
             return False
         del self._open[request]
-        self._final[request] = ballot.value
+        self._final[request] = answer
         if len(self._final) > self.kept:
             self._final.popitem(last=False)
-        for other in ballots:
-            self._judge(other, ballot.value)
+        for voter, other in ballots.items():
+            self._judge(voter, other, answer)
         return True
 
-    def _judge(self, ballot: Ballot, final: Any) -> None:
-        replica, agrees = ballot.replica, self._agree(ballot.value, final)
+    def _judge(self, replica: int, answer: Any, final: Any) -> None:
+        agrees = self._agree(answer, final)
         record = self._record.setdefault(replica, deque(maxlen=WINDOW))
         record.append(agrees)
         if not agrees:

@@ -14,8 +14,7 @@ from fogft.model.topic import Select
 # has spoken only once no gap is known, and the longer one holds.
 QUIET_S = 1.0
 QUIET_LIMIT_S = 10.0
-_STAMPS_KEPT = 1024
-_GOALS_KEPT = 1024
+_KEPT = 1024  # stamps, and goals
 _STAMP = slice(4, 12)  # of a message whose first field is a std_msgs/Header
 _GOAL = slice(4, 20)  # of a feedback message: its goal's id
 
@@ -77,7 +76,7 @@ class Selection:
         if stamp in self._stamps:
             return False
         self._stamps[stamp] = None
-        if len(self._stamps) > _STAMPS_KEPT:
+        if len(self._stamps) > _KEPT:
             self._stamps.popitem(last=False)
         return True
 
@@ -85,7 +84,7 @@ class Selection:
         leader = self._goals.get(goal)
         if leader is None:
             leader = self._goals[goal] = Leader()
-            if len(self._goals) > _GOALS_KEPT:
+            if len(self._goals) > _KEPT:
                 self._goals.popitem(last=False)
         return leader
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.requests.decide import Pending
-from fogft.requests.votes import LIMIT, Ballot, Quorum
+from fogft.requests.votes import LIMIT, Quorum
 
 
 class Within:
@@ -26,10 +26,6 @@ def of(quorum: int) -> Quorum:
     return Quorum(quorum, Within())
 
 
-def ballot(replica: int, value: float) -> Ballot:
-    return Ballot(replica, value)
-
-
 @given(
     st.integers(1, 4),
     st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=12),
@@ -41,7 +37,7 @@ def test_an_answer_has_a_quorum_behind_it_and_there_is_one_at_most(quorum, cast,
     answers = []
     for replica, value in cast:
         first.setdefault(replica, value)
-        if votes.vote(b"r", ballot(replica, value)):
+        if votes.vote(b"r", replica, value):
             answers.append(value)
             assert sum(abs(v - value) <= tolerance for v in first.values()) >= quorum
     assert len(answers) <= 1
@@ -62,7 +58,7 @@ def test_the_honest_win_and_are_never_flagged_while_fewer_than_k_lie(orders, dat
         request = number.to_bytes(2, "big")
         for replica in order:
             value = 7.0 if replica < 3 else data.draw(st.sampled_from([7.0, 8.0, 9.0]))
-            if votes.vote(request, ballot(replica, value)):
+            if votes.vote(request, replica, value):
                 assert value == 7.0
         assert votes.hears_out(request)
     assert votes.flagged <= {3, 4}
@@ -74,7 +70,7 @@ def test_a_liar_is_flagged_after_a_few_requests_however_slow_it_is(order):
     for number in range(LIMIT):
         assert 2 not in votes.flagged
         for replica in order:
-            votes.vote(bytes([number]), ballot(replica, 9.0 if replica == 2 else 7.0))
+            votes.vote(bytes([number]), replica, 9.0 if replica == 2 else 7.0)
     assert votes.flagged == {2}
     assert votes.disagreed == {2: LIMIT}
 
@@ -83,26 +79,26 @@ def test_a_flagged_ballot_does_not_count():
     """One that is flagged cannot give a wrong answer its majority."""
     votes = of(2)
     votes.flagged.add(2)
-    assert votes.vote(b"r", ballot(2, 9.0)) is False
-    assert votes.vote(b"r", ballot(1, 9.0)) is False
-    assert votes.vote(b"r", ballot(0, 9.0)) is True
+    assert votes.vote(b"r", 2, 9.0) is False
+    assert votes.vote(b"r", 1, 9.0) is False
+    assert votes.vote(b"r", 0, 9.0) is True
 
 
 def test_without_agreement_nobody_is_blamed():
     votes = of(2)
     for number in range(50):
-        votes.vote(bytes([number]), ballot(0, 1.0))
-        votes.vote(bytes([number]), ballot(1, 2.0))
+        votes.vote(bytes([number]), 0, 1.0)
+        votes.vote(bytes([number]), 1, 2.0)
         votes.closed(bytes([number]), Pending(0.0, None))
     assert not votes.flagged
     assert not votes.disagreed
-    assert not votes.vote(bytes([0]), ballot(2, 1.0))  # no ballot of it is kept
+    assert not votes.vote(bytes([0]), 2, 1.0)  # no ballot of it is kept
 
 
 def test_a_copy_is_no_second_vote():
     votes = of(2)
-    assert votes.vote(b"r", ballot(0, 1.0)) is False
-    assert votes.vote(b"r", ballot(0, 1.0)) is False
+    assert votes.vote(b"r", 0, 1.0) is False
+    assert votes.vote(b"r", 0, 1.0) is False
 
 
 def test_a_seldom_error_flags_nobody():
@@ -112,7 +108,7 @@ def test_a_seldom_error_flags_nobody():
         request = number.to_bytes(2, "big")
         for replica in (0, 1, 2):
             wrong = replica == 2 and number % 10 == 0
-            votes.vote(request, ballot(replica, 9.0 if wrong else 7.0))
+            votes.vote(request, replica, 9.0 if wrong else 7.0)
     assert not votes.flagged
     assert votes.disagreed == {2: 20}
 
@@ -121,5 +117,5 @@ def test_final_answers_are_kept_for_a_while_only():
     votes = of(1)
     votes.kept = 10
     for number in range(100):
-        votes.vote(bytes([number]), ballot(0, 1.0))
+        votes.vote(bytes([number]), 0, 1.0)
     assert sum(votes.hears_out(bytes([n])) for n in range(100)) == 10

@@ -72,7 +72,6 @@ class DialIn:
         self._verify = verify
         self._revoked = revoked
         self._counters = Counters()
-        # ``admitted``, ``tunnels``, ``greeting_...``, ``refused_full``
         self.counters = self._counters.snapshot
         self._lock = threading.Condition()
         self._waiting: dict[ReplicaId, deque[_Waiting]] = {}

@@ -12,7 +12,6 @@ import contextlib
 import datetime
 import socket
 import ssl
-from dataclasses import dataclass
 from typing import Any
 
 from fogft.errors import CredentialError
@@ -129,12 +128,7 @@ def _tls_words(error: ssl.SSLError) -> str:
     return f"TLS failed: {error.reason or error}"
 
 
-@dataclass(frozen=True)
-class Validity:
-    """When a certificate is good. Times in UTC."""
-
-    begins: datetime.datetime
-    ends: datetime.datetime
+Validity = tuple[datetime.datetime, datetime.datetime]  # from when to when a certificate is good
 
 
 def validity_of(certificate: bytes) -> Validity | None:
@@ -150,19 +144,20 @@ def validity_of(certificate: bytes) -> Validity | None:
         read = load(certificate)
     except Exception:  # the parser may raise anything on hostile bytes
         return None
-    return Validity(read.not_valid_before_utc, read.not_valid_after_utc)
+    return read.not_valid_before_utc, read.not_valid_after_utc
 
 
 def judged_here(validity: Validity, now: datetime.datetime) -> str:
     """Return why we refuse a replica's certificate: ``now`` is this machine's clock."""
-    if now < validity.begins:
+    begins, ends = validity
+    if now < begins:
         return (
-            f"it is not valid before {_utc(validity.begins)}, and this machine's clock says "
+            f"it is not valid before {_utc(begins)}, and this machine's clock says "
             f"{_utc(now)}. Set this machine's clock, or that of the manager, which issued it"
         )
-    if now >= validity.ends:
+    if now >= ends:
         return (
-            f"it expired at {_utc(validity.ends)}, and this machine's clock says {_utc(now)}. If "
+            f"it expired at {_utc(ends)}, and this machine's clock says {_utc(now)}. If "
             "that is right, replace the replica"
         )
     return ""
@@ -170,16 +165,15 @@ def judged_here(validity: Validity, now: datetime.datetime) -> str:
 
 def judged_there(validity: Validity, now: datetime.datetime) -> str:
     """Return why a replica refuses our certificate for its time."""
-    if now < validity.begins or now >= validity.ends:
-        which = "is not yet valid" if now < validity.begins else "has expired"
-        return (
-            f"our certificate {which} (valid from {_utc(validity.begins)} to {_utc(validity.ends)}"
-            f", this machine's clock says {_utc(now)})"
-        )
+    begins, ends = validity
+    valid = f"valid from {_utc(begins)} to {_utc(ends)}"
+    clock = f"this machine's clock says {_utc(now)}"
+    if now < begins or now >= ends:
+        which = "is not yet valid" if now < begins else "has expired"
+        return f"our certificate {which} ({valid}, {clock})"
     return (
-        f"the replica's clock is wrong: it rejects our certificate as not valid now, but it is "
-        f"valid from {_utc(validity.begins)} to {_utc(validity.ends)}; this machine's clock says "
-        f"{_utc(now)}"
+        "the replica's clock is wrong: it rejects our certificate as not valid now, but it is "
+        f"{valid}; {clock}"
     )
 
 

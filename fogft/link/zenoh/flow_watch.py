@@ -12,8 +12,7 @@ from fogft.link.socket_progress import BULK_BYTES, SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.sockets import Address, OwnSocket
 
-# Below, what is large is kept short in the kernel: 16 KiB take longer than 10 ms.
-THIN_BYTES_PER_S = 2_000_000.0
+THIN_BYTES_PER_S = 2_000_000.0  # below, what is large is kept short in the kernel
 _LOOK_AGAIN_S = 0.002
 _QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
 

@@ -24,11 +24,9 @@ from fogft.link.socket_progress import Flow
 Address = tuple[str, int]
 
 _DESCRIPTORS = "/proc/self/fd"
-# struct tcp_info of linux/tcp.h: eight bytes of state, then 32 and 64 bit counts.
-_INFO_BYTES, _WITH_UNSENT_BYTES = 136, 148
-_RTT, _RTT_VARIATION = (struct.Struct("@I"), 68), (struct.Struct("@I"), 72)
-_ACKNOWLEDGED, _RECEIVED = (struct.Struct("@Q"), 120), (struct.Struct("@Q"), 128)
-_UNSENT = struct.Struct("@I"), 144
+# Of struct tcp_info in linux/tcp.h: round trip and its variation (us), and bytes that were
+# acknowledged, received, and not sent yet.
+_INFO = struct.Struct("=68xII44xQQ8xI")
 _COUNT = struct.Struct("@i")
 _TCP_NOTSENT_LOWAT = 25
 _UNSENT_BYTES = 16 << 10
@@ -69,18 +67,12 @@ def listening(port: int) -> socket.socket | None:
         connection = _duplicate(number)
         if connection is None:
             continue
-        if _listens(connection, port):
-            return connection
+        with contextlib.suppress(OSError):
+            listens = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
+            if listens and connection.getsockname()[1] == port:
+                return connection
         connection.close()
     return None
-
-
-def _listens(connection: socket.socket, port: int) -> bool:
-    try:
-        listens = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
-        return bool(listens) and connection.getsockname()[1] == port
-    except OSError:
-        return False
 
 
 class OwnSocket:
@@ -151,24 +143,19 @@ def _ends(connection: socket.socket) -> tuple[Address, Address] | None:
 def flow(connection: socket.socket) -> Flow | None:
     """Return the kernel's counters of a connection; None if it has none."""
     try:
-        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _WITH_UNSENT_BYTES)
+        info = connection.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _INFO.size)
         waiting = fcntl.ioctl(connection, termios.TIOCOUTQ, bytes(_COUNT.size))
     except OSError:
         return None
-    if len(info) < _INFO_BYTES:
-        return None  # a kernel before 4.1
-    rtt_us, variation_us, acknowledged, received = (
-        form.unpack_from(info, at)[0]
-        for form, at in (_RTT, _RTT_VARIATION, _ACKNOWLEDGED, _RECEIVED)
-    )
-    form, at = _UNSENT
-    tells_unsent = len(info) >= _WITH_UNSENT_BYTES  # since Linux 4.6
+    if len(info) < _INFO.size:
+        return None  # a kernel before 4.6
+    rtt_us, variation_us, acknowledged, received, unsent = _INFO.unpack(info)
     return Flow(
         acknowledged=acknowledged,
         received=received,
         outstanding=max(0, _COUNT.unpack(waiting)[0]),
         round_trip_s=(rtt_us + 4 * variation_us) / 1e6,
-        unsent=form.unpack_from(info, at)[0] if tells_unsent else 0,
+        unsent=unsent,
     )
 
 

@@ -13,19 +13,13 @@ from collections.abc import Collection, Mapping
 from fogft.link.zenoh.sockets import Address
 from fogft.records.greetings import network_of
 
-# Longer than Zenoh takes to accept or give up a peer that talks.
-PATIENCE_S = 5.0
+PATIENCE_S = 5.0  # longer than Zenoh takes to accept or give up a peer that talks
 STRANGERS_LIMIT = 16
-# Of one host: from then on nothing more of it is accepted.
-HOST_LIMIT = 8
-# Of all hosts that are let in still: from then on nothing is accepted.
-SHUT_LIMIT = 32
-# In a flood even the young have to go, but not one that may be in the middle of its handshake.
-LEAST_AGE_S = 0.5
-# A host is kept out for so long, where no robot there has a link.
-KEPT_OUT_S = 10.0
-# One at a time: longer than Zenoh's rest.
-END_EVERY_S = 0.12
+HOST_LIMIT = 8  # of one host: from then on nothing more of it is accepted
+SHUT_LIMIT = 32  # of all hosts that are let in still: from then on nothing is accepted
+LEAST_AGE_S = 0.5  # in a flood even the young have to go, but not amid their handshake
+KEPT_OUT_S = 10.0  # a host is kept out for so long, where no robot there has a link
+END_EVERY_S = 0.12  # one at a time: longer than Zenoh's rest
 
 
 class Door:

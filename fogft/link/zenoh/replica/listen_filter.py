@@ -20,8 +20,7 @@ from collections.abc import Iterable
 from fogft.link.zenoh import sockets
 
 HOSTS_LIMIT = 32  # where more are to be kept out, all are
-# Connections that may wait for Zenoh. It takes them at once, but for its rests.
-WAITING_LIMIT = 4
+WAITING_LIMIT = 4  # connections that wait for Zenoh: it takes them at once, but for its rests
 
 _ATTACH, _DETACH = 26, 27  # SO_ATTACH_FILTER and SO_DETACH_FILTER of asm-generic/socket.h
 # Classic BPF (linux/filter.h): the code, where to jump if true and if not, and a constant.

@@ -21,8 +21,7 @@ from fogft.records.record import RecordError, Verify
 
 HOLDERS_LIMIT = 256
 TOKENS_LIMIT = 64  # of one holder: nobody's connections push out another's
-# Each costs a thread for a while: who makes so many within this greets too often.
-TOKENS_WITHIN_S = 10.0
+TOKENS_WITHIN_S = 10.0  # who makes so many within this greets too often: each costs a thread
 _MAY_ASK = frozenset({Role.ROBOT, Role.GATEWAY})
 
 

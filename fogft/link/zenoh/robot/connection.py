@@ -68,10 +68,8 @@ _ALL = zenoh.QueryTarget.ALL
 # NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
 # last replica has answered. Kept true by tests/link/zenoh/robot/test_first_reply_is_not_held_back.
 _AT_ONCE = zenoh.ConsolidationMode.NONE
-# How long a closed connection may still flow.
-_END_WITHIN_S = 1.0
-# For as long as the connection: Zenoh ends the query when the session closes.
-_ANSWERS_TIMEOUT_S = 1e9
+_END_WITHIN_S = 1.0  # so long a closed connection may still flow
+_ANSWERS_TIMEOUT_S = 1e9  # for as long as the connection
 
 
 _REFUSED = {
