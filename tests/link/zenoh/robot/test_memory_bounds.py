@@ -18,7 +18,7 @@ from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.link.zenoh.work_queue import LIMIT, WorkQueue
 from fogft.records.record_set import RecordSet
-from fogft.records.signing import LazyVerifier
+from fogft.records.signing import Verifier
 from tests.link.wire_pool import POOL_UID, SERVICE, Authority, ReplicaProcess, request_id, wait_for
 
 # A send to the frozen replica blocks for longer than any test waits.
@@ -89,7 +89,8 @@ class Query:
 
 def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authority) -> None:
     """A robot that probes without end has its probes dropped and counted, and each query ended."""
-    counters, turns, verifier = Counters(), QueryTurns(), LazyVerifier(authority.replica().ca)
+    counters, turns = Counters(), QueryTurns()
+    verifier = Verifier(authority.replica().ca, lazy=True)
     work = WorkQueue("test", counters)  # not begun: nothing leaves it
     control = ControlQueries(
         sessions=AuthenticatedSessions(POOL_UID, "replica", verifier),
