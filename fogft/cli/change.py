@@ -1,8 +1,4 @@
-"""``fogft scale | drain | exclude | include``: change what a running pool aims for.
-
-Each writes the pool's intent and returns, or with `--wait` once it is carried out; the manager
-acts on it in its next tick, even if it is killed and started again in between.
-"""
+"""``fogft scale | drain | exclude | include``: write a running pool's intent."""
 
 from __future__ import annotations
 
@@ -64,8 +60,7 @@ def drain(slot: Slot, wait: Wait = False, pool: PoolOption = None) -> None:
         progress.settle(store, Settled(since, (slot, generation)), f"has not replaced `{replica}`")
         output.done(f"replica `{replica}` of `{store.name}` is replaced")
         return
-    output.done(f"replica `{replica}` of `{store.name}` is being replaced")
-    _warn_without_manager(store)
+    _done(store, f"replica `{replica}` of `{store.name}` is being replaced")
 
 
 def exclude(
@@ -85,8 +80,7 @@ def exclude(
     store = composition.store_of(pool)
     is_new = change.exclude(store, location, composition.cloud_of(store.identity()))
     since = "is now" if is_new else "was already"
-    output.done(f"`{location}` {since} excluded from `{store.name}`")
-    _warn_without_manager(store)
+    _done(store, f"`{location}` {since} excluded from `{store.name}`")
 
 
 def include(
@@ -104,8 +98,7 @@ def include(
 
     store = composition.store_of(pool)
     change(store, lambda before: intent.include(before, location))
-    output.done(f"`{location}` may be used for `{store.name}` again")
-    _warn_without_manager(store)
+    _done(store, f"`{location}` may be used for `{store.name}` again")
 
 
 def retry(pool: PoolOption = None) -> None:
@@ -115,8 +108,7 @@ def retry(pool: PoolOption = None) -> None:
 
     store = composition.store_of(pool)
     change(store, lambda before: intent.retry(before, time.time()))
-    output.done(f"`{store.name}` will launch replicas again")
-    _warn_without_manager(store)
+    _done(store, f"`{store.name}` will launch replicas again")
 
 
 def _scale(pool: str | None, by: int, *, wait: bool) -> None:
@@ -134,11 +126,11 @@ def _scale(pool: str | None, by: int, *, wait: bool) -> None:
         progress.settle(store, Settled(since), f"does not have {after} replicas")
         output.done(f"`{store.name}` has {after} replicas (had {before})")
         return
-    output.done(f"`{store.name}` is scaling from {before} to {after} replicas")
-    _warn_without_manager(store)
+    _done(store, f"`{store.name}` is scaling from {before} to {after} replicas")
 
 
-def _warn_without_manager(store: PoolStore) -> None:
+def _done(store: PoolStore, what: str) -> None:
+    output.done(what)
     if not disk.is_locked(store.paths.manager_lock):
         output.warn(f"`{store.name}` has no manager: this takes effect once one is running")
         output.hint(f"start it with `fogft up {store.identity().file}`")

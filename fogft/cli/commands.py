@@ -1,8 +1,7 @@
 """The list of commands, grouped by task, and the layout of their help.
 
-A command's module is imported when the command is run or described, so that each starts
-without loading the others. A name stands for a function of that name in its module, or for a
-group of commands.
+A command's module is imported when the command is run or described. A name stands for a function
+of that name in its module, or for a group of commands.
 """
 
 from __future__ import annotations
@@ -93,8 +92,6 @@ def _load(name: str, module: str, example: str) -> Any:
 
 
 def _elsewhere(name: str) -> Any:
-    """Return a command that says that it needs Linux, whatever it is given."""
-
     def refuse() -> None:
         raise FogftError(
             f"`fogft {name}` needs Linux; this is {sys.platform}",

@@ -1,8 +1,4 @@
-"""``fogft credentials | join | export | import``: a pool's certificates, and moving a pool.
-
-A passphrase is typed, read from a file or generated; it is never an argument. Keys are never
-shown.
-"""
+"""``fogft credentials | join | export | import``: a pool's certificates, and moving a pool."""
 
 from __future__ import annotations
 
@@ -20,15 +16,15 @@ from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolOption
 from fogft.cli.status_text import utc
 from fogft.errors import CredentialError, FogftError
-from fogft.model.plain import to_plain
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 
 if TYPE_CHECKING:
     from fogft.model.credentials import Holder, Role
-    from fogft.pool.credentials.ledger import Entry
 
-DAY_H = 24.0
+Hours = Annotated[
+    float, typer.Option(min=0.1, max=720, metavar="H", help="Hours until it expires.")
+]
 RoleName = Annotated[
     str, typer.Argument(metavar="ROLE", help="`robot`, `replica`, `gateway` or `rendezvous`.")
 ]
@@ -53,9 +49,7 @@ def issue(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="FILE", help="The file to write.")
     ] = None,
-    hours: Annotated[
-        float, typer.Option(min=0.1, max=720, metavar="H", help="Hours until it expires.")
-    ] = DAY_H,
+    hours: Hours = 24.0,
     passphrase_file: PassphraseFile = None,
     pool: PoolOption = None,
 ) -> None:
@@ -86,18 +80,18 @@ def issue(
 
 
 @credentials.command("list", cls=Command, epilog="fogft credentials list")
-def list_(
-    as_json: AsJson = False,
-    pool: PoolOption = None,
-) -> None:
+def list_(as_json: AsJson = False, pool: PoolOption = None) -> None:
     """List the certificates that the pool's CA has issued, without their keys."""
     from fogft.cli.table import table
+    from fogft.model.plain import to_plain
     from fogft.pool.credentials.ledger import Ledger
 
     now = time.time()
     entries = Ledger(composition.paths_of(pool).credentials).entries()
     if as_json:
-        output.json_data([_as_data(entry, now) for entry in entries])
+        output.json_data(
+            [{**to_plain(e.holder), **to_plain(e), "state": e.state(now)} for e in entries]
+        )
         return
     rows = [
         (e.holder.role.value, e.holder.short, e.state(now), utc(e.not_after), e.serial[:16])
@@ -165,10 +159,8 @@ def rotate(
         )
     holder, old, in_use = rotate_robot(store)
     if not in_use:
-        output.warn(
-            f"robot `{holder.short}` has a new certificate, but its "
-            "client proxy does not use it yet"
-        )
+        new = f"robot `{holder.short}` has a new certificate"
+        output.warn(f"{new}, but its client proxy does not use it yet")
         listed = " ".join(h.short for h in old)
         output.hint(
             "the old one stays valid; once the new one is in use, run `fogft "
@@ -213,9 +205,7 @@ def export(
     ],
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write.")],
     *,
-    hours: Annotated[
-        float, typer.Option(min=0.1, max=720, metavar="H", help="Hours until it expires.")
-    ] = DAY_H,
+    hours: Hours = 24.0,
     passphrase_file: PassphraseFile = None,
 ) -> None:
     """Write a sealed file that moves a pool to another machine.
@@ -280,13 +270,11 @@ def _alone(holder: Holder) -> str:
 def _role(text: str) -> Role:
     from fogft.model.credentials import Role
 
-    allowed = (Role.ROBOT, Role.REPLICA, Role.GATEWAY, Role.RENDEZVOUS)
-    for role in allowed:
-        if role.value == text:
-            return role
-    raise CredentialError(
-        f"there is no role `{text}`", "roles: " + ", ".join(f"`{role.value}`" for role in allowed)
-    )
+    allowed = {one.value: one for one in (Role.ROBOT, Role.REPLICA, Role.GATEWAY, Role.RENDEZVOUS)}
+    if text not in allowed:
+        hint = "roles: " + ", ".join(f"`{name}`" for name in allowed)
+        raise CredentialError(f"there is no role `{text}`", hint)
+    return allowed[text]
 
 
 def _chosen_passphrase(file: Path | None) -> tuple[str, bool]:
@@ -313,7 +301,3 @@ def _read_passphrase(file: Path | None) -> str:
     import getpass
 
     return getpass.getpass("passphrase: ").strip()
-
-
-def _as_data(entry: Entry, now: float) -> dict[str, object]:
-    return {**to_plain(entry.holder), **to_plain(entry), "state": entry.state(now)}

@@ -42,11 +42,9 @@ def init(
     from fogft.pool.commands.init import DEFAULT_EXAMPLE, copy_example
 
     if schema:
-        import json
-
         from fogft.poolfile.schema import pool_schema
 
-        output.data(json.dumps(pool_schema(), indent=2))
+        output.json_data(pool_schema())
         return
     name = name or DEFAULT_EXAMPLE
     files = copy_example(name, into or Path(name), force=force)
@@ -124,8 +122,8 @@ def up(
     if not found.target:
         output.done(f"`{name}` is set up; its schedule asks for no replicas now")
         return
-    missing = max(0, found.target - found.ready)
-    rest = f"; {missing} more starting, see `fogft status`" if missing else ""
+    missing = found.target - found.ready
+    rest = f"; {missing} more starting, see `fogft status`" if missing > 0 else ""
     if awaited.is_updating(seen):
         rest = "; the update continues, see `fogft status`"
     for service in () if awaited.services else found.services:
@@ -142,7 +140,7 @@ def services_at_fault(status: PoolStatus) -> list[str]:
 
 
 def not_updated(status: PoolStatus) -> FogftError:
-    """Return the error for an `up` whose update was stopped, with the end of the log behind it."""
+    """Return the error for an `up` whose update was stopped."""
     why = "" if status.update is None else status.update.fault
     lines = [f"`{status.pool}` was not updated: {why}"]
     if replica := replica_at_fault(status.reasons):
@@ -194,11 +192,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     return FogftError("\n".join(lines), f"{tries}; `fogft down {status.pool}` ends it")
 
 
-def down(
-    pool: PoolArgument = None,
-    yes: Yes = False,
-    named: PoolOption = None,
-) -> None:
+def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) -> None:
     """Shut down a pool: its replicas, client proxy and manager.
 
     Works even if the manager is dead, and is safe to repeat. For an exported pool, stops only
@@ -226,9 +220,8 @@ def down(
     if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
         told(f"{len(swept)} shared-memory files of dead processes")
     if elsewhere:
-        output.done(
-            f"nothing of `{store.name}` remains on this machine; another machine manages it"
-        )
+        left = f"nothing of `{store.name}` remains on this machine"
+        output.done(f"{left}; another machine manages it")
         return
     output.done(f"`{store.name}` is shut down; nothing is left")
     if paid and not composition.pools():

@@ -1,11 +1,9 @@
 """The ``fogft`` command: runs a command and turns its outcome into an exit status.
 
-Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage; 130
-interrupted; 141 nobody reads stdout any more. Anything else is a defect of ours and
-keeps its trace.
+Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage; 130 interrupted;
+141 nobody reads stdout any more. Anything else is a defect of ours and keeps its trace.
 
-Every import that costs more than a few milliseconds is made inside the command that
-needs it, so that ``fogft --help`` and completion stay quick (tests/cli/test_laziness).
+Imports that take long are made inside the command that needs them (tests/cli/test_laziness).
 """
 
 from __future__ import annotations
@@ -74,9 +72,8 @@ def run(args: Sequence[str]) -> int:
         output.say("interrupted")
         return INTERRUPTED
     except BrokenPipeError:
-        if not output.stdout_closed():
+        if not output.silenced_stdout():
             raise
-        output.silence_stdout()
         return STDOUT_CLOSED
 
 

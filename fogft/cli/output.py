@@ -1,20 +1,18 @@
 """Print to the terminal: data to stdout, messages to stderr, both readable without colour.
 
-What a command answers (a table, JSON, a log) is data. Progress, hints and errors are
-messages. A script may therefore read stdout and ignore stderr. Rich draws tables, trees and
-whatever is redrawn; it is loaded when the first of them is shown.
+What a command answers is data; progress, hints and errors are messages. Rich is loaded when the
+first table, tree or redrawn screen is shown.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
 import select
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
 from typing import IO, TYPE_CHECKING, Any
 
 from fogft.errors import FogftError
@@ -129,37 +127,31 @@ def indented(text: str, by: int, stream: IO[str]) -> str:
     return ("\n" + " " * by).join(folded)
 
 
-@contextmanager
+@contextlib.contextmanager
 def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
     """Yield a function that redraws its output in place; long lines are cut."""
     from rich.live import Live
     from rich.text import Text
 
-    def show_in(live: Live, shown: RenderableType) -> None:
-        lines = Text.from_ansi(
-            _drawn(stream, shown, limit=width(stream)), no_wrap=True, overflow="ellipsis"
-        )
-        live.update(lines, refresh=True)
+    def show(shown: RenderableType) -> None:
+        drawn = _drawn(stream, shown, limit=width(stream))
+        live.update(Text.from_ansi(drawn, no_wrap=True, overflow="ellipsis"), refresh=True)
 
     with Live(console=_console(stream), auto_refresh=False, vertical_overflow="crop") as live:
-        yield partial(show_in, live)
+        yield show
 
 
-def stdout_closed() -> bool:
-    """Whether the reader of stdout is gone, as after ``| head``."""
-    try:
+def silenced_stdout() -> bool:
+    """Discard what is buffered for stdout if its reader is gone, as after ``| head``."""
+    with contextlib.suppress(OSError, ValueError):
         poll = select.poll()
         poll.register(sys.stdout.fileno(), 0)
-        return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
-    except (OSError, ValueError):
-        return True
-
-
-def silence_stdout() -> None:
-    """Discard what is buffered for a closed stdout, so that exiting prints no error."""
+        if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
+            return False
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.close(nowhere)
+    return True
 
 
 def _drawn(stream: IO[str], *parts: RenderableType, limit: int | None) -> str:

@@ -76,12 +76,8 @@ def check(file: PoolFile = DEFAULT_FILE, as_json: AsJson = False) -> None:
 
     found = mistakes(file)
     if as_json:
-        output.json_data(
-            [
-                {"line": one.line, "key": one.key, "message": one.message, "hint": one.hint}
-                for one in found
-            ]
-        )
+        keys = ("line", "key", "message", "hint")
+        output.json_data([{key: getattr(one, key) for key in keys} for one in found])
     for one in () if as_json else found:
         output.data(one.message + (f"\n    {one.hint}" if one.hint else ""))
     if not found:

@@ -1,8 +1,4 @@
-"""Show what ``fogft up`` will do, then each replica as it starts.
-
-On a terminal, a table that is redrawn; elsewhere one line for each change. All of it goes
-to stderr.
-"""
+"""Show what ``fogft up`` will do, then each replica as it starts. All of it goes to stderr."""
 
 from __future__ import annotations
 
@@ -35,11 +31,9 @@ REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup
 def announce(
     preview: Preview, joined: UpdateStatus | None = None, *, upgrade_from: str = ""
 ) -> None:
-    """Print what `up` is about to do.
+    """Print what `up` is about to do; `joined` is an update under way to this very file.
 
-    Args:
-        joined: The update that is under way to this very file.
-        upgrade_from: By which version of fogft the pool's manager runs, where it has one.
+    `upgrade_from` is the version of fogft by which the pool's manager runs, where it has one.
     """
     spec = preview.spec
     for name, problem in preview.accounts.items():
@@ -74,7 +68,6 @@ def announce(
 
 
 def _no_room(spec: PoolSpec) -> str:
-    """Return why a replica ends before its successor exists, and what that means."""
     if spec.max_surge == 0:
         why = "`max_surge` is 0"
     else:
@@ -109,8 +102,8 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
     from fogft.pool.commands import status
     from fogft.pool.commands.outcome import Outcome
 
-    deadline = time.monotonic() + timeout_s
     managed_at = time.monotonic()
+    deadline = managed_at + timeout_s
     with _shown() as show:
         while True:
             seen = status.read(paths, time.time())
@@ -150,40 +143,37 @@ def settle(store: PoolStore, settled: Settled, what: str) -> None:
 @contextmanager
 def _shown() -> Iterator[Callable[[Seen], None]]:
     if not output.is_terminal(sys.stderr):
-        yield PhaseLines(output.say)
+        yield _PhaseLines()
         return
-
     width = output.width(sys.stderr)
     with output.redrawn(sys.stderr) as show:
         yield lambda seen: show(status_text.starting(seen.status, width=width))
 
 
-class PhaseLines:
+class _PhaseLines:
     """One line for each replica's change of phase, and for each new note."""
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        self._say = say
+    def __init__(self) -> None:
         self._known: dict[str, tuple[str, str]] = {}
         self._notes: set[str] = set()
 
     def __call__(self, seen: Seen) -> None:
-        """Say what is new."""
         replicas = {f"{r.slot}.{r.generation}": r for r in seen.status.replicas}
         for name, replica in replicas.items():
             phase, detail = self._known.get(name, ("", ""))
             self._known[name] = (replica.phase, replica.detail)
             if phase != replica.phase:
                 where = "" if phase else f" at {replica.location}"
-                self._say(f"{name}  {replica.phase}{where}")
+                output.say(f"{name}  {replica.phase}{where}")
             if replica.detail not in ("", detail):
-                self._say(f"{name}  {replica.detail}")
+                output.say(f"{name}  {replica.detail}")
         for name in [name for name in self._known if name not in replicas]:
             del self._known[name]
-            self._say(f"{name}  gone")
+            output.say(f"{name}  gone")
         for note in seen.status.notes:
             if note not in self._notes:
                 self._notes.add(note)
-                self._say(f"note: {note}")
+                output.say(f"note: {note}")
 
 
 def _count(count: int, word: str) -> str:

@@ -41,30 +41,26 @@ NUMBERS = ("$/H", "RTT", "FIRST", "AGE", *SERVICE_COLUMNS[1:], *TOPIC_COLUMNS[3:
 
 def rendered(seen: Seen, *, width: int | None) -> Group:
     """Return the whole status for a given line width."""
-    status = seen.status
+    from rich.console import Group
+
+    status, links_known = seen.status, seen.links_known
     rows = [*status.replicas, *status.by_hand]
     parts: list[Sequence[RenderableType]] = [
         [headline(seen, width)],
-        replicas(rows, REPLICA_COLUMNS, width=width, links_known=seen.links_known),
-        [services(status.services, width=width, links_known=seen.links_known)]
-        if status.services
-        else [],
-        [topics(status.topics, width=width, links_known=seen.links_known)] if status.topics else [],
+        _replicas(rows, REPLICA_COLUMNS, width, links_known),
+        _services(status.services, width, links_known),
+        _topics(status.topics, width, links_known),
         topology(status.topology),
         notes(status),
     ]
-    return _lines([line for part in parts if part for line in ("", *part)][1:])
+    return Group(*[line for part in parts if part for line in ("", *part)][1:])
 
 
 def starting(status: PoolStatus, *, width: int | None) -> Group:
     """Return the shorter status that `up` shows while it waits."""
-    return _lines([*replicas(status.replicas, STARTING_COLUMNS, width=width), *notes(status)])
-
-
-def _lines(parts: Sequence[RenderableType]) -> Group:
     from rich.console import Group
 
-    return Group(*parts)
+    return Group(*_replicas(status.replicas, STARTING_COLUMNS, width, True), *notes(status))
 
 
 def headline(seen: Seen, width: int | None) -> Text:
@@ -100,7 +96,6 @@ def headline(seen: Seen, width: int | None) -> Text:
 
 
 def _answering(seen: Seen) -> list[Text]:
-    """Return whether a request would be answered now; nothing of a pool that is still new."""
     if seen.answers:
         return [cell("answering", "green")]
     if seen.answers is None:
@@ -111,7 +106,6 @@ def _answering(seen: Seen) -> list[Text]:
 
 
 def _joined(words: Sequence[Text], width: int | None = None) -> Text:
-    """Join words by two spaces, or by a new line before one that would not fit."""
     joined, column = words[0].copy(), len(words[0])
     for word in words[1:]:
         fits = width is None or column + 2 + len(word) <= width
@@ -164,12 +158,8 @@ def troubles(status: PoolStatus) -> list[str]:
     return found
 
 
-def replicas(
-    rows: Sequence[ReplicaStatus],
-    names: Sequence[str],
-    *,
-    width: int | None,
-    links_known: bool = True,
+def _replicas(
+    rows: Sequence[ReplicaStatus], names: Sequence[str], width: int | None, links_known: bool
 ) -> list[RenderableType]:
     """Return the table of replicas; details are in it if there is room, else below it."""
     from fogft.cli.table import table
@@ -204,12 +194,13 @@ def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
     }
 
 
-def services(
-    rows: Sequence[ServiceStatus], *, width: int | None, links_known: bool = True
-) -> RenderableType:
-    """Return the table of services and of the outcomes of their requests."""
+def _services(
+    rows: Sequence[ServiceStatus], width: int | None, links_known: bool
+) -> list[RenderableType]:
     from fogft.cli.table import table
 
+    if not rows:
+        return []
     cells: list[list[str | Text]] = []
     for row in rows:
         count = row.counters
@@ -229,17 +220,17 @@ def services(
                 milliseconds(count.get("p99_s")),
             ]
         )
-    return table(
-        SERVICE_COLUMNS, cells, width=width, right=NUMBERS, folds=("SERVICE",), optional=RARE
-    )
+    names, folds = SERVICE_COLUMNS, ("SERVICE",)
+    return [table(names, cells, width=width, right=NUMBERS, folds=folds, optional=RARE)]
 
 
-def topics(
-    rows: Sequence[TopicStatus], *, width: int | None, links_known: bool = True
-) -> RenderableType:
-    """Return the table of topics: their subscribers and the outcomes of their messages."""
+def _topics(
+    rows: Sequence[TopicStatus], width: int | None, links_known: bool
+) -> list[RenderableType]:
     from fogft.cli.table import table
 
+    if not rows:
+        return []
     cells: list[list[str | Text]] = []
     for row in rows:
         count, heard = row.counters, ", ".join(row.heard_by)
@@ -252,9 +243,8 @@ def topics(
                 *map(number, (count.messages, count.passed, count.dropped, count.refused)),
             ]
         )
-    return table(
-        TOPIC_COLUMNS, cells, width=width, right=NUMBERS, folds=("TOPIC",), optional=("REFUSED",)
-    )
+    names, folds = TOPIC_COLUMNS, ("TOPIC",)
+    return [table(names, cells, width=width, right=NUMBERS, folds=folds, optional=("REFUSED",))]
 
 
 def topology(drawn: Mapping[str, Any]) -> list[RenderableType]:

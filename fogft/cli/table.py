@@ -63,9 +63,7 @@ def table(
 ) -> RenderableType:
     """Return a table without rules, split into several that repeat the first column if needed.
 
-    Args:
-        folds: Columns whose cells may be folded.
-        optional: Columns that a terminal is spared where they are empty, or 0 everywhere.
+    Columns of `folds` may be folded; a terminal is spared `optional` ones of no or only 0 values.
     """
     cells = [[cell(one) if isinstance(one, str) else one for one in row] for row in rows]
     columns = [
@@ -73,7 +71,11 @@ def table(
         for at, name in enumerate(header)
     ]
     if width is not None:
-        columns = [one for one in columns if one.name not in optional or not _is_empty(one)]
+        columns = [
+            one
+            for one in columns
+            if one.name not in optional or not {text.plain for text in one.cells} <= _EMPTY
+        ]
     parts = [columns] if width is None else _parts(columns, width)
     drawn: list[RenderableType] = []
     for part in parts:
@@ -84,10 +86,6 @@ def table(
         ]
         drawn += ["", _drawn(part, rows_shown, right, titled)]
     return Group(*drawn[1:])
-
-
-def _is_empty(column: _Column) -> bool:
-    return all(one.plain in _EMPTY for one in column.cells)
 
 
 def _parts(columns: list[_Column], width: int) -> list[list[_Column]]:
