@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fogft.model.choices import GroupSpec
+from fogft.model.replica import Machine
 from fogft.model.spec import PoolSpec
 
 BLOCK = 200
@@ -78,6 +79,11 @@ def replica_hash(spec: PoolSpec, slot: int) -> str:
         group = group_of(groups_of(spec), slot)
         found = spec.derived[key] = spec.hash_with(group.resources)
     return found
+
+
+def is_current(spec: PoolSpec, machine: Machine) -> bool:
+    """Whether a machine runs what the pool file asks for now."""
+    return machine.spec_hash == replica_hash(spec, machine.id.slot)
 
 
 def task_at(spec: PoolSpec, slot: int) -> dict[str, Any]:

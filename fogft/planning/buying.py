@@ -112,7 +112,8 @@ class Buyer:
             old = need.replaces.id.short if need.replaces else ""
             self.notes.append(Reason(Cause.SURGE_FULL, slot=need.slot, replica=old))
             return False
-        hopeless = given_up(self.history, replica_hash(self.spec, need.slot), self._retried_at)
+        retried_at = self.history.by_clock(self.intent.retried_at)
+        hopeless = given_up(self.history, replica_hash(self.spec, need.slot), retried_at)
         if hopeless is not None:
             self.notes.append(hopeless)
             return False
@@ -127,10 +128,6 @@ class Buyer:
         generation = self.next_generation(need.slot)
         self.launches.append(PlannedLaunch(need.slot, generation, choice.offer, reason))
         return True
-
-    @cached_property
-    def _retried_at(self) -> float:
-        return self.history.by_clock(self.intent.retried_at)
 
     def _is_within_limit(self, *, on_demand: bool) -> bool:
         """Whether one more machine of a market may be had within this hour; a note if not."""
@@ -178,10 +175,11 @@ class Buyer:
             return frozenset()
         if not self.market(group, False).rows:
             return frozenset()
-        stay = (*self.machines.good, *self.machines.replaced)
-        here = [s.placement for s in stay if group_of(self.groups, s.slot) is group]
-        here += [x.offer.placement for x in self.launches if group_of(self.groups, x.slot) is group]
-        count = Counter(place.location for place in here if place.spot)
+        count = Counter(
+            place.location
+            for slot, place in self._placed()
+            if place.spot and group_of(self.groups, slot) is group
+        )
         half = max(1, math.ceil(group.replicas / 2))
         most = 1 if self.spec.spread is Spread.REQUIRE else half
         return frozenset(location for location, held in count.items() if held >= most)
@@ -231,21 +229,22 @@ class Buyer:
     def kind(self, group: Group, without: Assessment | None) -> bool | None:
         """Return whether a group's next machine is spot (True); None if either will do.
 
-        Args:
-            group: Whose.
-            without: One that is not counted, since it goes.
+        One that goes does not count.
         """
         if not group.on_demand.base and not group.on_demand.fallback:
             return None
-        stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
-        placed = [(s.slot, s.placement) for s in stay]
-        placed += [(launch.slot, launch.offer.placement) for launch in self.launches]
         on_demand = sum(
             not place.spot
-            for slot, place in placed
+            for slot, place in self._placed(without)
             if group_of(self.groups, slot) is group and not is_stand_in(slot)
         )
         return on_demand >= group.on_demand.base
+
+    def _placed(self, without: Assessment | None = None) -> list[tuple[int, Placement]]:
+        """Return slot and placement of the replicas that stay and of those that are ordered."""
+        stay = (*self.machines.good, *self.machines.replaced)
+        placed = [(s.slot, s.placement) for s in stay if s is not without]
+        return placed + [(launch.slot, launch.offer.placement) for launch in self.launches]
 
     def places(self, without: Assessment | None, *, lasting: bool = False) -> list[Placement]:
         """Return the current and planned placements of the replicas.
@@ -253,10 +252,8 @@ class Buyer:
         Args:
             lasting: Not of those that stand in, which go again.
         """
-        stay = [s for s in (*self.machines.good, *self.machines.replaced) if s is not without]
-        taken = [(s.slot, s.placement) for s in stay]
-        taken += [(launch.slot, launch.offer.placement) for launch in self.launches]
-        return [place for slot, place in taken if not (lasting and is_stand_in(slot))]
+        placed = self._placed(without)
+        return [place for slot, place in placed if not (lasting and is_stand_in(slot))]
 
     def price(self, replica: Assessment) -> float:
         """Return a machine's price: today's if known, else that of its order."""

@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
-from fogft.model.groups import BLOCK, Group, group_of, replica_hash
+from fogft.model.groups import BLOCK, Group, group_of, is_current
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Observed
@@ -141,7 +141,7 @@ def _unwanted(
         return replica.why
     if slot // BLOCK not in blocks:
         return Reason(Cause.NO_GROUP)
-    if machine.spec_hash != replica_hash(spec, slot):
+    if not is_current(spec, machine):
         return _OUTDATED
     return None
 

@@ -109,12 +109,7 @@ def _end_replaced(
         left -= 1
     replaced = sorted(
         (s for s in machines.replaced if s is not first and s.id not in held),
-        key=lambda s: (
-            s.may_serve,
-            s.marked_at,
-            s.slot not in ready_slots,
-            s.id,
-        ),
+        key=lambda s: (s.may_serve, s.marked_at, s.slot not in ready_slots, s.id),
     )
     ended = chooser.out.ids
     coming = sum(not s.ever_ready for s in machines.good if s.id not in ended)
@@ -154,13 +149,10 @@ class _Chooser:
     def end_lost(self, replica: Assessment, history: History) -> None:
         """A lost one ends once it is replaced, or at once when it cannot serve."""
         enough = len(self._pillars) >= self._wanted
-        if enough or not replica.ever_ready or self._superseded(replica, history):
+        later_served = history.served(replica.slot) > replica.id.generation
+        superseded = later_served and replica.verdict is Verdict.UNRESPONSIVE
+        if enough or superseded or not replica.ever_ready:
             self._go(replica, replica.why or Reason(Cause.NOT_WANTED))
-
-    def _superseded(self, replica: Assessment, history: History) -> bool:
-        """Whether a later launch of its slot has served: its own turn is over."""
-        later = history.served(replica.slot) > replica.id.generation
-        return later and replica.verdict is Verdict.UNRESPONSIVE
 
     def end_some(
         self, replicas: Iterable[Assessment], count: int, cause: Cause, *, coming: int = 0

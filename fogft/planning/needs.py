@@ -69,7 +69,7 @@ def _replacement(
             used = {s.slot for s in (*here.good, *here.replaced)}
             taken = {s.slot for s in here.good}
             free = replica.slot not in taken and group.owns(replica.slot)
-            slot = replica.slot if free else _lowest_free(group, used)
+            slot = replica.slot if free else _lowest_free(group.first_slot, used)
             return [Need(slot, _replaces(replica), group, replica)]
     return []
 
@@ -84,35 +84,29 @@ def _missing(
         for s in machines.lost
         if s.slot not in used and group.owns(s.slot) and not is_stand_in(s.slot)
     ]
-    lost_slots = {s.slot for s in vacant}
     for replica in vacant:
         if missing > 0 and replica.slot not in used:
             used.add(replica.slot)
             missing -= 1
             yield Need(replica.slot, _replaces(replica), group, replica)
-    used |= lost_slots
+    used |= {s.slot for s in vacant}
     for _ in range(missing):
-        slot = _lowest_free(group, used)
+        slot = _lowest_free(group.first_slot, used)
         used.add(slot)
-        yield Need(slot, _vacancy(slot, history), group)
+        before = history.generation(slot)
+        follows = Reason(Cause.FOLLOWS, replica=f"{slot}.{before}")
+        yield Need(slot, follows if before else Reason(Cause.NEW_SLOT), group)
 
 
 def stand_in(group: Group, used: Collection[int]) -> Need:
     """Return the launch of an on-demand machine that serves until a spot one does."""
-    slot = next(slot for slot in itertools.count(group.first_stand_in) if slot not in used)
+    slot = _lowest_free(group.first_stand_in, used)
     return Need(slot, Reason(Cause.STANDS_IN), group, stands_in=True)
 
 
-def _lowest_free(group: Group, used: set[int]) -> int:
-    return next(slot for slot in itertools.count(group.first_slot) if slot not in used)
+def _lowest_free(first: int, used: Collection[int]) -> int:
+    return next(slot for slot in itertools.count(first) if slot not in used)
 
 
 def _replaces(replica: Assessment) -> Reason:
     return Reason(Cause.REPLACES, replica=replica.id.short, because=because(replica.why))
-
-
-def _vacancy(slot: int, history: History) -> Reason:
-    generation = history.generation(slot)
-    if not generation:
-        return Reason(Cause.NEW_SLOT)
-    return Reason(Cause.FOLLOWS, replica=f"{slot}.{generation}")

@@ -16,9 +16,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 
-from fogft.model.groups import replica_hash
+from fogft.model.groups import is_current, replica_hash
 from fogft.model.reason import Cause, Reason, because
-from fogft.model.replica import LinkState, Machine
+from fogft.model.replica import LinkState
 from fogft.model.spec import PoolSpec
 from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment, Health, Verdict
@@ -94,32 +94,22 @@ def differs(spec: PoolSpec, good: PoolSpec, slots: Iterable[int]) -> bool:
     return any(replica_hash(spec, slot) != replica_hash(good, slot) for slot in slots)
 
 
-def is_new(spec: PoolSpec, good: PoolSpec, machine: Machine) -> bool:
-    """Whether a machine runs the new version, unlike the last good file's."""
-    wanted = replica_hash(spec, machine.id.slot)
-    return machine.spec_hash == wanted != replica_hash(good, machine.id.slot)
-
-
 def fault(
     spec: PoolSpec, good: PoolSpec, health: Health, history: History, began_at: float
 ) -> Reason | None:
-    """Return the proof that the new version is bad; None without one.
+    """Return the proof that the new version is bad, since it began; None without one.
 
-    Args:
-        spec: The file that is being applied.
-        good: The last good one.
-        health: The pool, judged by `spec`.
-        history: What happened.
-        began_at: When the update began.
+    The pool is judged by `spec`, the file that is being applied.
     """
     if spec is good:
         return None
-    new = [judged for judged in health.replicas if is_new(spec, good, judged.machine)]
-    old = [j for j in health.replicas if j.machine.spec_hash == replica_hash(good, j.id.slot)]
+    old = [judged for judged in health.replicas if is_current(good, judged.machine)]
+    current = [judged for judged in health.replicas if is_current(spec, judged.machine)]
+    new = [judged for judged in current if judged not in old]
     for judged in new:
         if why := _does_not_start(judged):
             return Reason(Cause.REPLICA_FAILS, replica=judged.id.short, because=(why,))
-    if why := _errors(new, [judged for judged in old if judged not in new]):
+    if why := _errors(new, old):
         return why
     if differs(spec, good, list(history.generations) or [0]):
         return _launches_fail(history, began_at)
@@ -199,7 +189,7 @@ def is_whole(
     return all(
         judged.serving
         and judged.verdict is Verdict.GOOD
-        and judged.machine.spec_hash == replica_hash(spec, judged.id.slot)
+        and is_current(spec, judged.machine)
         and not _settles(history, judged, now, settle_s)
         for judged in stay
     )
@@ -217,30 +207,21 @@ def describe(
     """Return the update in progress, or the one given up; None without one.
 
     Args:
-        spec: The file in force: after a rollback the good one.
+        spec: The file in force, by which `health` was judged: after a rollback the good one.
         good: The last good one; None before a pool was first ready.
-        trial: What is remembered of the file applied last.
-        health: The pool, judged by `spec`.
-        wanted: How many replicas should serve.
     """
     if good is None:
         return None
-    current = [
-        judged.machine.spec_hash == replica_hash(spec, judged.id.slot) for judged in health.replicas
-    ]
-    done = sum(
-        judged.serving and is_current
-        for judged, is_current in zip(health.replicas, current, strict=True)
-    )
-    done = min(done, wanted)
+    outdated = [judged for judged in health.replicas if not is_current(spec, judged.machine)]
+    serving = sum(judged.serving for judged in health.replicas if judged not in outdated)
+    done = min(serving, wanted)
     if trial.fault:
-        back = all(current) and done >= wanted
+        back = not outdated and done >= wanted
         state = UpdateState.ROLLED_BACK if back else UpdateState.STOPPED
         return Update(state, done, wanted, trial.fault)
     # Of one and the same file they differ where another fogft has launched them.
-    stay = [judged.verdict is Verdict.GOOD for judged in health.replicas]
-    outdated = any(good and not now for good, now in zip(stay, current, strict=True))
-    if not outdated and not differs(spec, good, [judged.id.slot for judged in health.replicas]):
+    is_same = not differs(spec, good, [judged.id.slot for judged in health.replicas])
+    if is_same and all(judged.verdict is not Verdict.GOOD for judged in outdated):
         return None
     return Update(UpdateState.IN_PROGRESS, done, wanted)
 
@@ -253,9 +234,7 @@ def is_settling(machines: Classification, now: float) -> bool:
     if not any(s.is_outdated for s in machines.replaced):
         return False
     return any(
-        (ready_at := s.record.first_ready_at if s.record else None) is not None
-        and 0 <= now - ready_at < SETTLE_S
-        for s in machines.good
+        s.was_ready_for(0.0, now) and not s.was_ready_for(SETTLE_S, now) for s in machines.good
     )
 
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from fogft.model.groups import group_of, groups_of, is_stand_in, replica_hash
+from fogft.model.groups import group_of, groups_of, is_current, is_stand_in
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import Machine, Observed, Offer, ReplicaId
+from fogft.model.replica import Observed, Offer, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.planner import PlannedEnd
@@ -24,7 +24,7 @@ def started(
     """Return, by the slot of a planned stand-in, the start of a standby in its place."""
     groups = groups_of(spec)
     prices = {(o.group, o.placement): o for o in observed.offers}
-    left = [m for m in observed.standbys if m.id not in observed.ending and _is_current(spec, m)]
+    left = [m for m in observed.standbys if m.id not in observed.ending and is_current(spec, m)]
     found: dict[int, PlannedLaunch] = {}
     for planned in launches:
         if not is_stand_in(planned.slot):
@@ -54,7 +54,7 @@ def stopped(
     for end in ends:
         machine, group = machines.get(end.id), group_of(groups, end.id.slot)
         enough = end.reason.cause is Cause.ENOUGH_SPOT and not (machine and machine.placement.spot)
-        if machine is not None and enough and room[group.name] > 0 and _is_current(spec, machine):
+        if machine is not None and enough and room[group.name] > 0 and is_current(spec, machine):
             room[group.name] -= 1
             offer = Offer(machine.placement, machine.usd_per_hour)
             found[end.id] = PlannedLaunch(end.id.slot, end.id.generation, offer, end.reason)
@@ -74,12 +74,8 @@ def superfluous(
             continue
         group = group_of(groups, machine.id.slot)
         room[group.name] -= 1
-        if not _is_current(spec, machine):
+        if not is_current(spec, machine):
             ends.append((machine.id, Reason(Cause.OUTDATED)))
         elif room[group.name] < 0:
             ends.append((machine.id, Reason(Cause.NOT_WANTED)))
     return ends
-
-
-def _is_current(spec: PoolSpec, machine: Machine) -> bool:
-    return machine.spec_hash == replica_hash(spec, machine.id.slot)

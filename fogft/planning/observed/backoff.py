@@ -80,11 +80,8 @@ def recently_failed(history: History, now: float) -> Mapping[str, Backoff]:
 
     Only the last failure counts.
     """
-    return _recent(_supplies(history, now))
-
-
-def _recent(supplies: Mapping[str, _Supply]) -> Mapping[str, Backoff]:
-    last = {supply: one.bad[-1] for supply, one in supplies.items() if one.bad}
+    found = _supplies(history, now).items()
+    last = {supply: one.bad[-1] for supply, one in found if one.bad}
     return {
         supply: Backoff(failure.at + FORGIVE_S, 1, failure.cause, since=failure.at)
         for supply, failure in last.items()
@@ -183,7 +180,7 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
         since = [pause.since for pause in (*pauses.values(), *filter(None, [everywhere]))]
         times.append(max(since, default=-NEVER) + EAGER_S)
     if restless:
-        times += [pause.until for pause in _recent(supplies).values()]
+        times += [one.bad[-1].at + FORGIVE_S for one in supplies.values() if one.bad]
     if waits or restless:  # a stand-in does not return to where one was just lost
         times += lost_lately(history, now).values()
     return min([at for at in times if at > now], default=NEVER)

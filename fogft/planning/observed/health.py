@@ -14,7 +14,7 @@ import math
 from enum import Enum
 from typing import NamedTuple
 
-from fogft.model.groups import replica_hash
+from fogft.model.groups import is_current
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
@@ -193,7 +193,7 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
     """
     if link is None or link.state is not _UP or machine.phase is not _RUNNING:
         return False
-    if machine.spec_hash != replica_hash(spec, machine.id.slot):
+    if not is_current(spec, machine):
         return bool(link.ready)
     wanted = spec.proxied_names
     if spec.discovered and not spec.services and spec.discovered_by != machine.spec_hash:

@@ -11,6 +11,7 @@ failures (`backoff`).
 
 from __future__ import annotations
 
+import copy
 from bisect import insort
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -50,7 +51,6 @@ MOVING = frozenset({EventKind.CLOCK, EventKind.SLEPT})
 TOLD_ONLY = frozenset({EventKind.UPDATING, EventKind.UPDATE_STOPPED, EventKind.PROXY_REPLACED})
 OF_NO_REPLICA = MOVING | TOLD_ONLY
 CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
-_ORDERS = frozenset({EventKind.LAUNCH, EventKind.DRAINING, EventKind.UNDRAINED})
 
 
 @dataclass(frozen=True)
@@ -82,6 +82,9 @@ class Event:
 _NO_FAULT = Reason(Cause.ERROR)
 OWN_FAULTS = frozenset({Cause.SETUP, Cause.NOT_SET_UP, Cause.NOT_READY})
 LAUNCHES_KEPT_S = 3600.0
+# A loss counts against the location where the replica was never ready for so long.
+YOUNG_S = 60.0
+KEPT_S = 86_400.0
 _PROOFS = 2 * MAX_REPLICAS  # of a version's failed launches
 
 
@@ -142,11 +145,11 @@ class History:
     def __init__(self, events: Iterable[Event] = ()) -> None:
         self._records: dict[tuple[int, int], Record] = {}
         self._open: dict[tuple[int, int], Record] = {}
-        self._generations: dict[int, int] = {}
+        self.generations: dict[int, int] = {}  # slot -> highest ever used
         self._served: dict[int, int] = {}  # slot -> the highest generation that was ever ready
-        self._failures: dict[str, list[Failure]] = {}
+        self.failures: dict[str, list[Failure]] = {}  # by supply, oldest first
         self._proven_at: dict[str, float] = {}
-        self._losses: dict[str, list[float]] = {}
+        self.losses: dict[str, list[float]] = {}  # when, by location, oldest first
         self._lives: dict[str, tuple[Record, ...]] = {}  # of spot machines, by location
         self._of_lives: dict[str, tuple[float, float]] = {}  # what follows from them, as of when
         self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
@@ -165,20 +168,21 @@ class History:
                 self._move(event)
             return
         key = (event.slot, event.generation)
-        if event.generation > self._generations.get(event.slot, -1):
-            self._generations[event.slot] = event.generation
+        if event.generation > self.generations.get(event.slot, -1):
+            self.generations[event.slot] = event.generation
         record = self._records.get(key)
         starts = event.kind is EventKind.LAUNCH
         if record is None or (starts and record.closed is EventKind.ENDED):  # a standby's, again
             record = Record(event.slot, event.generation, event.at, event.location)
             record.on_demand, record.version = event.on_demand, event.version
             self._records[key] = record
-            if event.kind is EventKind.LAUNCH:
-                self._note_launch(record)
+            if starts:
+                kept = self._launches[record.on_demand]
+                lately = [r for r in kept if r.launched_at > record.launched_at - LAUNCHES_KEPT_S]
+                self._launches[record.on_demand] = [*lately, record]
             if not record.on_demand:
-                kept = self._lives.get(record.location, ())
-                self._lives[record.location] = (*kept, record)
-        if event.kind is EventKind.LAUNCH:  # a second one: it was thought gone, and is listed
+                self._lives[record.location] = (*self._lives.get(record.location, ()), record)
+        if starts:  # a second one: it was thought gone, and is listed
             record.closed, record.ending = None, False
         else:
             self._update(record, event)
@@ -187,11 +191,6 @@ class History:
         else:
             self._open.pop(key, None)
 
-    def _note_launch(self, record: Record) -> None:
-        late = record.launched_at - LAUNCHES_KEPT_S
-        kept = self._launches[record.on_demand]
-        self._launches[record.on_demand] = [*(r for r in kept if r.launched_at > late), record]
-
     def _move(self, event: Event) -> None:
         """Let all that is remembered be later, so that durations stay what they were."""
         by_s = event.by_s
@@ -199,11 +198,11 @@ class History:
             self._set.append((event.at - by_s, by_s))
         for record in self._records.values():
             record.move(by_s)
-        self._failures = {
+        self.failures = {
             supply: [Failure(f.at + by_s, f.cause) for f in failures]
-            for supply, failures in self._failures.items()
+            for supply, failures in self.failures.items()
         }
-        self._losses = {p: [at + by_s for at in losses] for p, losses in self._losses.items()}
+        self.losses = {p: [at + by_s for at in losses] for p, losses in self.losses.items()}
         self._proven_at = {supply: at + by_s for supply, at in self._proven_at.items()}
         self._of_lives = {}
 
@@ -215,18 +214,12 @@ class History:
 
     def followed_by(self, events: Iterable[Event]) -> History:
         """Return a copy of this history with launches and marks added."""
-        later = History()
+        later = copy.copy(self)
+        # Launches and marks change nothing else.
         later._records, later._open = dict(self._records), dict(self._open)
-        later._generations = dict(self._generations)
+        later.generations, later._launches = dict(self.generations), dict(self._launches)
         later._lives, later._of_lives = dict(self._lives), dict(self._of_lives)
-        # Launches and marks change none of these.
-        later._failures, later._proven_at = self._failures, self._proven_at
-        later._losses, later._served = self._losses, self._served
-        later._fruitless, later._ready_versions = self._fruitless, self._ready_versions
-        later._launches = dict(self._launches)
         for event in events:
-            if event.kind not in _ORDERS:
-                raise ValueError(f"`{event.kind.value}` is not an order of fogft")
             key = (event.slot, event.generation)
             if key in later._records:
                 later._records[key] = replace(later._records[key])
@@ -270,16 +263,17 @@ class History:
                 kept = self._lives[record.location]
                 self._lives[record.location] = tuple([r for r in kept if r is not record])
         elif kind is EventKind.GONE:
-            if died_young(record, event):
+            ready_at = record.first_ready_at
+            if ready_at is None or event.at - ready_at < YOUNG_S:
                 self._fail(record, event)
-            insort(self._losses.setdefault(record.location, []), event.at)
+            insort(self.losses.setdefault(record.location, []), event.at)
         record.closed = kind
         record.closed_at = event.at
 
     def _fail(self, record: Record, event: Event) -> None:
         failure = Failure(event.at, fault_of(event.reason))
         self._of_lives.pop(record.location, None)
-        insort(self._failures.setdefault(record.supply, []), failure, key=_AT)
+        insort(self.failures.setdefault(record.supply, []), failure, key=_AT)
 
     def record(self, slot: int, generation: int) -> Record | None:
         """Return the record of a launch."""
@@ -292,8 +286,8 @@ class History:
     def places_alone(self) -> History:
         """Return the facts about locations alone, as for a new pool."""
         anew = History()
-        anew._failures, anew._proven_at = self._failures, self._proven_at
-        anew._lives, anew._losses = self._lives, self._losses
+        anew.failures, anew._proven_at = self.failures, self._proven_at
+        anew._lives, anew.losses = self._lives, self.losses
         return anew
 
     @property
@@ -303,7 +297,7 @@ class History:
 
     def generation(self, slot: int) -> int:
         """Return the highest generation ever used in a slot; 0 for none."""
-        return self._generations.get(slot, 0)
+        return self.generations.get(slot, 0)
 
     def served(self, slot: int) -> int:
         """Return the highest generation of a slot that was ever ready; 0 for none."""
@@ -328,16 +322,6 @@ class History:
         """Return the launches of one market of the last hour before its latest one."""
         return self._launches[on_demand]
 
-    @property
-    def generations(self) -> Mapping[int, int]:
-        """Slot -> highest generation ever used."""
-        return self._generations
-
-    @property
-    def failures(self) -> Mapping[str, list[Failure]]:
-        """Supply -> its failures, oldest first."""
-        return self._failures
-
     def proven_at(self, supply: str) -> float:
         """Return when a replica there last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
@@ -354,23 +338,9 @@ class History:
         """
         for location, lives in self._lives.items():
             if self._of_lives.get(location, (None, 0.0))[0] != at:
-                failures = self._failures.get(location, ())
+                failures = self.failures.get(location, ())
                 self._of_lives[location] = at, work_out(lives, failures, at)
         return {place: self._of_lives[place][1] for place in self._lives}
-
-    @property
-    def losses(self) -> Mapping[str, list[float]]:
-        """Location -> times of losses there, oldest first."""
-        return self._losses
-
-
-YOUNG_S = 60.0
-KEPT_S = 86_400.0
-
-
-def died_young(record: Record, event: Event) -> bool:
-    """Whether a loss counts against the location: never ready, or ready for under a minute."""
-    return record.first_ready_at is None or event.at - record.first_ready_at < YOUNG_S
 
 
 def compacted(
