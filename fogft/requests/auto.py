@@ -152,8 +152,12 @@ class Auto(Learning):
                 self._tokens -= 1.0
                 candidates = free
                 self.hedges += 1
-            elif all(self._replicas[c].doubted for c in candidates):
-                return ()
+            else:
+                wait_s = min(self._replicas[c].wait_s(now) for c in candidates)
+                longer_s = wait_s - (now - min(open.values()))
+                if longer_s > 0.0:  # than it has waited here: by half the difference they meet
+                    self._look(now + max(_RETRY_S, longer_s / 2))
+                    return ()
         best = self._best(request, candidates, now)
         known = self._replicas[best]
         known.asked(request, now)

@@ -108,6 +108,12 @@ class ReplicaLoad:
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
         return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s)
 
+    def wait_s(self, now: float) -> float:
+        """Return how long a request that arrives now is expected to wait: endless if in doubt."""
+        if self.doubted:
+            return NEVER
+        return 0.0 if self.free(now) else self.service_s * self.ahead(now) / max(1, self._slots)
+
     @property
     def oldest_begun(self) -> float:
         """When the oldest of our open requests there began; infinity for none."""

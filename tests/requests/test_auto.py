@@ -212,6 +212,19 @@ def test_what_a_doubted_replica_has_goes_to_another_though_that_is_busy_and_cost
     assert policy.first(B, (1, 2), 31.4)[0] == 2
 
 
+def test_it_goes_to_a_queue_once_it_has_waited_for_as_long_as_it_would_there():
+    """Sooner it takes from those that wait there more than it gains."""
+    policy = learned(r1=0.1, r2=0.1)
+    policy.first(A, (1,), 31.0)
+    for n in range(5):
+        policy.first(bytes([n]) * 16, (2,), 31.25)
+    policy.look_at = NEVER
+    assert policy.more(A, {1: 31.0}, (2,), 31.3) == ()
+    assert policy.look_at == pytest.approx(31.4)  # half of what is between 0.5 and 0.3 s
+    assert policy.more(A, {1: 31.0}, (2,), 31.49) == ()
+    assert policy.more(A, {1: 31.0}, (2,), 31.51) == (2,)
+
+
 def test_one_that_never_ends_what_another_answers_is_tried_once_a_second_not_once_for_all():
     """Else it would be found out by nobody: it has had no request alone, and gets no more."""
     policy = learned(r1=0.01, r2=0.01)

@@ -83,8 +83,8 @@ class PlanClient(Node):
         steady = Clock(clock_type=ClockType.STEADY_TIME)  # a node's own is the system's
         timer = self.create_timer(self._period_s, self.ask, clock=steady)
         while time.monotonic() < end and not self.enough:
-            # Short: in the wheels' Fast DDS a wait goes by the system's clock. One that began before
-            # that was set back would last until it is that late again, and no timer would run.
+            # Short: in the wheels' Fast DDS a wait goes by the system's clock. One that began
+            # before that was set back lasts until it is that late again, and no timer runs.
             executor.spin_once(timeout_sec=0.05)
             self.give_up()
         timer.cancel()

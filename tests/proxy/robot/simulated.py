@@ -33,6 +33,18 @@ def lognormal(median_s: float, sigma: float, stalls: float = 0.0, stall_s: float
     return sample
 
 
+class Draws:
+    """Random numbers that depend on the request and on how often it has run, not on where."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._runs: dict[bytes, int] = {}
+
+    def __call__(self, payload: bytes) -> random.Random:
+        run = self._runs[payload] = self._runs.get(payload, 0) + 1
+        return random.Random(f"{self._seed} {payload!r} {run}")
+
+
 class SimulatedService:
     """A service that works on all its requests at once, or on one after the other."""
 
@@ -41,6 +53,7 @@ class SimulatedService:
         self.service_time = service_time
         self.serial = serial
         self.source = random.Random(seed)
+        self.draws: Draws | None = None  # in place of the source
         self.free_at = 0.0
         self.hangs_until = 0.0
         self.ran = 0
@@ -48,7 +61,8 @@ class SimulatedService:
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         self.ran += 1
         now = max(self.world.now, self.hangs_until)
-        end = (max(now, self.free_at) if self.serial else now) + self.service_time(self.source)
+        source = self.source if self.draws is None else self.draws(payload)
+        end = (max(now, self.free_at) if self.serial else now) + self.service_time(source)
         self.free_at = end
         self.world.at(end, lambda: self._end(payload, on_response))
         return self.ran
