@@ -45,7 +45,6 @@ def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> No
 
 
 def _replaced(path: Path, data: bytes, *, durable: bool) -> int:
-    """Replace a file; return the new one, open."""
     temporary = ""
     try:
         descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
@@ -75,8 +74,7 @@ def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
 class Report:
     """A JSON file that says how things are now, also where nothing else can be written.
 
-    Without room or a descriptor, or where the folder became read-only, the last one is written
-    over in place: it stays open. Whoever reads it at that very moment may find it damaged.
+    Then the last one, which stays open, is written over: a reader may then find it damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -154,21 +152,15 @@ def read_or(path: Path, otherwise: T) -> T:
 
 
 class Lock:
-    """An exclusive lock on a file, held until `release` or the end of the process.
-
-    The file says which process holds it, for where the kernel's list of locks does not.
-    """
+    """An exclusive lock on a file, which says its holder, until `release` or the process ends."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._descriptor: int | None = None
 
     def acquire(self, *, wait: bool) -> bool:
-        """Take the lock; without `wait`, return False where another keeps it. Raises OSError.
-
-        Whoever only looks whether it is held (`is_locked`) holds it for an instant, so one
-        refusal proves nothing: it is tried for a moment.
-        """
+        """Take the lock; without `wait`, return False where another keeps it. Raises OSError."""
+        # `is_locked` holds it for an instant, so one refusal proves nothing.
         until = time.monotonic() + _PATIENCE_S
         while not self.take(fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB):
             if time.monotonic() > until:
@@ -249,8 +241,8 @@ def not_opened(path: Path, error: OSError) -> StateError:
 def holder(lock: Path, *, said: bool = True) -> int | None:
     """Return the process that holds a lock; None for nobody.
 
-    By the kernel's own list; in a container, whose overlays that list may know by another device,
-    by what the holder wrote, unless that is not to be believed (`said`).
+    By the kernel's own list; in a container, where it may name another device, by what the holder
+    wrote, if that is to be believed (`said`).
     """
     try:
         stat = lock.stat()

@@ -6,12 +6,7 @@ from collections.abc import Iterable
 
 
 class FogftError(Exception):
-    """A failure that the user can understand and act on.
-
-    Args:
-        message: What happened, and where. Names stand in backquotes.
-        hint: What to do about it; empty when nothing can be said.
-    """
+    """A failure that the user can understand and act on; `hint` says how, if that can be said."""
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message)

@@ -54,18 +54,9 @@ def _backing_off(reason: Reason) -> str:
     return f"backing off for {reason.seconds:.0f} s more after {reason.count} x {_names(reason)}"
 
 
-def _more_errors(reason: Reason) -> str:
-    new, old = reason.because
-    return (
-        f"{new.count} of {new.of} requests to the new version failed, "
-        f"{old.count} of {old.of} to the old one"
-    )
-
-
 def _clock_set(reason: Reason) -> str:
     set_s = reason.seconds or 0.0
-    where = "forward" if set_s > 0 else "back"
-    said = f"the clock was set {where} by {abs(set_s):.0f} s"
+    said = f"the clock was set {'forward' if set_s > 0 else 'back'} by {abs(set_s):.0f} s"
     return " and ".join([said, *map(words, reason.because)])
 
 
@@ -87,16 +78,8 @@ def _over_budget(reason: Reason) -> str:
 def _over_cap(reason: Reason) -> str:
     if reason.usd_per_hour is None:
         return "`max_usd_per_hour` allows no more"
-    cap = f"${reason.limit_usd_per_hour:g}/h"
-    return (
-        f"${reason.usd_per_hour:.3f}/h is over the cap of {cap}: the most "
-        "expensive replicas are ended one by one"
-    )
-
-
-def _other_market(reason: Reason) -> str:
-    other = "on demand" if reason.name == "spot" else "spot"
-    return f"{reason.name}, where slot {reason.slot} is {other}"
+    over = f"${reason.usd_per_hour:.3f}/h is over the cap of ${reason.limit_usd_per_hour:g}/h"
+    return f"{over}: the most expensive replicas are ended one by one"
 
 
 def _worse_score(reason: Reason) -> str:
@@ -189,7 +172,9 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     ),
     Cause.OLD_BEFORE_NEW: "slot {r.slot}: no room for both, so old before new",
     Cause.OTHER_KIND: "no machine of this kind is needed",
-    Cause.OTHER_MARKET: _other_market,
+    Cause.OTHER_MARKET: lambda r: (
+        f"{r.name}, where slot {r.slot} is {'on demand' if r.name == 'spot' else 'spot'}"
+    ),
     Cause.WORSE_SCORE: _worse_score,
     Cause.CROWDED: ("spread: `{r.location}` already has {r.count} when slot {r.slot} is placed"),
     Cause.NEVER_READY: _never_ready,
@@ -216,14 +201,17 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.REPLICA_FAILS: "replica {r.replica}{after}",
     Cause.TYPES_DIFFER: lambda r: r.words or "its types differ between robot and replica",
     Cause.RUN_ENDS: "`run` exited {r.count} times{in_brackets}",
-    Cause.MORE_ERRORS: _more_errors,
+    Cause.MORE_ERRORS: (
+        "{r.because[0].count} of {r.because[0].of} requests to the new version failed, "
+        "{r.because[1].count} of {r.because[1].of} to the old one"
+    ),
     Cause.LAUNCHES_FAIL: "{r.count} launches failed ({names}), and none served",
     Cause.CLOUD_UNREACHABLE: "the cloud cannot be reached: nothing is launched or ended",
     Cause.NO_ANSWER: "the cloud did not answer: {r.words}",
     Cause.NO_PRICES: "no prices are available: {r.words}",
     Cause.UPLINK_SUSPECTED: "all links are silent at once: the robot's uplink is suspected",
     Cause.NOBODY_HEARD: "nothing is ended while no replica can be reached",
-    Cause.ENDS_SOON: ("the pool shuts down in {minutes:.0f} min (`max_hours`)"),
+    Cause.ENDS_SOON: "the pool shuts down in {minutes:.0f} min (`max_hours`)",
     Cause.CLOCK_SET: _clock_set,
     Cause.CLOCK_DOUBTED: (
         "the clock was set by {r.seconds:+.0f} s: nothing is launched or ended because of it; "

@@ -15,6 +15,7 @@ from fogft.cli import options, output
 from fogft.cli.options import DEFAULT_FILE, Cloud, PoolArgument, PoolFile, PoolOption, Yes
 from fogft.errors import FogftError
 from fogft.pool.commands import composition
+from fogft.pool.folder.paths import PoolPaths
 
 if TYPE_CHECKING:
     from fogft.model.reason import Reason
@@ -76,7 +77,6 @@ def up(
     from fogft.planning.rollout import UpdateState
     from fogft.pool.commands import preview, startup, status
     from fogft.pool.commands.outcome import Awaited, Outcome
-    from fogft.pool.folder.paths import PoolPaths
 
     order = preview.order(file, cloud, told=output.say)
     paths = PoolPaths.of(order.spec.name)
@@ -90,9 +90,7 @@ def up(
     if order.costs_money and may_cost_more and not yes:
         count = len(order.launches) if order.is_new else 0
         machines = f"{count} machine{'' if count == 1 else 's'}"
-        if not output.confirm(f"launch {machines} at these prices?" if count else "continue?"):
-            output.say("aborted: nothing was changed")
-            raise typer.Exit(1)
+        output.confirm(f"launch {machines} at these prices?" if count else "continue?")
     limit_s = timeout or (progress.REAL_LIMIT_S if order.costs_money else progress.LIMIT_S)
     if startup.start(order) and not order.is_new and not upgrades:
         output.say("the pool had no manager: started a new one")
@@ -208,10 +206,8 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     store = composition.store_of(name)
     elsewhere = store.paths.exported.exists()
     paid = not elsewhere and store.identity().cloud != composition.LOCAL
-    asks = paid and not yes and output.is_terminal(sys.stdin)
-    if asks and not output.confirm(f"shut down `{store.name}` and all its machines?"):
-        output.say("aborted: nothing was changed")
-        raise typer.Exit(1)
+    if paid and not yes and output.is_terminal(sys.stdin):
+        output.confirm(f"shut down `{store.name}` and all its machines?")
 
     def told(what: str) -> None:
         output.say(f"ended {what}")

@@ -15,6 +15,8 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import IO, TYPE_CHECKING, Any
 
+import typer
+
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
@@ -91,8 +93,8 @@ def error(message: str, hint_text: str = "") -> None:
         hint(hint_text)
 
 
-def confirm(question: str) -> bool:
-    """Ask a yes-or-no question on the terminal; anything but yes is no."""
+def confirm(question: str) -> None:
+    """Ask a yes-or-no question on the terminal; anything but yes ends the command."""
     if not is_terminal(sys.stdin):
         raise FogftError(
             "cannot ask for confirmation: there is no terminal",
@@ -100,7 +102,9 @@ def confirm(question: str) -> bool:
         )
     sys.stderr.write(f"{printable(question)} [y/N] ")
     sys.stderr.flush()
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        say("aborted: nothing was changed")
+        raise typer.Exit(1)
 
 
 def is_terminal(stream: IO[str]) -> bool:

@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from fogft.pool.folder.store import PoolStore
     from fogft.pool.manager.status import EventStatus
 
+_LISTED = (
+    *("answers", "ready", "target", "cloud", "usd_per_hour", "age_s", "manager_alive"),
+    *("proxy_alive", "file", "ended"),
+)
 _ANSWERS = {True: ("yes", "green"), False: ("no", "bold red"), None: ("?", "yellow")}
 
 
@@ -40,7 +44,7 @@ def list(as_json: AsJson = False) -> None:
             rows.append([name, output.cell("?", "bold red"), "?", "?", "?", "?", seen.message])
             continue
         status = seen.status
-        said = {key: value for key, value in seen.to_json().items() if key in _KEYS}
+        said = {key: value for key, value in seen.to_json().items() if key in _LISTED}
         found[name] = {"pool": name, **said, "error": ""}
         rows.append(
             [
@@ -62,12 +66,6 @@ def list(as_json: AsJson = False) -> None:
     else:
         output.say("no pools on this machine")
         output.hint("start one with `fogft up FILE`")
-
-
-_KEYS = frozenset(
-    {"answers", "ready", "target", "cloud", "usd_per_hour", "age_s", "manager_alive"}
-    | {"proxy_alive", "file", "ended"}
-)
 
 
 def events(
@@ -97,8 +95,13 @@ def events(
 
 def event_rows(store: PoolStore, count: int) -> Sequence[Sequence[str]]:
     """Return the last events as rows of a table, the oldest first."""
-    found = _last_events(store, count)
-    return [[_when(one.at), one.event, one.replica, one.location, one.detail] for one in found]
+    return [
+        [
+            time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(one.at)),
+            *(one.event, one.replica, one.location, one.detail),
+        ]
+        for one in _last_events(store, count)
+    ]
 
 
 def _last_events(store: PoolStore, count: int) -> Sequence[EventStatus]:
@@ -110,10 +113,6 @@ def _last_events(store: PoolStore, count: int) -> Sequence[EventStatus]:
         replace(event_status(e), location=places.get((e.slot, e.generation), ""))
         for e in history[-count:]
     ]
-
-
-def _when(at: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(at))
 
 
 def cost(pool: PoolArgument = None, as_json: AsJson = False, named: PoolOption = None) -> None:
@@ -166,10 +165,7 @@ def _show_costs(found: Sequence[Costs]) -> None:
             rows.append([costs.pool, "earlier", "", "", "", "", before])
         rows.extend(
             [
-                costs.pool,
-                one.day,
-                one.replica,
-                one.location,
+                *(costs.pool, one.day, one.replica, one.location),
                 f"{one.instance}{' spot' if one.spot else ''}",
                 f"{one.hours:.2f}",
                 price(one.usd).removeprefix("$"),

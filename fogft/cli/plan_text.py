@@ -72,12 +72,8 @@ def to_json(shown: PlanShown) -> dict[str, Any]:
             for replica in plan.replicas
         ],
         "cost": _cost_json(plan.cost),
-        "one_on_demand": None
-        if plan.single is None
-        else {
-            **_machine_json(plan.single[0]),
-            **_cost_json(plan.single[1]),
-        },
+        "one_on_demand": plan.single
+        and {**_machine_json(plan.single[0]), **_cost_json(plan.single[1])},
         "pool_is_cheapest": plan.is_cheapest,
         "availability": {
             "target": plan.target,
@@ -125,14 +121,11 @@ def _row(shown: PlanShown, one: Considered) -> list[str | Text]:
         f"{one.offer.usd_per_hour:.3f}",
         price_source(one.offer, shown.now) or "simulated",
         "?" if one.rtt_s is None else f"{one.rtt_s * 1000:.0f} ms",
-        "-" if one.losses_per_hour is None else _lost(one),
+        "-"
+        if one.losses_per_hour is None
+        else f"{'~' * one.losses_assumed}{one.losses_per_hour:.2f}/h",
         output.cell(words(one.why_not), "dim"),
     ]
-
-
-def _lost(one: Considered) -> str:
-    """Return how often spot machines are lost there; a `~` where that is assumed."""
-    return f"{'~' * one.losses_assumed}{one.losses_per_hour:.2f}/h"
 
 
 def price_source(offer: Offer, now: float) -> str:
@@ -154,9 +147,8 @@ def _summary(shown: PlanShown) -> list[str]:
         out.append(f"  ${extras:.3f}/h of it for disks and addresses")
     if shown.ready_p90_s is not None:
         out.append(
-            f"ready         within {shown.ready_p90_s:.0f} s of the order (p90 of "
-            f"{shown.launches} "
-            "launches; used as the recovery below)"
+            f"ready         within {shown.ready_p90_s:.0f} s of the order "
+            f"(p90 of {shown.launches} launches; used as the recovery below)"
         )
     for name, one in shown.traffic.items():
         out.append(
@@ -166,11 +158,10 @@ def _summary(shown: PlanShown) -> list[str]:
         )
     if plan.single is not None:
         offer, alone = plan.single
+        compared = ""
         if plan.cost.usd_per_hour:
             ratio = alone.usd_per_hour / plan.cost.usd_per_hour
             compared = f"; {ratio:.2f} times the pool's"
-        else:
-            compared = ""
         place = offer.placement
         where = f"{place.instance} at {place.location.rstrip('/')}"
         out.append(f"  one on-demand {where}: {_money(alone)}{compared}")
@@ -205,9 +196,9 @@ def _verdict(shown: PlanShown) -> list[str]:
 
 
 def _availability(shown: PlanShown) -> list[str]:
-    plan, assumed = shown.explanation, shown.explanation.assumed
+    plan = shown.explanation
+    assumed, levels, least = plan.assumed, plan.assumed.correlation, plan.expected
     target = "" if plan.target is None else f", target {plan.target:.6g}"
-    levels, least = assumed.correlation, plan.expected
     return [
         f"availability  {least.correlated:.6f} expected{target} "
         f"({least.independent:.6f} if replicas failed independently)",

@@ -46,14 +46,11 @@ def sweep(
         known = " that SkyPilot knows" if blind else ""
         output.done(f"every machine{known} belongs to a managed pool")
         if blind:
-            output.hint(
-                "no cloud could be asked about machines that SkyPilot has forgotten; "
-                "`sky check` tests the credentials"
-            )
+            asked = "no cloud could be asked about machines that SkyPilot has forgotten"
+            output.hint(f"{asked}; `sky check` tests the credentials")
         if cloud is None and not any(one.cloud == "sky" for one in found):
-            output.hint(
-                "no real cloud has been used from this machine; `--cloud sky` checks them anyway"
-            )
+            used = "no real cloud has been used from this machine"
+            output.hint(f"{used}; `--cloud sky` checks them anyway")
         return
     if not end:
         output.hint(
@@ -61,9 +58,8 @@ def sweep(
             "pool on this machine"
         )
         return
-    if not yes and not output.confirm(f"end {len(unowned)}?"):
-        output.say("aborted: nothing was changed")
-        raise typer.Exit(1)
+    if not yes:
+        output.confirm(f"end {len(unowned)}?")
     problems = [problem for one in found for problem in end_found(one, output.say)]
     if problems:
         hints = dict.fromkeys(problem.hint for problem in problems if problem.hint)
@@ -78,16 +74,11 @@ def _show(found: Swept) -> None:
         asked = ", ".join(f"`{name}`" for name in sorted(found.asked)) or "no cloud"
         output.say(f"checked all of SkyPilot's clouds, and {asked} directly")
     now = time.time()
-    rows = [
-        (
-            str(one.machine.id),
-            one.machine.placement.location,
-            f"{price(one.machine.usd_per_hour)}/h",
-            age(max(0.0, now - one.machine.launched_at)),
-            one.why,
-        )
-        for one in found.unowned
-    ]
+    rows = []
+    for one in found.unowned:
+        machine = one.machine
+        costs, age_s = f"{price(machine.usd_per_hour)}/h", max(0.0, now - machine.launched_at)
+        rows.append((str(machine.id), machine.placement.location, costs, age(age_s), one.why))
     if rows:
         names = ("MACHINE", "LOCATION", "$/H", "AGE", "WHY")
         width = output.width(sys.stdout)

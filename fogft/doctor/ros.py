@@ -218,9 +218,8 @@ def child_command(*arguments: str) -> list[str]:
 
 
 def _environ() -> dict[str, str]:
-    """Return our environment, with fogft importable also when it is run from its sources."""
-    ours = str(Path(fogft.__file__).parent.parent)
-    path = [ours, *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    ours = str(Path(fogft.__file__).parent.parent)  # or fogft's sources are not importable there
+    path = filter(None, (ours, os.environ.get("PYTHONPATH")))
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
 
 

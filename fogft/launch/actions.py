@@ -173,17 +173,15 @@ def _written(tree: Mapping[str, Any]) -> Path:
     return path
 
 
-def _as_block(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
-    """Write texts of several lines as blocks."""
-    style = "|" if "\n" in text else None
-    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
-
-
 class _Blocks(yaml.SafeDumper):
     """A dumper of our own: PyYAML's is shared with the rest of the launch."""
 
+    def represent_str(self, text: str) -> yaml.ScalarNode:
+        style = "|" if "\n" in text else None
+        return self.represent_scalar("tag:yaml.org,2002:str", text, style=style)
 
-_Blocks.add_representer(str, _as_block)
+
+_Blocks.add_representer(str, _Blocks.represent_str)
 
 
 def _running(

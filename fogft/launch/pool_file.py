@@ -18,11 +18,8 @@ _END = "END_OF_PARAMETERS"
 class NodeCommand:
     """How a node is started, all substitutions made.
 
-    Attributes:
-        package: Its ROS package; empty when `executable` is a path or a program's name.
-        arguments: After the executable, ``--ros-args`` included.
-        environ: Set for this node besides what the replica has.
-        files: Contents of parameter files, by the argument that names each.
+    `package` is empty when `executable` is a path or a program's name; `files` holds the contents
+    of parameter files, by the argument that names each.
     """
 
     package: str

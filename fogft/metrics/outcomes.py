@@ -52,10 +52,7 @@ class Outcomes:
     """Counts since the start. Replicas are numbers, as in `requests`.
 
     Attributes:
-        count: By `OUTCOMES_COUNTED`. ``sent`` are copies of requests; ``fallback_failed`` calls of
-            the fallback that came to nothing; ``rejected`` responses that were not ok;
-            ``undelivered`` those that ROS did not take. ``request_bytes`` are those of all
-            received requests together, ``response_bytes`` those of the first answers of replicas.
+        count: By `OUTCOMES_COUNTED`, which `fogft.metrics.proxies` describes.
         of: By replica.
         poisoned_at: When services last died over a request that was then given up; wall clock.
         trace: How each request ended, until somebody takes it; None where it is not wanted.

@@ -140,7 +140,6 @@ def _refusals(values: Iterator[tuple[float, dict[str, str]]]) -> Metric:
 
 
 def _by_slot(by_replica: Mapping[str, int]) -> dict[str, int]:
-    """Return counts by slot, of all its generations together."""
     found: dict[str, int] = {}
     for replica, count in by_replica.items():
         slot = replica.partition(".")[0]

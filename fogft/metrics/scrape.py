@@ -54,7 +54,7 @@ def histogram(
 
     Args:
         bounds: Upper bounds of the buckets, rising; one more is without bound.
-        counted: How many values fell into each bucket, the last one included; their sum; labels.
+        counted: How many values fell into each bucket; their sum; labels.
     """
     family = _family(name, "histogram", help, ())
     for counts, total, labels in counted:

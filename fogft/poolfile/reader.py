@@ -101,9 +101,9 @@ class Reader:
             return None
         if form.short and not isinstance(node.value, (Mapping, tuple)) and node.value is not None:
             children = {name: Node(node.value, node.line, node.key_line) for name in form.short}
-            below = section.below(key, children)
+            meant = Section(section.file, key, Node(children, node.line, node.key_line))
             try:
-                return Reader(self._rules).map(form.of, below)
+                return Reader(self._rules).map(form.of, meant)
             except SpecError as error:  # of the key that was written, not the one it stands for
                 raise section.error(key, error.what, error.hint) from None
         return self.map(form.of, section.section(key, form.hint))

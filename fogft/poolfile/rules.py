@@ -43,7 +43,6 @@ def service(section: Section, made: ServiceSpec) -> ServiceSpec:
 
 
 def _stateful(section: Section, made: ServiceSpec) -> None:
-    """A stateful service is asked of every replica, and its first answer is the answer."""
     if made.state is None:
         return
     what = "cannot be combined with `state`: every replica applies every request"

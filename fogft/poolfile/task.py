@@ -11,21 +11,8 @@ from fogft.poolfile.tree import Mistakes, Section, plain, shown
 
 # The task schema of SkyPilot 0.14.1, without the keys that it keeps for itself.
 TASK_KEYS = (
-    "name",
-    "workdir",
-    "event_callback",
-    "num_nodes",
-    "resources",
-    "file_mounts",
-    "setup",
-    "run",
-    "envs",
-    "secrets",
-    "managed_secrets",
-    "inputs",
-    "outputs",
-    "config",
-    "volumes",
+    *("name", "workdir", "event_callback", "num_nodes", "resources", "file_mounts", "setup", "run"),
+    *("envs", "secrets", "managed_secrets", "inputs", "outputs", "config", "volumes"),
     "api_server_access",
 )
 REFUSED_TASK_KEYS = {

@@ -23,12 +23,7 @@ Choice = TypeVar("Choice", bound=Enum)
 
 @dataclass(frozen=True)
 class Node:
-    """A value with its place.
-
-    Attributes:
-        value: A list is a tuple of nodes, a map one from text to nodes.
-        key_line: Where the key stands that leads to it; `line` if none does.
-    """
+    """A value with its place, and the place of the key that leads to it."""
 
     value: str | int | float | bool | tuple[Node, ...] | Mapping[str, Node] | None
     line: int
@@ -201,12 +196,6 @@ class Section:
             hint = VALUE_HINTS.get((type(members[0]), text)) or nearest(text, by_value)
             raise self.error(key, f"must be {allowed}, not {shown(text)}", hint)
         return by_value[text]
-
-    def below(self, key: str, children: Mapping[str, Node]) -> Section:
-        """Return a map below, given in a short form."""
-        node = self.children[key]
-        path = f"{self.path}.{key}" if self.path else key
-        return Section(self.file, path, Node(children, node.line, node.key_line))
 
     def section(self, key: str, hint: str = "") -> Section:
         """Return a map below; an empty one if the key is absent."""

@@ -1,9 +1,7 @@
 """Parse YAML into a tree with the line of every key and value.
 
-PyYAML's own loader forgets lines, keeps the last of two equal keys, and expands aliases
-without end. So its composer is used, and the nodes are converted here, with limits. What
-comes out can be written as JSON: dates stay the text that was written, and there are no
-other tags. Nothing is ever executed.
+PyYAML's own loader forgets lines, keeps the last of two equal keys, and expands aliases without
+end. What comes out can be written as JSON: dates stay the text that was written.
 """
 
 from __future__ import annotations
@@ -30,7 +28,9 @@ def tree(text: str, file: str) -> Node:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         line = mark.line + 1 if mark else 1
-        raise SpecError(f"{file}:{line}: not YAML: {_problem(error)}", _hint(error)) from None
+        words = ", ".join(filter(None, (error.problem, error.context))) or "unknown problem"
+        what = f"not YAML: {shown(words, 160)[1:-1]}"
+        raise SpecError(f"{file}:{line}: {what}", _hint(error)) from None
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         what = f"character {ascii(chr(error.character))[1:-1]} is not allowed"
@@ -162,11 +162,6 @@ class _Loader(yaml.SafeLoader):
     def _tagged(self, node: yaml.Node, path: str) -> SpecError:
         what = f"the tag {shown(node.tag.replace(_TAG, '!!'))} is not allowed"
         return self._error(node.start_mark.line + 1, path, what, "remove it")
-
-
-def _problem(error: yaml.MarkedYAMLError) -> str:
-    words = (part for part in (error.problem, error.context) if part)
-    return shown(", ".join(words) or "unknown problem", 160)[1:-1]
 
 
 def _hint(error: yaml.MarkedYAMLError) -> str:

@@ -1,14 +1,11 @@
-"""Plot a plan: each offer's price over its round trip, chosen offers filled.
-
-Not here: what is drawn (`fogft.planning.explain`).
-"""
+"""Plot a plan: each offer's price over its round trip, chosen offers filled."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fogft.simulation.plot import MARKS, check, save
+from fogft.simulation.plot import MARKS, save
 
 if TYPE_CHECKING:
     from fogft.pool.commands.plan import PlanShown
@@ -16,7 +13,6 @@ if TYPE_CHECKING:
 
 def draw(shown: PlanShown, path: Path) -> None:
     """Plot a plan to a PNG, SVG or PDF file. Offers of unknown distance are drawn apart."""
-    check(path)
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.8), layout="constrained")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import io
-import itertools
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -68,9 +67,7 @@ def _page(store: Any, now: float) -> str:
     seen = read(store.paths, now)
     status = seen.status
     spans = list(ready_spans(store.recent(sys.maxsize), now))
-    steps = _steps(spans)
-    known_s = now - steps[0][0] if steps else 0.0
-    up_s = sum(until - at for (at, n), (until, _) in itertools.pairwise(steps) if n)
+    known_s = now - min((at for _, at, _ in spans), default=now)
     costs = [one for one in read_all(home() / "costs") if one.uid == status.uid]
     days: dict[str, float] = {}
     for spent in (row for one in costs for row in one.spent):
@@ -80,8 +77,8 @@ def _page(store: Any, now: float) -> str:
         f"<p>{status.ready} of {status.target} replicas ready on {html.escape(status.cloud)}; "
         f"{price(sum(one.usd for one in costs))} spent; written {utc(now)}.</p>",
         "<h2>Availability</h2>",
-        f"<p>At least one replica was ready for {up_s / known_s:.4%} of the last {age(known_s)}, "
-        "for which events are kept.</p>"
+        f"<p>At least one replica was ready for {_covered_s(spans) / known_s:.4%} of the last "
+        f"{age(known_s)}, for which events are kept.</p>"
         if known_s
         else "<p>No replica has been ready yet.</p>",
         _figure(lambda axes: _draw_spans(axes, spans, now), 0.6 + 0.3 * len(spans))
@@ -130,30 +127,24 @@ def ready_spans(events: Iterable[Event], now: float) -> Iterator[tuple[str, floa
     """Yield each period in which a replica was ready: ``slot.generation``, start, end."""
     from fogft.planning.observed.history import EventKind
 
+    over = (EventKind.UNREADY, EventKind.ENDED, EventKind.GONE)
     since: dict[str, float] = {}
     for event in events:
         replica = f"{event.slot}.{event.generation}"
         if event.kind is EventKind.READY:
             since.setdefault(replica, event.at)
-        elif replica in since and event.kind in (
-            *(EventKind.UNREADY, EventKind.ENDED, EventKind.GONE),
-        ):
+        elif replica in since and event.kind in over:
             yield replica, since.pop(replica), event.at
     for replica, at in since.items():
         yield replica, at, now
 
 
-def _steps(spans: Sequence[tuple[str, float, float]]) -> list[tuple[float, int]]:
-    """Return how many replicas were ready from when on, the earliest first."""
-    changes = sorted(
-        [(at, 1) for _, at, _ in spans] + [(until, -1) for _, _, until in spans],
-        key=lambda change: (change[0], -change[1]),
-    )
-    found, count = [], 0
-    for at, by in changes:
-        count += by
-        found.append((at, count))
-    return found
+def _covered_s(spans: Sequence[tuple[str, float, float]]) -> float:
+    covered_s = latest = 0.0
+    for _, at, until in sorted(spans, key=lambda span: span[1]):
+        covered_s += max(0.0, until - max(at, latest))
+        latest = max(latest, until)
+    return covered_s
 
 
 def _draw_spans(axes: Any, spans: Sequence[tuple[str, float, float]], now: float) -> None:

@@ -52,7 +52,6 @@ def top(pool: PoolArgument = None, named: PoolOption = None) -> None:
 
 
 def _remember(latencies: dict[str, deque[float]], seen: Seen) -> None:
-    """Add what was just seen: the 99th percentile of each service, the round trip of each link."""
     now = {f"P99 {one.name}": one.counters.get("p99_s") for one in seen.status.services}
     now |= {f"RTT {one.slot}.{one.generation}": one.rtt_s for one in seen.status.replicas}
     for gone in latencies.keys() - now.keys():
