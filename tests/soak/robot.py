@@ -161,6 +161,7 @@ def _kill(*which: str) -> Damage:
     @contextlib.contextmanager
     def damage(world: World, fault: Fault) -> Iterator[None]:
         pids = [world.pid(what) for what in which]
+        world.during.began = time.monotonic()  # on a busy machine the last may have come late
         for number in (signal.SIGSTOP, signal.SIGKILL):
             for pid in pids:
                 os.kill(pid, number)
@@ -180,6 +181,7 @@ def _kill_all(world: World, fault: Fault) -> Iterator[None]:
 @contextlib.contextmanager
 def _kill_twice(world: World, fault: Fault) -> Iterator[None]:
     first = world.pid("proxy")
+    world.during.began = time.monotonic()
     os.kill(first, signal.SIGKILL)
     world.wait(lambda: lock_holder(world.paths.proxy_lock) not in (first, None), "taken over")
     time.sleep(1.0)
