@@ -104,8 +104,8 @@ def _show(report: Report) -> None:
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "simulated"
     output.data(
-        f"\n{report.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
-        f"{scenario.days:.4g} days. A VM is the cheapest on-demand one; N is {report.replicas}."
+        f"\n{scenario.replicas} replicas wanted; {len(scenario.seeds)} markets ({kind}) of "
+        f"{scenario.days:.4g} days. A VM is the cheapest on-demand one; N is {scenario.replicas}."
     )
     best = report.cheapest
     if best is None:

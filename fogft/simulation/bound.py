@@ -15,7 +15,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from fogft.simulation.timeline import Timeline
+from fogft.simulation.timeline import Timeline, of_changes
 
 HOUR_S = 3600.0
 
@@ -74,17 +74,11 @@ def _stays(
 
 def _spells(line: Timeline, level: int, length_s: float) -> Iterator[tuple[float, float]]:
     """Yield the times in which there is room for so many machines."""
-    ends = (at for at, _ in (*line.changes[1:], (math.inf, 0)))
-    spells = ((at, end) for (at, n), end in zip(line.changes, ends, strict=True) if n >= level)
-    begin = last = -1.0
-    for at, end in spells:
-        if at != last:
-            if last > begin:
-                yield begin, min(last, length_s)
-            begin = at
-        last = end
-    if last > begin and begin < length_s:
-        yield begin, min(last, length_s)
+    changes = of_changes(((at, int(n >= level)) for at, n in line.changes), length_s).changes
+    ends = [*(at for at, _ in changes[1:]), length_s]
+    for (begin, has_room), end in zip(changes, ends, strict=True):
+        if has_room and begin < length_s:
+            yield begin, min(end, length_s)
 
 
 class _Flow:

@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 from fogft.model.groups import groups_of, with_spot
@@ -79,6 +79,41 @@ class Scenario:
         """Whether every seed replays all that was recorded, two days or more."""
         known_s = min((line.length_s for line in self.recorded.values()), default=math.inf)
         return known_s - 1.0 < self.length_s and self.days >= 2.0
+
+    @cached_property
+    def replicas(self) -> int:
+        """How many replicas the planner wants outside the schedule's windows."""
+        bare = replace(self.spec, schedule=None)
+        return size(bare, Intent(), self._seen(EPOCH)).total
+
+    @cached_property
+    def _offers(self) -> tuple[Offer, ...]:
+        return ask(self.market(self.seeds[0]), self.spec)
+
+    def _seen(self, now: float) -> Observed:
+        return Observed(now, (), None, self._offers)
+
+    @cached_property
+    def sold(self) -> tuple[list[Offer], list[Offer]]:
+        """What suits the pool's largest group: spot; and on demand, the cheapest first."""
+        kind = max(groups_of(self.spec), key=lambda group: group.replicas).resources
+        market = self.market(self.seeds[0])
+        spots = [o for o in market.offers(with_spot(kind, True)) if o.placement.spot]
+        reserved = [o for o in market.offers(with_spot(kind, False)) if not o.placement.spot]
+        return spots, sorted(reserved, key=lambda o: (o.usd_per_hour, o.placement))
+
+    def target(self) -> Target:
+        """Return how many replicas the pool file wants at a time, nothing launched ahead."""
+        schedule = self.spec.schedule
+        if schedule is None:
+            return lambda now: self.replicas
+        punctual = replace(self.spec, schedule=replace(schedule, prelaunch_s=0.0))
+
+        @cache
+        def wanted(minute: int) -> int:
+            return size(punctual, Intent(), self._seen(60.0 * minute)).total
+
+        return lambda now: wanted(int(now // 60))
 
     def market(self, seed: int) -> Market:
         """Return the market of a seed: a section of the recordings, or a generated one."""
@@ -195,11 +230,8 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
 
     The fixed ones have the machines of the pool's largest group, as many as the pool has.
     """
-    spec, market = scenario.spec, scenario.market(scenario.seeds[0])
-    world = World(market, seed=0, length_s=0.0)
-    target = target_of(spec, ask(world, spec))
-    replicas = replicas_of(spec, ask(world, spec))
-    spots, reserved = _sold(spec, market)
+    spec, target, replicas = scenario.spec, scenario.target(), scenario.replicas
+    spots, reserved = scenario.sold
     found: dict[str, Factory] = {"fogft": lambda world: Managed(world, spec, target)}
     if reserved:
         found["one on-demand"] = lambda world: Static(world, reserved[:1], target)
@@ -215,44 +247,6 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
             found["naive"] = partial(search, rule=Naive)
             found["round robin"] = partial(search, rule=InTurn)
     return found
-
-
-def _sold(spec: PoolSpec, market: Market) -> tuple[list[Offer], list[Offer]]:
-    """Return what suits the pool's largest group: spot; and on demand, the cheapest first."""
-    kind = max(groups_of(spec), key=lambda group: group.replicas).resources
-    spots = [o for o in market.offers(with_spot(kind, True)) if o.placement.spot]
-    reserved = [o for o in market.offers(with_spot(kind, False)) if not o.placement.spot]
-    return spots, sorted(reserved, key=lambda o: (o.usd_per_hour, o.placement))
-
-
-def on_demand_usd_per_hour(scenario: Scenario) -> float | None:
-    """Return the price of the cheapest on-demand machine; None where none is sold."""
-    _, reserved = _sold(scenario.spec, scenario.market(scenario.seeds[0]))
-    return reserved[0].usd_per_hour if reserved else None
-
-
-def replicas_of(spec: PoolSpec, offers: Sequence[Offer]) -> int:
-    """Return how many replicas the planner wants outside the schedule's windows."""
-    bare = replace(spec, schedule=None)
-    return size(bare, Intent(), Observed(EPOCH, (), None, tuple(offers))).total
-
-
-def target_of(spec: PoolSpec, offers: Sequence[Offer]) -> Target:
-    """Return how many replicas a pool file wants at a time, nothing launched ahead."""
-    if spec.schedule is None:
-        replicas = replicas_of(spec, offers)
-        return lambda now: replicas
-    punctual = replace(spec, schedule=replace(spec.schedule, prelaunch_s=0.0))
-    known: dict[int, int] = {}
-
-    def target(now: float) -> int:
-        minute = int(now // 60)
-        if minute not in known:
-            seen = Observed(now, (), None, tuple(offers))
-            known[minute] = size(punctual, Intent(), seen).total
-        return known[minute]
-
-    return target
 
 
 def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
@@ -296,24 +290,22 @@ def compare(
 
 def bound(scenario: Scenario, market: Market) -> Outcome | None:
     """Return the cost with perfect foresight of always having all ready; None if impossible."""
-    spec = scenario.spec
-    spots, reserved = _sold(spec, market)
+    spots, reserved = scenario.sold
     cheapest = {
         o.placement.location: o.usd_per_hour for o in sorted(spots, key=lambda o: -o.usd_per_hour)
     }
-    replicas = replicas_of(spec, ask(World(market, seed=0, length_s=0.0), spec))
     seconds = scenario.length_s - SETTLE_S
     usd_per_hour = least_usd_per_hour(
         {place: line.window(SETTLE_S, seconds) for place, line in market.timelines.items()},
         cheapest,
         reserved[0].usd_per_hour if reserved else None,
-        replicas,
+        scenario.replicas,
         boot_s=scenario.timing.boot_s,
         length_s=seconds,
     )
     if usd_per_hour is None:
         return None
-    return Outcome(seconds, 1.0, 0.0, float(replicas), usd_per_hour, 0, 0, 0, 0, 0.0)
+    return Outcome(seconds, 1.0, 0.0, float(scenario.replicas), usd_per_hour, 0, 0, 0, 0, 0.0)
 
 
 @contextmanager

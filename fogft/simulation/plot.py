@@ -60,7 +60,7 @@ def draw(report: Report, path: Path) -> None:
         scenario = report.scenario
         market = "recorded traces" if scenario.recorded else "a simulated market"
         figure.suptitle(
-            f"{scenario.spec.name}: {report.replicas} replicas, {market}, "
+            f"{scenario.spec.name}: {report.scenario.replicas} replicas, {market}, "
             f"{len(scenario.seeds)} seeds of {scenario.days:.4g} days"
         )
         save(figure, path)
@@ -107,7 +107,7 @@ def _costs(axes: Any, rows: tuple[Row, ...]) -> None:
 
 def _curves(axes: Any, report: Report, rows: Sequence[Row]) -> None:
     shown = min(_SHOWN_DAYS, report.scenario.days)
-    wanted = report.replicas
+    wanted = report.scenario.replicas
     top = max((ready for row in rows for _, ready in row.curve), default=1)
     for ax, row, colour in zip(axes, rows, cycle(_COLOURS), strict=False):
         points = [(at / DAY_S, ready) for at, ready in row.curve]

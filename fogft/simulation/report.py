@@ -16,7 +16,6 @@ from fogft.model.groups import groups_of, with_spot
 from fogft.model.replica import Offer, Placement
 from fogft.model.spec import PoolSpec
 from fogft.pool.commands.composition import cloud_named_by, make_cloud
-from fogft.pool.manager.offers import ask
 from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import located as located_in_file
 from fogft.simulation import fitting
@@ -25,8 +24,6 @@ from fogft.simulation.comparison import (
     Row,
     Scenario,
     compare,
-    on_demand_usd_per_hour,
-    replicas_of,
     spot_locations,
 )
 from fogft.simulation.market import FindOffers, remembered
@@ -34,7 +31,6 @@ from fogft.simulation.meter import DAY_S
 from fogft.simulation.model import MARKET_KEYS, SLOW, MarketModel, Timing, applied, read_values
 from fogft.simulation.timeline import PER_USD
 from fogft.simulation.traces import located, read
-from fogft.simulation.world import World
 
 MAX_POOL_DAYS = 1_000_000
 
@@ -45,9 +41,13 @@ class Report:
 
     scenario: Scenario
     rows: tuple[Row, ...]
-    replicas: int  # how many the planner wants outside of the schedule's windows
-    one_on_demand: float | None = None  # US dollars per hour of one such machine
     notes: tuple[str, ...] = ()  # what a reader should know, in sentences
+
+    @property
+    def one_on_demand(self) -> float | None:
+        """US dollars per hour of the cheapest on-demand machine; None where none is sold."""
+        _, reserved = self.scenario.sold
+        return reserved[0].usd_per_hour if reserved else None
 
     @property
     def target(self) -> float:
@@ -67,10 +67,10 @@ class Report:
 
     def in_machines(self, row: Row) -> tuple[float, float] | None:
         """Return what a policy costs in units of one on-demand machine, and of one a replica."""
-        if not self.one_on_demand or not self.replicas:
+        if not self.one_on_demand or not self.scenario.replicas:
             return None
         of_one = row.estimate("usd_per_hour").mean / self.one_on_demand
-        return of_one, of_one / self.replicas
+        return of_one, of_one / self.scenario.replicas
 
     def to_json(self) -> dict[str, Any]:
         """Return everything, seed by seed."""
@@ -78,7 +78,7 @@ class Report:
         scenario = self.scenario
         return {
             "pool": scenario.spec.name,
-            "replicas": self.replicas,
+            "replicas": scenario.replicas,
             "market": "recorded" if scenario.recorded else "modelled",
             "locations": len(scenario.recorded) or None,
             "model": None if scenario.recorded else asdict(scenario.model),
@@ -105,11 +105,7 @@ def simulate_scenario(
 ) -> Report:
     """Run a scenario. Raises FogftError: it is too long, or longer than what was recorded."""
     scenario, more = _fitting(scenario)
-    rows = compare(scenario, told)
-    world = World(scenario.market(scenario.seeds[0]), seed=0, length_s=0.0)
-    replicas = replicas_of(scenario.spec, ask(world, scenario.spec))
-    one = on_demand_usd_per_hour(scenario)
-    return Report(scenario, tuple(rows), replicas, one, (*notes, *more))
+    return Report(scenario, tuple(compare(scenario, told)), (*notes, *more))
 
 
 def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:

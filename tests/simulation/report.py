@@ -195,7 +195,7 @@ def table(report: Report) -> Iterator[str]:
     yield ""
     yield (
         "| policy | available | under target | of 1 VM | of "
-        f"{report.replicas} VMs | launches/day | longest outage |"
+        f"{report.scenario.replicas} VMs | launches/day | longest outage |"
     )
     yield "|---|---|---|---|---|---|---|"
     yield from (f"| {' | '.join(cells(row, report))} |" for row in report.rows)
