@@ -65,11 +65,8 @@ class Watchdog:
 class Hanging:
     """Tells whether another process hangs: it is stopped, or its main thread never comes round.
 
-    By the kernel's count of how often that thread went to sleep, which needs no disk and no help.
-
-    Args:
-        limit_s: It hangs after so long, in seconds. A pause of ours counts for little of it: we
-            may have been asleep, and it as well.
+    By the kernel's count of how often that thread went to sleep. It hangs after `limit_s`, of which
+    a pause of ours counts for little: we may have been asleep, and it as well.
     """
 
     def __init__(self, limit_s: float, clock: Callable[[], float] = time.monotonic) -> None:

@@ -143,37 +143,37 @@ def settle(store: PoolStore, settled: Settled, what: str) -> None:
 @contextmanager
 def _shown() -> Iterator[Callable[[Seen], None]]:
     if not output.is_terminal(sys.stderr):
-        yield _PhaseLines()
+        yield _phase_lines()
         return
     width = output.width(sys.stderr)
     with output.redrawn(sys.stderr) as show:
         yield lambda seen: show(status_text.starting(seen.status, width=width))
 
 
-class _PhaseLines:
-    """One line for each replica's change of phase, and for each new note."""
+def _phase_lines() -> Callable[[Seen], None]:
+    """Return what says a line for each replica's change of phase, and for each new note."""
+    known: dict[str, tuple[str, str]] = {}
+    notes: set[str] = set()
 
-    def __init__(self) -> None:
-        self._known: dict[str, tuple[str, str]] = {}
-        self._notes: set[str] = set()
-
-    def __call__(self, seen: Seen) -> None:
+    def say(seen: Seen) -> None:
         replicas = {f"{r.slot}.{r.generation}": r for r in seen.status.replicas}
         for name, replica in replicas.items():
-            phase, detail = self._known.get(name, ("", ""))
-            self._known[name] = (replica.phase, replica.detail)
+            phase, detail = known.get(name, ("", ""))
+            known[name] = (replica.phase, replica.detail)
             if phase != replica.phase:
                 where = "" if phase else f" at {replica.location}"
                 output.say(f"{name}  {replica.phase}{where}")
             if replica.detail not in ("", detail):
                 output.say(f"{name}  {replica.detail}")
-        for name in [name for name in self._known if name not in replicas]:
-            del self._known[name]
+        for name in [name for name in known if name not in replicas]:
+            del known[name]
             output.say(f"{name}  gone")
         for note in seen.status.notes:
-            if note not in self._notes:
-                self._notes.add(note)
+            if note not in notes:
+                notes.add(note)
                 output.say(f"note: {note}")
+
+    return say
 
 
 def _count(count: int, word: str) -> str:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rich.cells import cell_len
 from rich.console import Group
@@ -26,29 +25,11 @@ _PIECE = re.compile(r"[^ /]*[ /]?")
 _EMPTY = frozenset({"", "-", "0"})
 
 
-@dataclass(frozen=True)
-class _Column:
+class _Column(NamedTuple):
     name: str
     cells: list[Text]
-    folds: bool = False
-
-    @property
-    def natural(self) -> int:
-        """How wide it is unfolded."""
-        lines = (line for one in self.cells for line in one.plain.split("\n"))
-        return max(map(cell_len, (self.name, *lines)))
-
-    @property
-    def least(self) -> int:
-        """How wide it must be."""
-        if not self.folds:
-            return self.natural
-        pieces = (piece for one in self.cells for piece in _PIECE.findall(one.plain))
-        return min(self.natural, max(_LEAST, cell_len(self.name), *map(cell_len, pieces), 0))
-
-    def folded(self, width: int) -> _Column:
-        """Return it with lines of at most a width."""
-        return replace(self, cells=[_folded(one, width) for one in self.cells])
+    natural: int  # its width unfolded
+    least: int  # the width that it needs
 
 
 def table(
@@ -67,7 +48,7 @@ def table(
     """
     cells = [[cell(one) if isinstance(one, str) else one for one in row] for row in rows]
     columns = [
-        _Column(name if titled else "", [row[at] for row in cells], name in folds)
+        _column(name if titled else "", [row[at] for row in cells], name in folds)
         for at, name in enumerate(header)
     ]
     if width is not None:
@@ -88,6 +69,16 @@ def table(
     return Group(*drawn[1:])
 
 
+def _column(name: str, cells: list[Text], folds: bool) -> _Column:
+    lines = [line for one in cells for line in one.plain.split("\n")]
+    natural = max(map(cell_len, (name, *lines)))
+    if not folds:
+        return _Column(name, cells, natural, natural)
+    pieces = (piece for one in cells for piece in _PIECE.findall(one.plain))
+    least = max(_LEAST, cell_len(name), *map(cell_len, pieces))
+    return _Column(name, cells, natural, min(natural, least))
+
+
 def _parts(columns: list[_Column], width: int) -> list[list[_Column]]:
     """Return the columns in as many tables as are needed, each with its text folded to fit."""
     first, *rest = columns
@@ -100,7 +91,8 @@ def _parts(columns: list[_Column], width: int) -> list[list[_Column]]:
         for at, one in enumerate(part):
             room = one.least + max(0, spare)
             spare -= min(one.natural, room) - one.least
-            part[at] = one.folded(room) if one.natural > room else one
+            if one.natural > room:
+                part[at] = one._replace(cells=[_folded(text, room) for text in one.cells])
         parts.append(part)
     return parts
 

@@ -23,7 +23,7 @@ import fogft
 from fogft.model.names import host_and_port
 
 if TYPE_CHECKING:
-    from prometheus_client import CollectorRegistry, Metric
+    from prometheus_client import Metric
 
 log = logging.getLogger(__name__)
 
@@ -82,39 +82,6 @@ def _printable(labels: Labels) -> dict[str, str]:
     return {key: value.encode(errors="replace").decode() for key, value in labels.items()}
 
 
-class _Collector:
-    """What one process tells: its families as measured now, each with the process's labels."""
-
-    def __init__(self, measure: Measure, labels: Labels) -> None:
-        self._measure = measure
-        self._labels = labels
-
-    def collect(self) -> Iterator[Metric]:
-        yield gauge(
-            "fogft_build_info",
-            "Version of fogft and of Python.",
-            [(1, {"version": fogft.__version__, "python": platform.python_version()})],
-        )
-        from prometheus_client import ProcessCollector
-
-        for family in chain(self._measure(), ProcessCollector(registry=None).collect()):
-            family.samples = [
-                sample._replace(labels={**self._labels, **sample.labels})
-                for sample in family.samples
-            ]
-            if family.samples:
-                yield family
-
-
-def registry(measure: Measure, labels: Labels) -> CollectorRegistry:
-    """Return a process's metrics registry, collected at each scrape, with these labels."""
-    from prometheus_client import CollectorRegistry
-
-    made = CollectorRegistry(auto_describe=False)
-    made.register(_Collector(measure, labels))
-    return made
-
-
 class Scrape:
     """Metrics at an endpoint, which may change or be none; collected for each request."""
 
@@ -123,6 +90,20 @@ class Scrape:
         self._labels = labels
         self._wanted = ""
         self._server: WSGIServer | None = None
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield the families that have samples, each with the process's labels."""
+        from prometheus_client import ProcessCollector
+
+        version = {"version": fogft.__version__, "python": platform.python_version()}
+        yield gauge("fogft_build_info", "Version of fogft and of Python.", [(1, version)])
+        for family in chain(self._measure(), ProcessCollector(registry=None).collect()):
+            family.samples = [
+                sample._replace(labels={**self._labels, **sample.labels})
+                for sample in family.samples
+            ]
+            if family.samples:
+                yield family
 
     @property
     def endpoint(self) -> str:
@@ -143,10 +124,12 @@ class Scrape:
         self._wanted = endpoint
         if not endpoint:
             return
-        from prometheus_client import make_wsgi_app
+        from prometheus_client import CollectorRegistry, make_wsgi_app
 
-        app = make_wsgi_app(registry(self._measure, self._labels))
+        registry = CollectorRegistry(auto_describe=False)
+        registry.register(self)
         try:
+            app = make_wsgi_app(registry)
             self._server = make_server(*host_and_port(endpoint), app, _Server, _Request)
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))

@@ -31,8 +31,7 @@ _WANTED_BY = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT
 class Spans:
     """Exports spans over OTLP (HTTP) in the background; spans that cannot be sent are dropped.
 
-    OpenTelemetry's environment variables apply: the endpoint, its headers, the sampler. `process`
-    is the ``service.name`` of its spans.
+    OpenTelemetry's environment variables apply; `process` is the ``service.name`` of its spans.
     """
 
     def __init__(self, process: str, pool: str) -> None:
@@ -50,8 +49,7 @@ class Spans:
     def asked(self, requests: Iterable[Mapping[str, Any]]) -> None:
         """Export the robot's side: a span for each request, and one for each replica asked.
 
-        Args:
-            requests: As `Outcomes.note` has them, with ``service``; moments on the wall clock.
+        Requests are as `Outcomes.note` has them, with ``service`` and moments on the wall clock.
         """
         for line in requests:
             service, request = line["service"], bytes.fromhex(line["request"])
@@ -68,8 +66,7 @@ class Spans:
     def ran(self, request: bytes, service: str, replica: str, moments: tuple[float, ...]) -> None:
         """Export the replica's side: the request's time there, and its time in the service.
 
-        Args:
-            moments: When it arrived, was passed on to the service, and was answered; monotonic.
+        The moments are when it arrived, was passed on, and was answered; monotonic.
         """
         past_s = time.time() - time.monotonic()
         arrived, begun, ended = (past_s + moment for moment in moments)

@@ -51,7 +51,10 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
     if not news:
         return spec
     if spec.part is not Part.NONE:
-        return replace(spec, timeout_s=_timeout(spec, news["timeout_s"]))
+        timeout_s = news["timeout_s"]
+        if isinstance(timeout_s, (bool, str)) or not 0 < timeout_s <= LONGEST_S:
+            raise ValueError(f"timeout_s: must be a number above 0 and at most {LONGEST_S:g}")
+        return replace(spec, timeout_s=float(timeout_s))
     raw: dict[str, Any] = {**to_plain(spec, omit_defaults=True), **news}
     if raw.get("on_timeout") != OnTimeout.FALLBACK.value:
         raw.pop("fallback_service", None)
@@ -66,12 +69,6 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         reason = f"{key}: {error.what}"
         raise ValueError(f"{reason}; {error.hint}" if error.hint else reason) from None
     return replace(read, traffic=spec.traffic)
-
-
-def _timeout(spec: ServiceSpec, value: Value) -> float:
-    if isinstance(value, (bool, str)) or not 0 < value <= LONGEST_S:
-        raise ValueError(f"timeout_s: must be a number above 0 and at most {LONGEST_S:g}")
-    return float(value)
 
 
 class Policies:

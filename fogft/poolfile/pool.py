@@ -148,11 +148,9 @@ def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
 def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
     if not made.groups:
         return ()
-    for key, instead in (
-        ("replicas", "each group has its own `replicas`"),
-        ("on_demand", "each group has its own `on_demand`"),
-    ):
+    for key in ("replicas", "on_demand"):
         if key in ours.children:
+            instead = f"each group has its own `{key}`"
             raise ours.error(key, "cannot be combined with `groups`", instead, at_key=True)
     shared: Any = made.task.get("resources") or {}
     for section, group in zip(ours.sections("groups", ""), made.groups, strict=True):

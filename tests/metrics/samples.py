@@ -8,7 +8,7 @@ from prometheus_client import Metric, generate_latest
 
 from fogft.metrics import proxies
 from fogft.metrics.outcomes import BUCKETS_S, OUTCOMES_COUNTED
-from fogft.metrics.scrape import Labels, registry
+from fogft.metrics.scrape import Labels, Scrape
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.manager.tally import Tally, of_pool, of_rendezvous
@@ -68,7 +68,7 @@ POOL = {"pool": "p"}
 
 def text(families: Iterable[Metric], labels: Labels) -> str:
     """Return families in Prometheus's text format, as a scraper gets them."""
-    return generate_latest(registry(lambda: families, labels)).decode()
+    return generate_latest(Scrape(lambda: families, labels)).decode()
 
 
 def tally() -> Tally:
