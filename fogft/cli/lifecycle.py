@@ -108,14 +108,14 @@ def up(
         output.say(f"interrupted: `{name}` continues to start; `fogft down {name}` shuts it down")
         raise typer.Exit(130) from None
     if outcome is Outcome.WITHDRAWN:
-        raise not_updated(seen.status)
+        raise _not_updated(seen.status)
     if outcome is not Outcome.ANSWERING:
         what = {
             Outcome.RUN_KEEPS_ENDING: "does not answer: `run` keeps exiting",
             Outcome.NEVER_READY: "does not answer: no replica has become ready",
             Outcome.TYPES_DIFFER: "cannot answer: robot and replicas disagree on its type",
         }
-        raise not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
+        raise _not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
     found = seen.status
     if not found.target:
         output.done(f"`{name}` is set up; its schedule asks for no replicas now")
@@ -137,29 +137,28 @@ def services_at_fault(status: PoolStatus) -> list[str]:
     return sorted(differing) or [one.name for one in status.services if not one.ready_replicas]
 
 
-def not_updated(status: PoolStatus) -> FogftError:
-    """Return the error for an `up` whose update was stopped."""
+def _not_updated(status: PoolStatus) -> FogftError:
     why = "" if status.update is None else status.update.fault
     lines = [f"`{status.pool}` was not updated: {why}"]
-    if replica := replica_at_fault(status.reasons):
-        lines += end_of_log(status, replica)
+    if replica := _replica_at_fault(status.reasons):
+        lines += _end_of_log(status, replica)
     hint = "see `fogft logs`; this file is not tried again: change it and run `fogft up`"
     return FogftError("\n".join(lines), hint)
 
 
-def replica_at_fault(reasons: Iterable[Reason]) -> str:
+def _replica_at_fault(reasons: Iterable[Reason]) -> str:
     """Return the replica for which an update was given up; empty where it was for none."""
     from fogft.model.reason import Cause
 
     for reason in reasons:
         if reason.cause is Cause.REPLICA_FAILS:
             return reason.replica
-        if found := replica_at_fault(reason.because):
+        if found := _replica_at_fault(reason.because):
             return found
     return ""
 
 
-def end_of_log(status: PoolStatus, of: str = "") -> list[str]:
+def _end_of_log(status: PoolStatus, of: str = "") -> list[str]:
     """Return the last lines of a replica's log; by default the last replica's or the proxy's."""
     from fogft import logfile
     from fogft.pool.commands import logs
@@ -172,8 +171,7 @@ def end_of_log(status: PoolStatus, of: str = "") -> list[str]:
     return [f"the end of the log of `{label}`:", *(f"  {line}" for line in last_lines)]
 
 
-def not_answering(seen: Seen, what: str) -> FogftError:
-    """Return the error for an `up` that failed, with everything known about the reason."""
+def _not_answering(seen: Seen, what: str) -> FogftError:
     from fogft.pool.commands.outcome import is_given_up
 
     status = seen.status
@@ -183,7 +181,7 @@ def not_answering(seen: Seen, what: str) -> FogftError:
     lines = [f"{listed} of `{status.pool}` {what}"]
     lines += [f"  {note}" for note in status.notes]
     lines += [f"  replica {r.slot}.{r.generation}: {r.detail}" for r in status.replicas if r.detail]
-    lines += end_of_log(status)
+    lines += _end_of_log(status)
     tries = "the manager keeps trying: see `fogft status` and `fogft logs`"
     if is_given_up(seen):
         tries = "change the file and run `fogft up` again, or `fogft retry`; nothing is running now"

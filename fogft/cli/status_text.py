@@ -46,7 +46,7 @@ def rendered(seen: Seen, *, width: int | None) -> Group:
     status, links_known = seen.status, seen.links_known
     rows = [*status.replicas, *status.by_hand]
     parts: list[Sequence[RenderableType]] = [
-        [headline(seen, width)],
+        [_headline(seen, width)],
         _replicas(rows, REPLICA_COLUMNS, width, links_known),
         _services(status.services, width, links_known),
         _topics(status.topics, width, links_known),
@@ -63,8 +63,7 @@ def starting(status: PoolStatus, *, width: int | None) -> Group:
     return Group(*_replicas(status.replicas, STARTING_COLUMNS, width, True), *notes(status))
 
 
-def headline(seen: Seen, width: int | None) -> Text:
-    """Return the headline: ready replicas, price, and the age of the information."""
+def _headline(seen: Seen, width: int | None) -> Text:
     status = seen.status
     pool = cell(status.pool, "bold")
     if status.ended and not seen.manager_alive:

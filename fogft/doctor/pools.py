@@ -144,7 +144,7 @@ def processes(situation: Situation) -> Iterator[Finding]:
         if seen.status.ended and not seen.manager_alive:
             yield ok("manager", f"pool `{pool}`: ended {seen.status.ended}")
             continue
-        yield from judge_processes(pool, seen)
+        yield from _judge_processes(pool, seen)
         yield from judge_traffic(pool, seen)
         folder = PoolPaths.of(pool, situation.home).folder
         if why := disk.unwritable(folder):
@@ -154,8 +154,7 @@ def processes(situation: Situation) -> Iterator[Finding]:
             yield from judge_links(pool, seen)
 
 
-def judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
-    """Judge which processes run, and whether the pool answers, as `fogft status` does."""
+def _judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
     proxy, up = seen.status.proxy_alive, f"run `fogft up {seen.status.file}`"
     if seen.manager_alive:
         yield ok("manager", f"pool `{pool}`: runs")

@@ -25,8 +25,7 @@ NOT_WITH_STATE = (*NOT_WITH_QUORUM, "concurrency", "quorum", "trace")
 _LAST_REPLICA_PORT = 65535 - FIRST_BY_HAND
 
 
-def service(section: Section, made: ServiceSpec) -> ServiceSpec:
-    """Check one of `services`."""
+def _service(section: Section, made: ServiceSpec) -> ServiceSpec:
     _stateful(section, made)
     _with_quorum(section, made)
     if made.cancel == made.name:
@@ -97,8 +96,7 @@ def _fallback(section: Section, made: ServiceSpec) -> None:
         )
 
 
-def state_services(section: Section, made: StateSpec) -> StateSpec:
-    """Check `state`, and complete the types of services given by name alone."""
+def _state_services(section: Section, made: StateSpec) -> StateSpec:
     return StateSpec(
         _state_service(section, "snapshot", made.snapshot, state.SNAPSHOT_TYPE),
         _state_service(section, "restore", made.restore, state.RESTORE_TYPE),
@@ -114,16 +112,14 @@ def _state_service(section: Section, key: str, made: StateService, usual: str) -
     return made if made.type else replace(made, type=usual, field=state.FIELD)
 
 
-def topic(section: Section, made: TopicSpec) -> TopicSpec:
-    """Check one of `topics`."""
+def _topic(section: Section, made: TopicSpec) -> TopicSpec:
     if made.origin is Origin.ROBOT and section.has("select"):
         what = "has no effect here: what the robot publishes comes from one place"
         raise section.error("select", what, "remove it")
     return made
 
 
-def metrics(section: Section, made: MetricsSpec) -> MetricsSpec:
-    """Check `metrics`."""
+def _metrics(section: Section, made: MetricsSpec) -> MetricsSpec:
     seen: set[str] = set()
     for key, endpoint in vars(made).items():
         if not endpoint:
@@ -137,8 +133,7 @@ def metrics(section: Section, made: MetricsSpec) -> MetricsSpec:
     return made
 
 
-def schedule_zone(section: Section, made: ScheduleSpec) -> ScheduleSpec:
-    """Check `schedule`."""
+def _schedule_zone(section: Section, made: ScheduleSpec) -> ScheduleSpec:
     try:
         schedule.zone(made.time_zone)
     except ValueError:
@@ -151,8 +146,7 @@ def schedule_zone(section: Section, made: ScheduleSpec) -> ScheduleSpec:
     return made
 
 
-def window(section: Section, made: WindowSpec) -> WindowSpec:
-    """Check one of a schedule's `windows`."""
+def _window(section: Section, made: WindowSpec) -> WindowSpec:
     if made.replicas is None and made.max_usd_per_hour is None:
         raise section.error("replicas", "is missing, and so is `max_usd_per_hour`", "write one")
     if made.begins_s == DAY_END_S:
@@ -172,8 +166,7 @@ def on_demand(section: Section, made: OnDemandSpec, replicas: int) -> None:
         raise section.error("standbys", what, "write `fallback: true`, or remove it")
 
 
-def topology(section: Section, made: Topology) -> Topology:
-    """Check `topology`: known names, no loop of gateways."""
+def _topology(section: Section, made: Topology) -> Topology:
     if not made.gateways:
         hint = "write a list, such as `gateways: [{name: edge, endpoint: edge.example.org:7470}]`"
         raise section.error("gateways", "is missing", hint)
@@ -205,11 +198,11 @@ def _check_known(section: Section, key: str, names: Sequence[str], known: Sequen
 
 
 RULES: dict[type, Callable[[Section, Any], Any]] = {
-    ServiceSpec: service,
-    StateSpec: state_services,
-    TopicSpec: topic,
-    MetricsSpec: metrics,
-    ScheduleSpec: schedule_zone,
-    WindowSpec: window,
-    Topology: topology,
+    ServiceSpec: _service,
+    StateSpec: _state_services,
+    TopicSpec: _topic,
+    MetricsSpec: _metrics,
+    ScheduleSpec: _schedule_zone,
+    WindowSpec: _window,
+    Topology: _topology,
 }
