@@ -1,6 +1,6 @@
-"""Files shared between processes: replaced atomically, private, locked by the kernel.
+"""Files shared between processes: replaced atomically, private, locked by the kernel (flock).
 
-Locks are flocks: they end with the process that holds them, whatever ends it. Errors: StateError.
+Errors: StateError.
 """
 
 from __future__ import annotations

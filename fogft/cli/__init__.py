@@ -1,4 +1,1 @@
-"""The command line: arguments in, text out.
-
-Not here: what a command does (`fogft.pool.commands`).
-"""
+"""The command line. Not here: what a command does (`fogft.pool.commands`)."""

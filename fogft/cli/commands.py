@@ -1,7 +1,6 @@
 """The list of commands, grouped by task, and the layout of their help.
 
-A command's module is imported when the command is run or described. A name stands for a function
-of that name in its module, or for a group of commands.
+A command's module is imported when the command is run or described.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Options shared by several commands, and their shell completion.
-
-A completion never fails and never prints: what cannot be known is not offered.
-"""
+"""Options shared by several commands, and their completion, which never fails or prints."""
 
 from __future__ import annotations
 

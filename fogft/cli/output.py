@@ -1,7 +1,6 @@
 """Print to the terminal: data to stdout, messages to stderr, both readable without colour.
 
-What a command answers is data; progress, hints and errors are messages. Rich is loaded when the
-first table, tree or redrawn screen is shown.
+Rich is loaded when the first table, tree or redrawn screen is shown.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Run one part of a pool in the foreground: proxy, serve, manager, rendezvous or gateway.
-
-`fogft up` starts what a pool needs. These are for a service manager, a container or a debugger.
-"""
+"""Run one part of a pool in the foreground, or let systemd do so."""
 
 from __future__ import annotations
 

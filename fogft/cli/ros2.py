@@ -1,7 +1,4 @@
-"""``ros2 fog``: the commands of ``fogft`` as verbs of ``ros2``. Loaded by ros2cli only.
-
-Each verb hands its words to `fogft.cli.main` unread, so that both ways behave the same.
-"""
+"""``ros2 fog``: the commands of ``fogft`` as verbs of ``ros2``. Loaded by ros2cli only."""
 
 from __future__ import annotations
 

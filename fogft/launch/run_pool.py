@@ -1,7 +1,7 @@
 """``python -m fogft.launch.run_pool FILE``: the process that a launch file starts for a pool.
 
-Starts the pool, prints a line that the launch file waits for, then shows the logs of the
-replicas. On a signal it ends, and with `--down` it ends the pool first.
+Starts the pool, prints a line that the launch file waits for, then shows the replicas' logs. On a
+signal it ends, and with `--down` it ends the pool first.
 """
 
 from __future__ import annotations

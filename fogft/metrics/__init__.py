@@ -1,4 +1,1 @@
-"""Counters of proxies, Prometheus metrics, and OpenTelemetry spans.
-
-Not here: the manager's metrics (`fogft.pool.manager.tally`).
-"""
+"""Metrics and spans of proxies. Not here: the manager's metrics (`fogft.pool.manager.tally`)."""

@@ -1,4 +1,1 @@
-"""The pool file: reading, checking and comparing. Pure but for `file` and `config_file`.
-
-Not here: the values that come of it (`fogft.model`).
-"""
+"""The pool file, read, checked and compared. Not here: the values of it (`fogft.model`)."""

@@ -1,8 +1,4 @@
-"""Check a pool file and turn it into a `PoolSpec`. Pure: tree and type checks are passed in.
-
-The `fogft` section is checked to the last key; of SkyPilot's keys only the names are, and what a
-pool cannot do.
-"""
+"""Check a pool file and turn it into a `PoolSpec`. Pure: tree and type checks are passed in."""
 
 from __future__ import annotations
 

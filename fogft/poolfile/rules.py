@@ -1,7 +1,4 @@
-"""Rules for combinations of keys in a pool file. Pure.
-
-Each judges one map after its keys were read, and may return another value for it.
-"""
+"""Rules for combinations of keys in a pool file: each judges a map once its keys are read. Pure."""
 
 from __future__ import annotations
 

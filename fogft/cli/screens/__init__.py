@@ -1,4 +1,1 @@
-"""Graphical output: the full-screen view, the HTML report and the plot of a plan.
-
-Not here: tables and lines of text (`fogft.cli.status_text`, `fogft.cli.table`).
-"""
+"""The full-screen view, a report, a plan plotted. Not here: tables (`fogft.cli.table`)."""
