@@ -61,44 +61,28 @@ class Probe:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplicaWord:
-    """A replica's own state, as reported in probe answers and by gateways.
-
-    Attributes:
-        ready: Names of the services that it can answer now.
-        draining: It asks to be left alone: its machine will be taken.
-        at_risk: Its cloud recommends to move it; it serves on meanwhile.
-        restarts: How often it restarted the user's `run` command.
-        detail: Why it is not ready, in words; empty when it is.
-        version: Of fogft on the replica; empty before 0.2.0.
-        lease_age_s: Since it last heard of the pool's manager; None for never.
-        lease_left_s: Until it shuts down unless it hears of it again; None for never.
-    """
+    """A replica's own state, as reported in probe answers and by gateways."""
 
     slot: Count
     generation: Count
-    ready: frozenset[Line] = frozenset()
-    draining: bool = False
-    at_risk: bool = False
-    restarts: Count = 0
-    detail: Line = ""
-    version: Line = ""
-    lease_age_s: Seconds | None = None
-    lease_left_s: Seconds | None = None
+    ready: frozenset[Line] = frozenset()  # names of the services that it can answer now
+    draining: bool = False  # it asks to be left alone: its machine will be taken
+    at_risk: bool = False  # its cloud recommends to move it; it serves on meanwhile
+    restarts: Count = 0  # of the user's `run` command
+    detail: Line = ""  # why it is not ready, in words; empty when it is
+    version: Line = ""  # of fogft on the replica; empty before 0.2.0
+    lease_age_s: Seconds | None = None  # since it last heard of the pool's manager; None for never
+    lease_left_s: Seconds | None = None  # until it shuts down unless it hears of it again
 
 
 @dataclass(frozen=True, kw_only=True)
 class GatewayView(ReplicaWord):
-    """A gateway's link to one replica behind it. Durations in seconds.
-
-    Attributes:
-        through: The gateways on the way, beginning with the one that is asked, and its name
-            left out: ``lab`` or ``lab/edge``; empty for none.
-    """
+    """A gateway's link to one replica behind it. Durations in seconds."""
 
     state: LinkState
     silent_for_s: Seconds = 0.0
     rtt_s: Seconds | None = None
-    through: Line = ""
+    through: Line = ""  # the further gateways on the way: ``lab`` or ``lab/edge``; empty for none
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> GatewayView:
@@ -111,30 +95,21 @@ class GatewayView(ReplicaWord):
 
 @dataclass(frozen=True, kw_only=True)
 class ProbeAnswer(ReplicaWord):
-    """A replica's answer to a probe.
+    """A replica's answer to a probe."""
 
-    Attributes:
-        incarnation: Random text made when the server proxy started. A new one at the
-            same id means that it forgot every request.
-        work: What became of requests since its start, by name (`Responder.report`).
-        offered: Service name -> type of what `run` offers, where it is to be found out or is not
-            the configured one.
-        types: Type name -> its definition on the replica. Told only where a probe asks for
-            it; a link keeps what it was told.
-        accepts: Names of compressions that it reads, or does by itself; since 0.2.0 all of them.
-        hanging: Services that have work, and have answered nothing for far longer than they take.
-        strangers: Connections that were turned away, because nobody with a certificate spoke.
-    """
-
+    # Random text made when the server proxy started. A new one at the same id means that it forgot
+    # every request.
     incarnation: Line
     in_flight: Count = 0
-    work: Mapping[Line, Seconds] = field(default_factory=dict)
+    work: Mapping[Line, Seconds] = field(default_factory=dict)  # since its start, by name
+    # Service name -> type of what `run` offers, where it is to be found out or not the configured.
     offered: Mapping[Line, Line] = field(default_factory=dict)
-    types: Mapping[Line, Definition] = field(default_factory=dict)
+    types: Mapping[Line, Definition] = field(default_factory=dict)  # by name, where a probe asks
     behind: tuple[GatewayView, ...] = ()
-    accepts: frozenset[Line] = frozenset()
+    accepts: frozenset[Line] = frozenset()  # names of compressions; since 0.2.0 all of them
+    # Services that have work, and have answered nothing for far longer than they take.
     hanging: frozenset[Line] = frozenset()
-    strangers: Count = 0
+    strangers: Count = 0  # connections turned away: nobody with a certificate spoke
 
 
 class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much

@@ -38,9 +38,8 @@ def choose(
 ) -> tuple[Sequence[int], int | None]:
     """Return which of the usable uplinks a request takes, and which is current from now on.
 
-    Args:
-        usable: Uplinks that are up and not on the request already, as listed in the pool file.
-        current: The one that `failover` uses; None before the first.
+    Those usable are up and not on the request already, in the pool file's order. `current` is the
+    one that `failover` uses; None before the first.
     """
     if policy is UplinkPolicy.ALL or not usable:
         return usable, current
@@ -122,7 +121,6 @@ class UplinksLink:
             return self._attempts.pop(request_id, None) is None
 
     def _send(self, request_id: bytes, attempt: _Attempt) -> bool:
-        """Offer an attempt to the uplinks that its policy chooses; whether one took it."""
         policy = self._dialer.policies.get(attempt.service, UplinkPolicy.PREFER)
         taken = False
         usable = [i for i, link in enumerate(self._links) if link.usable]
@@ -267,17 +265,13 @@ class UplinksLink:
 
 
 class UplinkDialer:
-    """Makes links that use several uplinks; see `port.Dialer`.
-
-    Attributes:
-        interfaces: Names of network interfaces, the preferred one first; none for whatever the
-            routes say.
-    """
+    """Makes links that use several uplinks; see `port.Dialer`."""
 
     def __init__(self, inner: Dialer) -> None:
         self.inner = inner
         self.adopt, self.renew, self.tell = inner.adopt, inner.renew, inner.tell
         self.certificate, self.close, self.newer = inner.certificate, inner.close, inner.newer
+        # The preferred one first; none for whatever the routes say.
         self.interfaces: tuple[str, ...] = ()
         self.policies: Mapping[str, UplinkPolicy] = {}
         self._options = DEFAULT_OPTIONS

@@ -51,8 +51,6 @@ Effect = Reply[T] | Refuse[T] | Begin
 
 @dataclass
 class _Work(Generic[T]):
-    """What the service does now."""
-
     op: Op
     serial: int
     epoch: int
@@ -221,7 +219,6 @@ class OrderedReplica(Generic[T]):
     # -- the service ----------------------------------------------------------------------
 
     def _go_on(self) -> list[Effect[T]]:
-        """Begin the next thing, if nothing is being done."""
         if self._work is not None:  # within its own term a claim asks only where we stand
             return self._tell() if self.joined else []
         out = self._tell()

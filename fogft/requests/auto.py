@@ -37,14 +37,10 @@ _RETRY_S = 0.02
 
 
 class Spares:
-    """Which requests get spare copies: all, unless those cost more waiting than they save.
-
-    Attributes:
-        share: Of requests that get them.
-    """
+    """Which requests get spare copies: all, unless those cost more waiting than they save."""
 
     def __init__(self) -> None:
-        self.share = 1.0
+        self.share = 1.0  # of requests that get them
         self._saved_s = 0.0
         self._cost_s = 0.0
         self._at: float | None = None
@@ -115,7 +111,6 @@ class Auto(Learning):
         return [best, *self._spared(request, spares, now)]
 
     def _spared(self, request: bytes, replicas: Sequence[int], now: float) -> Sequence[int]:
-        """Note that these get a spare copy; return them."""
         for replica in replicas:
             self._spares.open[request, replica] = now
             self._replicas[replica].asked(request, now)

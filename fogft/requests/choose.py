@@ -21,16 +21,11 @@ class Choose:
 
     Replicas are numbers, `open` maps each that works on a request to the moment it was asked.
     What a policy does not say here it does not care for.
-
-    Attributes:
-        moves_on: Whether another replica is asked at once when nobody works on a request.
-        look_at: When `more` wants to be asked next, though nothing else has happened.
-        news: What it has learned concerns requests that it did not want to be asked about yet.
     """
 
-    moves_on = True
-    look_at = NEVER
-    news = False
+    moves_on = True  # another replica is asked at once when nobody works on a request
+    look_at = NEVER  # when `more` wants to be asked next, though nothing else has happened
+    news = False  # it has learned something about requests that were not due yet
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
         """Return the replicas, of those able, that a new request goes to at once."""

@@ -22,22 +22,14 @@ _WEIGHT = 0.1  # of a sample in the mean
 
 
 class ConcurrencyLimit:
-    """The limit of one service.
-
-    Args:
-        most: The highest limit that may be learned; what the service's own queue holds.
-        given: The limit, where it is not to be learned.
-
-    Attributes:
-        takes_s: Recent service time of a request, in seconds; 0 before the first.
-        service_s: The same, divided by how many were at work.
-    """
+    """The limit of one service: `given`, or learned, up to the `most` that its own queue holds."""
 
     def __init__(self, most: int, given: int | None = None) -> None:
         self._most = most
         self._given = given
         self.limit = most if given is None else given
-        self.takes_s = self.service_s = 0.0
+        self.takes_s = 0.0  # recent service time of a request, in seconds; 0 before the first
+        self.service_s = 0.0  # the same, divided by how many were at work
         # Of the limit in force, while as many as it allows were at work:
         self._samples = 0
         self._sum_s = 0.0

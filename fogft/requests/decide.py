@@ -80,18 +80,11 @@ class Decide:
     """Judges answers: the first response counts; with `accepts`, the first ok one.
 
     All but `read` is called under the dispatcher's lock. What differs is overridden.
-
-    Args:
-        accepts: Whether a response is a success; None where every one is.
-
-    Attributes:
-        flagged: Replicas whose answers do not count any more.
-        replicates: Replicas must have more than single requests: `request_of`, `reach`, `take` and
-            `declined` are asked.
-        sends_requests: Requests leave by `take` too, in its order, and are not chosen for.
     """
 
-    flagged: Collection[int] = ()
+    flagged: Collection[int] = ()  # replicas whose answers do not count any more
+    # Replicas must have more than single requests: `request_of`, `reach`, `take` and `declined` are
+    # asked. With the second, requests leave by `take`, too, and are not chosen for.
     replicates = False
     sends_requests = False
 

@@ -31,8 +31,6 @@ class _Entry(Generic[T]):
 
 
 class _Robot(Generic[T]):
-    """One robot's queue."""
-
     def __init__(self, given: float) -> None:
         self.heap: list[_Entry[T]] = []  # entries that were removed stay until they come up
         self.waiting = 0

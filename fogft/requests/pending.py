@@ -222,11 +222,7 @@ class PendingRequests(Generic[T]):
         load: Load | None,
         now: float,
     ) -> Judged[T]:
-        """Take an answer.
-
-        Args:
-            request: What it is about; None for no request.
-            load: What the replica has to do, if it says so.
+        """Take an answer about `request`; None for no request.
 
         Returns:
             What it means; the request that it answers, None where it comes too late or is no

@@ -43,8 +43,6 @@ _PATIENCE_S = 1.0
 
 
 class _Waiting:
-    """A replica's connection that waits to be used."""
-
     def __init__(self, link: socket.socket) -> None:
         self.link = link
         self.lock = threading.Lock()  # held by whoever talks on it; the taker keeps it

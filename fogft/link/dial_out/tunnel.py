@@ -19,12 +19,10 @@ _LEAST_S = 0.01  # a time-out of 0 would mean none
 
 
 def receive(link: socket.socket, limit_bytes: int, within_s: float) -> dict[str, Any]:
-    """Receive the first message, the whole of it within the time. Changes the link's time-out.
+    """Receive the first message, the whole of it within the time.
 
-    Raises:
-        OSError: It did not come in time, or the connection broke.
-        EOFError: The other party left before.
-        RecordError: It is none.
+    Raises OSError: it did not come in time, or the connection broke. EOFError: the other party
+    left before. RecordError: it is none.
     """
     until = time.monotonic() + within_s
     unframer = frames.Unframer(limit=limit_bytes)

@@ -40,30 +40,16 @@ class LinkSettings:
 
     Zenoh's own two are long, because it cannot tell a thin uplink from a dead one; both ends see
     to the connection themselves (`flow_watch`, `connection_reaper`).
-
-    Attributes:
-        lease_s: Zenoh ends a session whose peer sent nothing for so long. Must be longer
-            than `wait_before_close_s`, or healthy links stall for seconds.
-        wait_before_close_s: How long the sending of one message may take before Zenoh gives
-            the session up.
-        open_timeout_s: The most that opening a session takes.
-        long_open_timeout_s: The same for every third try in a row that takes so long: through a
-            full uplink, or on a busy machine, a handshake needs more.
-        stall_after_s: A robot gives up a connection in which a queue stands still for so long,
-            or for four round trips where that is longer.
-        stuck_after_s: A replica gives up a connection that delivers nothing for so long: a robot
-            that is out of reach has long opened another link by then.
     """
 
-    lease_s: float = 150.0
+    lease_s: float = 150.0  # Zenoh ends a session whose peer sent nothing for so long
+    # Or where sending one message takes so long. Less than the lease, or healthy links stall.
     wait_before_close_s: float = 120.0
     open_timeout_s: float = 1.5
+    # For every third try in a row that takes so long: a full uplink or a busy machine needs more.
     long_open_timeout_s: float = 4.0
-    stall_after_s: float = 1.0
-    stuck_after_s: float = 15.0
-
-
-_DECLARED = ("declare_queryable", "declare_subscriber")
+    stall_after_s: float = 1.0  # or four round trips: a robot gives up where a queue stands still
+    stuck_after_s: float = 15.0  # a replica gives up later: a robot has long opened another link
 
 
 def robot_settings(
@@ -96,11 +82,7 @@ def robot_settings(
         # To any other common name nothing at all goes out. Kept true by
         # tests/link/zenoh/test_trust.py::test_nothing_is_sent_to_an_impostor_after_a_reconnect.
         "access_control": _access(
-            [
-                ("ask", "egress", ["query", "put"], keys),
-                ("hear", "ingress", ["reply", *_DECLARED], keys),
-            ],
-            {"cert_common_names": [peer.certificate_name]},
+            keys, "egress", "ingress", {"cert_common_names": [peer.certificate_name]}
         ),
     }
 
@@ -127,13 +109,7 @@ def replica_settings(
             "close_link_on_expiration": True,
         },
         # Any name: the handshake has proved that the CA made its holder a robot.
-        "access_control": _access(
-            [
-                ("hear", "ingress", ["query", "put"], keys),
-                ("answer", "egress", ["reply", *_DECLARED], keys),
-            ],
-            {},
-        ),
+        "access_control": _access(keys, "ingress", "egress", {}),
     }
 
 
@@ -173,24 +149,28 @@ def _common(settings: LinkSettings) -> dict[str, Any]:
 
 
 def _access(
-    rules: list[tuple[str, str, list[str], str]], subject: dict[str, list[str]]
+    keys: str, requests: str, answers: str, subject: dict[str, list[str]]
 ) -> dict[str, Any]:
-    """Return an access control list of rules (id, flow, messages, keys); the rest is denied."""
+    """Return an access control list: requests flow one way and answers the other, nothing else."""
+    messages = {
+        requests: ["query", "put"],
+        answers: ["reply", "declare_queryable", "declare_subscriber"],
+    }
     return {
         "enabled": True,
         "default_permission": "deny",
         "rules": [
             {
-                "id": id,
+                "id": flow,
                 "permission": "allow",
                 "flows": [flow],
-                "messages": messages,
+                "messages": allowed,
                 "key_exprs": [keys],
             }
-            for id, flow, messages, keys in rules
+            for flow, allowed in messages.items()
         ],
         "subjects": [{"id": "peer", **subject}],
-        "policies": [{"rules": [rule[0] for rule in rules], "subjects": ["peer"]}],
+        "policies": [{"rules": list(messages), "subjects": ["peer"]}],
     }
 
 

@@ -83,13 +83,9 @@ def surplus(links: Mapping[Address, str]) -> list[Address]:
 class ConnectionReaper:
     """Watches one port until closed; `thin` are the holders to whom a link is thin.
 
-    Args:
-        port: The port that this process listens at.
-        links: Returns the peers' addresses of authenticated links, with their common names.
-        revoked: Returns the names whose links are to be ended.
-        counters: Counts what was ended, the times when the door was shut or descriptors were short.
-        also: Done at each look.
-        stuck_after_s: Links are ended that have bytes to deliver, and delivered none for so long.
+    `links` are the peers' addresses of authenticated links, with their holders; those of who is
+    `revoked` are ended, as are those that have bytes to deliver and delivered none for
+    `stuck_after_s`. `also` is done at each look.
     """
 
     def __init__(

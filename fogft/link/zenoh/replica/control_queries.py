@@ -124,7 +124,6 @@ class ControlQueries:
     def _answer(
         self, greeting: frame.Greeting, asked: QueryEnd, answer: Callable[[], bytes]
     ) -> None:
-        """Let in who asks and answer, or tell why not."""
         try:
             self._sessions.greet(greeting)
         except NotAdmittedError as error:
@@ -153,7 +152,6 @@ class ControlQueries:
 
 
 def _greeting(query: zenoh.Query) -> frame.Greeting:
-    """Read who asks. Raises FrameError: it does not say so."""
     attachment = query.attachment
     return frame.decode_greeting(attachment.to_bytes() if attachment else b"")
 

@@ -162,7 +162,6 @@ class ZenohListener:
         return {address(link.dst): link.auth_identifier or "" for link in links}
 
     def _slow(self, holder: str) -> bool:
-        """Whether what a robot is sent was seen to leave slowly."""
         return self._reaper is not None and holder in self._reaper.thin
 
     def _count_handshakes(self) -> None:

@@ -28,6 +28,7 @@ from fogft.link.zenoh.robot.probing import Probing
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.replica import LinkState
+from fogft.requests.load import NEVER
 
 log = logging.getLogger(__name__)
 
@@ -80,8 +81,7 @@ class ZenohLink:
         self._opening = Opening(peer, shared.settings)
         self._opened = 0
         self._ignores = False
-        self._renew = threading.Event()
-        self._renew_at: float | None = None
+        self._renew_at = NEVER
         self._retiring: list[Connection] = []  # succeeded, with requests under way
         self._thread = threading.Thread(
             target=self._keep, name=f"fogft-keep-{peer.id.short}", daemon=True
@@ -161,7 +161,7 @@ class ZenohLink:
 
     def renew(self) -> None:
         """Switch to new credentials over a new connection; returns at once, no request is lost."""
-        self._renew.set()
+        self._renew_at = 0.0
         self._wake.set()
 
     def join(self, timeout_s: float) -> None:
@@ -205,7 +205,7 @@ class ZenohLink:
 
         Whatever goes wrong with the new one, the old one stays, and it is tried again.
         """
-        self._renew.clear()
+        self._renew_at = NEVER
         new = self._open()
         if new is not None and self._attend(new, until_up=True) and new is self._live:
             self._retiring.append(old)
@@ -214,7 +214,7 @@ class ZenohLink:
         if new is not None:
             self._say(new.lost_because)
             new.close()
-        self._renew_at = time.monotonic() + _RENEW_AGAIN_S
+        self._renew_at = min(self._renew_at, time.monotonic() + _RENEW_AGAIN_S)
         self._probing.another_connection()
         return old
 
@@ -257,7 +257,7 @@ class ZenohLink:
         self._probing.another_connection()
         while not self._closed and not connection.lost_because and not (up and until_up):
             now = time.monotonic()
-            if self._renewal_due(now) and connection is self._live:
+            if now >= self._renew_at and connection is self._live:
                 break
             self._let_go()
             if not self._flows(connection, now):
@@ -318,12 +318,6 @@ class ZenohLink:
             key = names.slot_key(id.pool_uid, id.slot, names.RECORDS)
             connection.tell_records(key, records, newer)
 
-    def _renewal_due(self, now: float) -> bool:
-        if self._renew_at is not None and now >= self._renew_at:
-            self._renew_at = None
-            self._renew.set()
-        return self._renew.is_set()
-
     def _probe(self, connection: Connection, now: float) -> None:
         known = self._probing.answer
         # Its types are asked for once a connection: it may be another process at each.
@@ -365,7 +359,7 @@ class ZenohLink:
         """Let go of a connection: nothing more is offered to it, what is open there is lost."""
         was_up = self._live is not None
         self._nothing_live()
-        self._renew.clear()  # the next one begins with what there is now
+        self._renew_at = NEVER  # the next one begins with what there is now
         if was_up:
             self._state = LinkState.SUSPECT
             log.warning("link_lost replica=%s reason=%r", self.peer.id.short,
@@ -412,5 +406,4 @@ class ZenohLink:
 
 
 def _decline(*_: object, **__: object) -> bool:
-    """Take no attempt: nothing is live."""
     return False
