@@ -78,22 +78,16 @@ class FairQueue(Generic[T]):
         entry = queue.first()
         self._turn = queue.given
         queue.given += 1.0
-        item = entry.item
-        self._discard(entry)
-        return item
+        return self._remove(entry)
 
     def remove(self, id: bytes) -> T | None:
         """Remove and return an item; None if it is not queued."""
         entry = self._entries.get(id)
-        if entry is None:
-            return None
-        item = entry.item
-        self._discard(entry)
-        return item
+        return None if entry is None else self._remove(entry)
 
-    def _discard(self, entry: _Entry[T]) -> None:
+    def _remove(self, entry: _Entry[T]) -> T | None:
         del self._entries[entry.id]
-        entry.item = None
+        item, entry.item = entry.item, None
         queue = self._robots[entry.robot]
         queue.waiting -= 1
         if not queue.waiting:
@@ -101,6 +95,7 @@ class FairQueue(Generic[T]):
         elif len(queue.heap) > 2 * queue.waiting + 16:
             queue.heap = [kept for kept in queue.heap if kept.item is not None]
             heapq.heapify(queue.heap)
+        return item
 
     def evict(self, robot: str, deadline: float) -> T | None:
         """Remove the item that must make room for a new one; None if the new one must go."""
@@ -115,9 +110,7 @@ class FairQueue(Generic[T]):
         last = max(entry for entry in most.heap if entry.item is not None)
         if most is own and last.rank <= self._sign * deadline:
             return None
-        item = last.item
-        self._discard(last)
-        return item
+        return self._remove(last)
 
     def ahead(self, robot: str, deadline: float) -> int:
         """Return about how many will be served before a request that arrives now."""

@@ -10,23 +10,13 @@ from __future__ import annotations
 
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.decide import Decide, Judgement, Means, Pending
 
 WINDOW = 20  # judged answers of a replica that count
 LIMIT = 3  # disagreements among them that make it flagged
-
-
-class Comparison(Protocol):
-    """Reads responses and compares them."""
-
-    def read(self, payload: bytes) -> Any:
-        """Read a response. Raises RosError for invalid bytes."""
-
-    def agree(self, one: Any, other: Any) -> bool:
-        """Whether two responses agree, within the tolerances. Symmetric."""
 
 
 class Quorum(Decide):
@@ -41,22 +31,23 @@ class Quorum(Decide):
     def __init__(
         self,
         quorum: int,
-        comparison: Comparison,
+        read: Callable[[bytes], Any],
+        agree: Callable[[Any, Any], bool],
         newly_flagged: Callable[[int, int], None] = lambda replica, count: None,
     ) -> None:
         super().__init__()
         self.flagged: set[int] = set()
         self.disagreed: dict[int, int] = {}
         self._quorum = quorum
-        self._agree = comparison.agree
-        self._read = comparison.read
+        self._agree = agree
+        self._read = read
         self._newly_flagged = newly_flagged
         self._open: dict[bytes, dict[int, Any]] = {}  # each replica's answer
         self._final: OrderedDict[bytes, Any] = OrderedDict()
         self._record: dict[int, deque[bool]] = {}
 
     def read(self, payload: bytes) -> Any:
-        """Read a response."""
+        """Read a response. Raises RosError for invalid bytes."""
         return self._read(payload)
 
     def judge(

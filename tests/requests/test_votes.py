@@ -9,21 +9,9 @@ from fogft.requests.decide import Pending
 from fogft.requests.votes import LIMIT, Quorum
 
 
-class Within:
-    """Numbers that agree where they are no further apart."""
-
-    def __init__(self, tolerance: float = 0.0) -> None:
-        self.tolerance = tolerance
-
-    def read(self, payload: bytes) -> float:
-        return float(payload)
-
-    def agree(self, one: float, other: float) -> bool:
-        return abs(one - other) <= self.tolerance
-
-
-def of(quorum: int) -> Quorum:
-    return Quorum(quorum, Within())
+def of(quorum: int, tolerance: float = 0.0) -> Quorum:
+    """Votes on numbers that agree where they are no further apart."""
+    return Quorum(quorum, float, lambda one, other: abs(one - other) <= tolerance)
 
 
 @given(
@@ -32,7 +20,7 @@ def of(quorum: int) -> Quorum:
     st.sampled_from([0, 1]),
 )
 def test_an_answer_has_a_quorum_behind_it_and_there_is_one_at_most(quorum, cast, tolerance):
-    votes = Quorum(quorum, Within(tolerance))
+    votes = of(quorum, tolerance)
     first: dict[int, int] = {}
     answers = []
     for replica, value in cast:

@@ -177,7 +177,9 @@ def make_dispatcher(
     if spec.quorum > 1:
         comparison = Comparison(spec.type, spec.tolerance)
         flagged = functools.partial(_replica_disagrees, spec.name)
-        return make(decide=Quorum(spec.quorum, comparison, flagged), ok_of=ok_of)
+        return make(
+            decide=Quorum(spec.quorum, comparison.read, comparison.agree, flagged), ok_of=ok_of
+        )
     return make(ok_of=ok_of)
 
 

@@ -22,16 +22,11 @@ from tests.proxy.fakes import Clock, FakeLink
 pytestmark = pytest.mark.timeout(180)
 
 
-class Numbers:
-    """Responses that are numbers in text."""
-
-    def read(self, payload: bytes) -> float:
-        try:
-            return float(payload)
-        except ValueError as error:
-            raise RosError("no number") from error
-
-    agree = staticmethod(operator.eq)
+def number(payload: bytes) -> float:
+    try:
+        return float(payload)
+    except ValueError as error:
+        raise RosError("no number") from error
 
 
 class Scene:
@@ -42,7 +37,7 @@ class Scene:
             lambda handle, payload: self.responses.append((handle, payload)),
             empty_response=b"empty",
             clock=self.clock,
-            decide=Quorum(2, Numbers()),
+            decide=Quorum(2, number, operator.eq),
         )
         self.links = [FakeLink(slot) for slot in range(links)]
         self.dispatcher.route(self.links)
