@@ -215,7 +215,7 @@ class ReplyQueues:
                 taken = queue.next(_END_LOOK_S if unended else self.idle_s)
             except Empty:
                 if unended:
-                    unended = [one for one in unended if not self._ended(one)]
+                    unended = [one for one in unended if not self._guarded(one.ended)]
                     continue
                 with self._lock:
                     if queue.waiting:
@@ -232,25 +232,19 @@ class ReplyQueues:
             else:
                 return
             if unended:
-                unended = [one for one in unended if not self._ended(one)]
+                unended = [one for one in unended if not self._guarded(one.ended)]
             with self._lock:
                 queue.waiting -= len(sizes)
                 for size in sizes:
                     queue.large.remove(size)
             del taken  # its payloads, while this thread waits
 
-    def _ended(self, one: QueryEnd) -> bool:
+    def _guarded(self, step: Callable[[], object]) -> object:
         try:
-            return one.ended()
+            return step()
         except Exception as error:
             self._failed(error)
             return True
-
-    def _guarded(self, step: Callable[[], None]) -> None:
-        try:
-            step()
-        except Exception as error:
-            self._failed(error)
 
     def _failed(self, error: Exception) -> None:
         self._counters.warn(log, "failed", "reply_failed reason=%r", str(error))

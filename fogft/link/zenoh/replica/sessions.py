@@ -28,7 +28,7 @@ _MAY_ASK = frozenset({Role.ROBOT, Role.GATEWAY})
 class NotAdmittedError(Exception):
     """A connection is not admitted."""
 
-    def __init__(self, refusal: Refusal, detail: str) -> None:
+    def __init__(self, detail: str, refusal: Refusal = Refusal.NOT_ADMITTED) -> None:
         super().__init__(detail)
         self.refusal = refusal
 
@@ -58,7 +58,7 @@ class AuthenticatedSessions:
         """Admit a connection. Raises NotAdmittedError: its holder may not ask here."""
         if not greeting.certificate:
             if greeting.token not in self._tokens:
-                raise NotAdmittedError(Refusal.NOT_ADMITTED, "a connection that did not greet")
+                raise NotAdmittedError("a connection that did not greet")
             return
         message = frame.greeted_bytes(greeting.token, self._replica)
         try:
@@ -67,23 +67,20 @@ class AuthenticatedSessions:
         except ValueError as error:
             expired = isinstance(error, RecordError) and error.reason == "expired"
             refusal = Refusal.EXPIRED_CERTIFICATE if expired else Refusal.NOT_ADMITTED
-            raise NotAdmittedError(refusal, str(error)) from error
+            raise NotAdmittedError(str(error), refusal) from error
         if holder.role.value != writer.role or holder.role not in _MAY_ASK:
-            words = f"`{writer.common_name}` may not send requests"
-            raise NotAdmittedError(Refusal.NOT_ADMITTED, words)
+            raise NotAdmittedError(f"`{writer.common_name}` may not send requests")
         if holder.pool_uid != self._pool_uid:
-            raise NotAdmittedError(
-                Refusal.NOT_ADMITTED, f"`{writer.common_name}` is not a member of this pool"
-            )
+            raise NotAdmittedError(f"`{writer.common_name}` is not a member of this pool")
         self._admit(greeting.token, holder)
 
     def _admit(self, token: bytes, holder: Holder) -> None:
         name = holder.common_name
         with self._lock:
             if name in self.revoked:
-                raise NotAdmittedError(Refusal.REVOKED, f"`{name}` is revoked")
+                raise NotAdmittedError(f"`{name}` is revoked", Refusal.REVOKED)
             if self._tokens.get(token, holder) != holder:
-                raise NotAdmittedError(Refusal.NOT_ADMITTED, "a token that is another's")
+                raise NotAdmittedError("a token that is another's")
             if name not in self._holders and len(self._holders) >= HOLDERS_LIMIT:
                 self._forget(next(iter(self._holders)))
             tokens, now = self._holders.setdefault(name, OrderedDict()), self._clock()
@@ -93,7 +90,7 @@ class AuthenticatedSessions:
             if len(tokens) >= TOKENS_LIMIT:
                 oldest, since = next(iter(tokens.items()))
                 if now - since < TOKENS_WITHIN_S:
-                    raise NotAdmittedError(Refusal.OVERLOADED, f"`{name}` greets too often")
+                    raise NotAdmittedError(f"`{name}` greets too often", Refusal.OVERLOADED)
                 del tokens[oldest], self._tokens[oldest]
             tokens[token], self._tokens[token] = now, holder
 

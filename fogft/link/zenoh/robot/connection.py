@@ -18,7 +18,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
 
 import zenoh
 from zenoh import handlers
@@ -117,6 +116,9 @@ class Connection:
         self.lost_because = ""
         self.told, self.told_at = b"", 0.0  # the records that the replica has taken, and when
         self._session = zenoh.open(config)
+        self._get = partial(self._session.get, target=_ALL, consolidation=_AT_ONCE)
+        # The link's thread must not wait behind what is stuck: a lost probe is an unanswered one.
+        self._ask = partial(self._get, congestion_control=zenoh.CongestionControl.DROP)
         try:
             self._listener = self._session.info.declare_link_events_listener(
                 handlers.Callback(self._link_event, indirect=False)
@@ -164,14 +166,9 @@ class Connection:
                 return False
         ended = partial(self.lose, "the replica closed the stream of answers")
         answers = handlers.Callback(self._heard, ended, indirect=False)
-        self._ask(self._answers_key, answers, _ANSWERS_TIMEOUT_S, attachment=self._bare)
+        self._get(self._answers_key, answers, timeout=_ANSWERS_TIMEOUT_S, attachment=self._bare)
         self._begun = True
         return True
-
-    def _ask(self, key: str, answers: Any, timeout_s: float, **how: Any) -> None:
-        self._session.get(
-            key, answers, timeout=timeout_s, target=_ALL, consolidation=_AT_ONCE, **how
-        )
 
     # -- for its attempts -----------------------------------------------------------------
 
@@ -231,11 +228,9 @@ class Connection:
         self._ask(
             key,
             handlers.Callback(on_reply, indirect=False),
-            timeout_s,
+            timeout=timeout_s,
             payload=payload,
             attachment=self._greeting,
-            # This thread must not wait behind what is stuck: a lost probe is an unanswered one.
-            congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
             express=True,
         )
@@ -262,10 +257,9 @@ class Connection:
         self._ask(
             key,
             handlers.Callback(on_reply, indirect=False),
-            _TELL_RECORDS_TIMEOUT_S,
+            timeout=_TELL_RECORDS_TIMEOUT_S,
             payload=records,
             attachment=self._bare,
-            congestion_control=zenoh.CongestionControl.DROP,
             # Not that of the answers: its end at the replica must not wait for room among them.
             priority=zenoh.Priority.DATA_LOW,
         )
