@@ -10,6 +10,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
 import zenoh
 
@@ -30,6 +31,7 @@ from fogft.records.record_set import RecordSet, Verdict
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
 _STRANGERS = b""  # in place of a token: replies to whose connection is not known
 
 
@@ -71,35 +73,35 @@ class ControlQueries:
 
     def probe(self, on_probe: Callable[[Probe], ProbeAnswer], asked: QueryEnd) -> None:
         """Handle a probe, which may carry a greeting."""
-        self._counters.add("probes")
-        try:
-            probe = probe_frames.decode_probe(_content(asked.query))
-            greeting = _greeting(asked.query)
-        except FrameError as error:
-            self._malformed(error, asked)
-            return
 
-        def answer() -> bytes:
+        def answer(probe: Probe) -> bytes:
             said = replace(on_probe(probe), accepts=ACCEPTED)
             return probe_frames.encode_probe_answer(said)
 
-        self.later(greeting, partial(self._answer, greeting, asked, answer), asked)
+        self._handle(asked, "probes", probe_frames.decode_probe, answer)
 
     def records(self, asked: QueryEnd) -> None:
         """Handle signed records that a robot passes on."""
-        self._counters.add("records")
-        try:
-            greeting = _greeting(asked.query)
-            offered = frames.unpack(_content(asked.query))
-        except (FrameError, RecordError) as error:
-            self._malformed(error, asked)
-            return
 
-        def answer() -> bytes:
+        def answer(offered: Sequence[SignedRecord]) -> bytes:
             newer = self.take(offered)
             return frames.pack(newer) if newer else b""
 
-        self.later(greeting, partial(self._answer, greeting, asked, answer), asked)
+        self._handle(asked, "records", frames.unpack, answer)
+
+    def _handle(
+        self, asked: QueryEnd, event: str, read: Callable[[bytes], T], answer: Callable[[T], bytes]
+    ) -> None:
+        self._counters.add(event)
+        payload = asked.query.payload
+        try:
+            greeting = _greeting(asked.query)
+            content = read(payload.to_bytes() if payload else b"")
+        except (FrameError, RecordError) as error:
+            self._malformed(error, asked)
+            return
+        job = partial(self._answer, greeting, asked, partial(answer, content))
+        self.later(greeting, job, asked)
 
     def later(self, greeting: frame.Greeting, job: Callable[[], None], asked: QueryEnd) -> None:
         """Run a job on the other thread; if its sender's queue is full, just end the query."""
@@ -154,8 +156,3 @@ class ControlQueries:
 def _greeting(query: zenoh.Query) -> frame.Greeting:
     attachment = query.attachment
     return frame.decode_greeting(attachment.to_bytes() if attachment else b"")
-
-
-def _content(query: zenoh.Query) -> bytes:
-    payload = query.payload
-    return payload.to_bytes() if payload else b""
