@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.errors import SpecError
+from fogft.model.names import NO_VM_CLOUDS, VM_CLOUDS
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import yaml_tree
 from fogft.poolfile.tree import below, nearest
@@ -23,18 +24,16 @@ def located(error: SpecError, source: str, file: Path) -> SpecError:
     return SpecError(message, error.hint, key=error.key, what=error.what, line=line)
 
 
-def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) -> str | None:
-    """Return the cloud adapter for a pool file's resources; None if they name no cloud.
-
-    `names` are those that it may use, each with the adapter that it stands for.
-    """
+def cloud_named_by(spec: PoolSpec, source: str, file: Path) -> str:
+    """Return `sky` for a pool file whose resources name real clouds, else `local`."""
+    known = {"local": "local", **dict.fromkeys((*VM_CLOUDS, *NO_VM_CLOUDS), "sky")}
     named = dict(_named_in(spec))
     for cloud, key in named.items():
-        if cloud not in names:
+        if cloud not in known:
             what = f"there is no cloud `{cloud}`"
-            problem = SpecError.of_key(key, what, nearest(cloud, names))
+            problem = SpecError.of_key(key, what, nearest(cloud, known))
             raise located(problem, source, file)
-    by_adapter = {names[cloud]: cloud for cloud in sorted(named)}
+    by_adapter = {known[cloud]: cloud for cloud in sorted(named)}
     if len(by_adapter) > 1:
         listed = " and ".join(f"`{cloud}`" for cloud in sorted(by_adapter.values()))
         problem = SpecError.of_key(
@@ -43,7 +42,7 @@ def cloud_of(spec: PoolSpec, names: Mapping[str, str], source: str, file: Path) 
             "name real clouds only; `--cloud local` tries their regions on this machine",
         )
         raise located(problem, source, file)
-    return next(iter(by_adapter), None)
+    return next(iter(by_adapter), "local")
 
 
 def clouds_named(spec: PoolSpec) -> list[str]:

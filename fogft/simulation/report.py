@@ -15,8 +15,9 @@ from fogft.errors import FogftError, SpecError
 from fogft.model.groups import groups_of, with_spot
 from fogft.model.replica import Offer, Placement
 from fogft.model.spec import PoolSpec
-from fogft.pool.commands.composition import cloud_named_by, make_cloud
+from fogft.pool.commands.composition import make_cloud
 from fogft.poolfile.file import parse, read_text
+from fogft.poolfile.named_clouds import cloud_named_by
 from fogft.poolfile.named_clouds import located as located_in_file
 from fogft.simulation import fitting
 from fogft.simulation.comparison import (

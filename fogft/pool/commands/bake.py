@@ -11,10 +11,10 @@ from pathlib import Path
 
 from fogft.cloud.port import Baking
 from fogft.errors import CloudError, SpecError
-from fogft.pool.commands.composition import cloud_named_by, make_cloud
+from fogft.pool.commands.composition import make_cloud
 from fogft.pool.manager.configuration import absolute, with_build
 from fogft.poolfile.file import parse, read_text
-from fogft.poolfile.named_clouds import alternatives
+from fogft.poolfile.named_clouds import alternatives, cloud_named_by
 
 PLAIN = "ubuntu:24.04"
 _DOCKER = "docker:"

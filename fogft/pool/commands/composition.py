@@ -15,7 +15,6 @@ from fogft.pool.folder.paths import PoolPaths, home
 
 if TYPE_CHECKING:
     from fogft.cloud.port import Cloud
-    from fogft.model.spec import PoolSpec
     from fogft.pool.folder.store import Identity, PoolStore
 
 LOCAL = "local"
@@ -84,15 +83,6 @@ def make_cloud(name: str, base: Path) -> Cloud:
 def cloud_of(identity: Identity) -> Cloud:
     """Return the cloud that a pool runs on."""
     return make_cloud(identity.cloud, Path(identity.file).parent)
-
-
-def cloud_named_by(spec: PoolSpec, source: str, file: Path) -> str:
-    """Return which of `CLOUDS` a pool file's resources name, else `local`."""
-    from fogft.model.names import NO_VM_CLOUDS, VM_CLOUDS
-    from fogft.poolfile import named_clouds
-
-    known = {LOCAL: LOCAL, **dict.fromkeys((*VM_CLOUDS, *NO_VM_CLOUDS), SKY)}
-    return named_clouds.cloud_of(spec, known, source, file) or LOCAL
 
 
 def local_root() -> Path:

@@ -18,7 +18,7 @@ from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.explain import Explanation, explain
 from fogft.planning.observed.history import Event, EventKind, History
-from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
+from fogft.pool.commands.composition import LOCAL, make_cloud, make_store
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.manager import launched_gateway, offers, proxy_report
 from fogft.pool.manager.distances import Distance, Latencies, regions_of
@@ -72,7 +72,7 @@ def plan_file(
     if prices is not None:
         name, seller = str(prices), PriceTable(prices)
     else:
-        name = cloud or cloud_named_by(spec, source, file)
+        name = cloud or named_clouds.cloud_named_by(spec, source, file)
         seller = make_cloud(name, file.resolve().parent)
         if name != LOCAL:
             told("fetching prices")

@@ -23,7 +23,7 @@ from fogft.planning.lifetime import HOUR_S
 from fogft.planning.observed.history import History
 from fogft.planning.planner import plan
 from fogft.planning.rollout import has_room
-from fogft.pool.commands.composition import LOCAL, cloud_named_by, make_cloud, make_store
+from fogft.pool.commands.composition import LOCAL, make_cloud, make_store
 from fogft.pool.commands.plan import far
 from fogft.pool.commands.sweep import left_of
 from fogft.pool.folder.store import Identity, PoolStore, digest
@@ -31,7 +31,7 @@ from fogft.pool.manager import launched_gateway, offers
 from fogft.poolfile import file as pool_file
 from fogft.poolfile.changes import changes, replaces_replicas
 from fogft.poolfile.file import parse, read_text
-from fogft.poolfile.named_clouds import clouds_named, located
+from fogft.poolfile.named_clouds import cloud_named_by, clouds_named, located
 from fogft.poolfile.pool import Checks
 from fogft.reason_words import words
 
