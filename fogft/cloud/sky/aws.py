@@ -1,25 +1,21 @@
 """AWS through its own API (boto3, which comes with SkyPilot's AWS support). See `provider`.
 
-Only `describe` calls, `TerminateInstances` on instances whose tags were just read and are ours,
-and security groups that are named for what they let in. Credentials and regions come from the
-same places as SkyPilot's.
+Credentials and regions come from the same places as SkyPilot's.
 """
 
 from __future__ import annotations
 
 import contextlib
 import datetime
-import functools
 import hashlib
 import importlib
-import itertools
 import json
 import os
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.failures import classify, plain
@@ -27,8 +23,6 @@ from fogft.cloud.sky.provider import Instance, NotAllowedError
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.reason import Cause
 from fogft.model.replica import Placement
-
-T = TypeVar("T")
 
 _ALIVE = ["pending", "running", "stopping", "stopped"]  # a stopped one's disk still costs
 _FORBIDDEN = ("UnauthorizedOperation", "AccessDenied", "AccessDeniedException")
@@ -58,29 +52,34 @@ class Aws:
         where = sorted(set(self.regions() if regions is None else regions))
         if not where:
             return []
+        refused: list[NotAllowedError] = []
 
-        def ask(region: str) -> Sequence[Instance] | NotAllowedError:
+        def ask(region: str) -> Sequence[Instance]:
             try:
                 return self._instances_in(region, pool_uid)
             except NotAllowedError as error:
-                return error
+                refused.append(error)
+                return []
 
         with ThreadPoolExecutor(min(8, len(where)), "aws") as pool:
-            answers = list(pool.map(ask, where))
-        refused = [answer for answer in answers if isinstance(answer, NotAllowedError)]
+            found = [instance for answer in pool.map(ask, where) for instance in answer]
         if refused and (regions is not None or len(refused) == len(where)):
             raise refused[0]
-        found = (answer for answer in answers if not isinstance(answer, NotAllowedError))
-        return sorted(itertools.chain.from_iterable(found), key=lambda i: (i.id, i.key))
+        return sorted(found, key=lambda i: (i.id, i.key))
 
     def terminate(self, instances: Iterable[Instance]) -> None:
         """See `Provider`."""
-        for instance in instances:  # one by one: a single unknown key fails a whole call
-            self._ask(instance.placement.region, functools.partial(_terminate, instance.key))
+        for one in instances:  # one by one: a single unknown key fails a whole call
+            with self._asked(one.placement.region) as ec2, _unless("InvalidInstanceID.NotFound"):
+                ec2.terminate_instances(InstanceIds=[one.key])
 
     def end_when_shut_down(self, instance: Instance) -> None:
         """See `Provider`."""
-        self._ask(instance.placement.region, functools.partial(_end_when_shut_down, instance.key))
+        attribute = "instanceInitiatedShutdownBehavior"
+        with self._asked(instance.placement.region) as ec2:
+            ec2.modify_instance_attribute(
+                InstanceId=instance.key, Attribute=attribute, Value="terminate"
+            )
 
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
         """See `Provider`. A security group in each VPC: SkyPilot decides which one a machine is in.
@@ -89,9 +88,11 @@ class Aws:
         """
         rules = {(port, source) for port in ports for source in sources}
         name = f"fogft-{hashlib.sha256(repr(sorted(rules)).encode()).hexdigest()[:16]}"
-        for group in self._ask(region, functools.partial(_firewalls, name, rules)):
+        with self._asked(region) as ec2:
+            changed = _firewalls(name, rules, ec2)
+        if changed:
             raise CloudError(
-                f"the security group `{name}` ({group}) in `aws/{region}` was changed: it no "
+                f"the security group `{name}` ({changed[0]}) in `aws/{region}` was changed: it no "
                 "longer matches `fogft.allow_from`",
                 "delete it, and fogft creates a new one",
             )
@@ -120,65 +121,51 @@ class Aws:
 
     def quota(self, region: str, code: str) -> float | None:
         """See `Provider`. By the code of AWS's Service Quotas."""
-
-        def value(quotas: Any) -> float | None:
+        with self._asked(region, "service-quotas") as quotas:
             try:
                 found = quotas.get_service_quota(ServiceCode="ec2", QuotaCode=code)
             except quotas.exceptions.NoSuchResourceException:
                 return None
             return float(found["Quota"]["Value"])
 
-        return self._ask(region, value, "service-quotas")
-
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:
         """See `Provider`."""
-        now = datetime.datetime.now(datetime.timezone.utc)
-
-        def prices(ec2: Any) -> dict[tuple[str, str], float]:
+        with self._asked(region) as ec2:
             pages = ec2.get_paginator("describe_spot_price_history").paginate(
                 InstanceTypes=sorted(set(instances)),
                 ProductDescriptions=["Linux/UNIX"],
-                StartTime=now,  # the one price in force now, of each zone
+                # The one price in force now, of each zone.
+                StartTime=datetime.datetime.now(datetime.timezone.utc),
             )
             found = [entry for page in pages for entry in page["SpotPriceHistory"]]
-            found.sort(key=lambda entry: entry["Timestamp"])
-            return {
-                (p["AvailabilityZone"], p["InstanceType"]): float(p["SpotPrice"]) for p in found
-            }
-
-        return self._ask(region, prices)
+        found.sort(key=lambda entry: entry["Timestamp"])
+        return {(p["AvailabilityZone"], p["InstanceType"]): float(p["SpotPrice"]) for p in found}
 
     def _instances_in(self, region: str, pool_uid: str) -> list[Instance]:
-        ours = (
-            {"Name": f"tag:{naming.POOL}", "Values": [pool_uid]}
-            if pool_uid
-            else {"Name": "tag-key", "Values": [naming.POOL]}
-        )
-
-        def instances(ec2: Any) -> list[Instance]:
-            pages = ec2.get_paginator("describe_instances").paginate(
-                Filters=[ours, {"Name": "instance-state-name", "Values": _ALIVE}]
-            )
-            found = (
+        ours = {"Name": "tag-key", "Values": [naming.POOL]}
+        if pool_uid:
+            ours = {"Name": f"tag:{naming.POOL}", "Values": [pool_uid]}
+        alive = {"Name": "instance-state-name", "Values": _ALIVE}
+        with self._asked(region) as ec2:
+            pages = ec2.get_paginator("describe_instances").paginate(Filters=[ours, alive])
+            listed = [
                 _instance(region, raw)
                 for page in pages
                 for reservation in page["Reservations"]
                 for raw in reservation["Instances"]
-            )
-            return [instance for instance in found if instance is not None]
-
-        return self._ask(region, instances)
+            ]
+        return [instance for instance in listed if instance is not None]
 
     def regions(self) -> list[str]:
         """Return every region's name."""
-        answer = self._ask(_HOME, lambda ec2: ec2.describe_regions())
-        return [str(region["RegionName"]) for region in answer["Regions"]]
+        with self._asked(_HOME) as ec2:
+            return [str(region["RegionName"]) for region in ec2.describe_regions()["Regions"]]
 
     def warning(self) -> str:
         """See `Provider`. Reads the policies of SkyPilot's role, where the account may."""
-
         try:
-            mighty = self._ask(_HOME, _mighty, "iam")
+            with self._asked(_HOME, "iam") as iam:
+                mighty = _mighty(iam)
         except NotAllowedError as error:
             return f"cannot read the permissions of AWS role `{ROLE}`, which every VM has: {error}"
         except CloudUnreachable:
@@ -210,9 +197,11 @@ class Aws:
                 )
             return self.clients[service, region]
 
-    def _ask(self, region: str, call: Callable[[Any], T], service: str = "ec2") -> T:
+    @contextlib.contextmanager
+    def _asked(self, region: str, service: str = "ec2") -> Iterator[Any]:
+        """Give a client, and translate the errors of its calls."""
         try:
-            return call(self._client(service, region))
+            yield self._client(service, region)
         except ImportError as error:
             raise NotAllowedError("boto3 is not installed") from error
         except Exception as error:
@@ -236,17 +225,6 @@ def _moment(text: str) -> float:
     except ValueError:
         return 0.0
     return (read if read.tzinfo else read.replace(tzinfo=datetime.timezone.utc)).timestamp()
-
-
-def _terminate(key: str, ec2: Any) -> None:
-    with _unless("InvalidInstanceID.NotFound"):
-        ec2.terminate_instances(InstanceIds=[key])
-
-
-def _end_when_shut_down(key: str, ec2: Any) -> None:
-    ec2.modify_instance_attribute(
-        InstanceId=key, Attribute="instanceInitiatedShutdownBehavior", Value="terminate"
-    )
 
 
 def _mighty(iam: Any) -> list[str] | None:

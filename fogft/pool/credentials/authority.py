@@ -1,13 +1,9 @@
 """A pool's certificate authority and the certificates that it issues.
 
-Each pool has a CA of its own, made at the first `up`; both ends of every link trust it and
-nothing else. A certificate says who its holder is (common name, from `model.names`) and what
-it may do: a robot's is good for asking only, a replica's for answering only. That is the
-extended key usage, which TLS itself checks, so a stolen replica's key can ask nothing.
+A certificate says who its holder is (common name) and what it may do: a robot's is good for
+asking only, a replica's for answering only. That is the extended key usage, which TLS itself
+checks. What cannot be used raises `CredentialError`, what cannot be written `StateError`.
 
-What cannot be used raises `CredentialError`, what cannot be written `StateError`.
-
-Owns: making, writing, reading and describing keys and certificates. Keys are never shown.
 Not here: who gets one (`fogft.pool`), how they are used (`fogft.link.zenoh.settings`).
 """
 
@@ -70,19 +66,14 @@ class Description:
 
 def create_authority(folder: Path, pool_uid: str) -> None:
     """Create the pool's CA in a folder, which is created too. An existing CA is kept."""
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     if (folder / AUTHORITY_CERTIFICATE).exists():
         _load_authority(folder)
         return
     disk.make_folder(folder)
-    key = ec.generate_private_key(ec.SECP256R1())
-    certificate = _sign(
-        key, key.public_key(), f"fogft.{pool_uid}", role=None, authority=None, days=AUTHORITY_DAYS
-    )
+    certificate, key = _made(f"fogft.{pool_uid}", role=None, days=AUTHORITY_DAYS, issuer=None)
     # The key first: a crash in between leaves no certificate, so the next call begins again.
-    disk.write_whole(folder / AUTHORITY_KEY, _key_pem(key))
-    disk.write_whole(folder / AUTHORITY_CERTIFICATE, _certificate_pem(certificate))
+    disk.write_whole(folder / AUTHORITY_KEY, key)
+    disk.write_whole(folder / AUTHORITY_CERTIFICATE, certificate)
 
 
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
@@ -91,20 +82,10 @@ def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS
     Args:
         days: How long it is valid from now; never beyond the CA's own end.
     """
-    from cryptography.hazmat.primitives.asymmetric import ec
-
     if not 0 < len(common_name) <= _COMMON_NAME_LIMIT:
         raise ValueError(f"a common name has 1 to {_COMMON_NAME_LIMIT} characters: {common_name!r}")
-    authority, authority_key = _load_authority(folder)
-    key = ec.generate_private_key(ec.SECP256R1())
-    certificate = _sign(
-        authority_key, key.public_key(), common_name, role=role, authority=authority, days=days
-    )
-    return Credential(
-        certificate_pem=_certificate_pem(certificate),
-        key_pem=_key_pem(key),
-        authority_pem=_certificate_pem(authority),
-    )
+    certificate, key = _made(common_name, role=role, days=days, issuer=_load_authority(folder))
+    return Credential(certificate, key, (folder / AUTHORITY_CERTIFICATE).read_bytes())
 
 
 def write(credential: Credential, folder: Path, stem: str) -> None:
@@ -136,10 +117,7 @@ def describe_pem(pem: bytes) -> Description:
     """Return the fields of a PEM certificate."""
     from cryptography import x509
 
-    try:
-        return _described(x509.load_pem_x509_certificate(pem))
-    except ValueError as error:
-        raise CredentialError("not a certificate") from error
+    return _described(x509.load_pem_x509_certificate(pem))
 
 
 def _described(certificate: x509.Certificate) -> Description:
@@ -154,35 +132,49 @@ def _described(certificate: x509.Certificate) -> Description:
     )
 
 
-def _sign(
-    signer: ec.EllipticCurvePrivateKey,
-    public_key: ec.EllipticCurvePublicKey,
+def _made(
     common_name: str,
     *,
     role: Role | None,
-    authority: x509.Certificate | None,
     days: float,
-) -> x509.Certificate:
-    """Make a certificate; of the CA itself where `role` and `authority` are None."""
+    issuer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None,
+) -> tuple[bytes, bytes]:
+    """Make a certificate and its key, both PEM; the CA's own where role and issuer are None."""
     from cryptography import x509
-    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives import hashes, serialization
+    from cryptography.hazmat.primitives.asymmetric import ec
+    from cryptography.x509.oid import ExtendedKeyUsageOID
 
-    now = datetime.datetime.now(datetime.timezone.utc)
-    not_after = now + datetime.timedelta(days=days)
-    if authority is not None:
-        not_after = min(not_after, authority.not_valid_after_utc)
+    key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name(
         [
             x509.NameAttribute(x509.NameOID.ORGANIZATIONAL_UNIT_NAME, role.value if role else "ca"),
             x509.NameAttribute(x509.NameOID.COMMON_NAME, common_name),
         ]
     )
+    now = datetime.datetime.now(datetime.timezone.utc)
+    not_after = now + datetime.timedelta(days=days)
+    signer, issued_by = key, subject
+    if issuer is not None:
+        signer, issued_by = issuer[1], issuer[0].subject
+        not_after = min(not_after, issuer[0].not_valid_after_utc)
     identifier = x509.SubjectKeyIdentifier.from_public_key(signer.public_key())
+    usage = x509.KeyUsage(
+        digital_signature=role is not None,
+        key_cert_sign=role is None,
+        crl_sign=role is None,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(authority.subject if authority is not None else subject)
-        .public_key(public_key)
+        .issuer_name(issued_by)
+        .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(now - BACKDATE)
         .not_valid_after(not_after)
@@ -191,45 +183,26 @@ def _sign(
             x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier),
             critical=False,
         )
-        .add_extension(x509.SubjectKeyIdentifier.from_public_key(public_key), critical=False)
-        .add_extension(_key_usage(is_authority=role is None), critical=True)
+        .add_extension(x509.SubjectKeyIdentifier.from_public_key(key.public_key()), critical=False)
+        .add_extension(usage, critical=True)
     )
     if role is not None:
+        asks, answers = ExtendedKeyUsageOID.CLIENT_AUTH, ExtendedKeyUsageOID.SERVER_AUTH
+        usages = {
+            Role.ROBOT: [asks],
+            Role.REPLICA: [answers],
+            Role.GATEWAY: [answers, asks],
+            Role.RENDEZVOUS: [answers],
+            # Good for no connection at all: neither end of TLS accepts it.
+            Role.MANAGER: [ExtendedKeyUsageOID.CODE_SIGNING],
+        }
         builder = builder.add_extension(
             x509.SubjectAlternativeName([x509.DNSName(common_name)]), critical=False
-        ).add_extension(x509.ExtendedKeyUsage(_usages(role)), critical=True)
-    return builder.sign(signer, hashes.SHA256())
-
-
-def _usages(role: Role) -> list[x509.ObjectIdentifier]:
-    from cryptography.x509.oid import ExtendedKeyUsageOID
-
-    asks = ExtendedKeyUsageOID.CLIENT_AUTH
-    answers = ExtendedKeyUsageOID.SERVER_AUTH
-    return {
-        Role.ROBOT: [asks],
-        Role.REPLICA: [answers],
-        Role.GATEWAY: [answers, asks],
-        Role.RENDEZVOUS: [answers],
-        # Good for no connection at all: neither end of TLS accepts it.
-        Role.MANAGER: [ExtendedKeyUsageOID.CODE_SIGNING],
-    }[role]
-
-
-def _key_usage(*, is_authority: bool) -> x509.KeyUsage:
-    from cryptography import x509
-
-    return x509.KeyUsage(
-        digital_signature=not is_authority,
-        key_cert_sign=is_authority,
-        crl_sign=is_authority,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        encipher_only=False,
-        decipher_only=False,
-    )
+        ).add_extension(x509.ExtendedKeyUsage(usages[role]), critical=True)
+    pem = serialization.Encoding.PEM
+    form, encryption = serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    signed = builder.sign(signer, hashes.SHA256())
+    return signed.public_bytes(pem), key.private_bytes(pem, form, encryption)
 
 
 def _load_authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
@@ -272,19 +245,3 @@ def _reason(error: Exception) -> str:
 def _name(certificate: x509.Certificate, oid: x509.ObjectIdentifier) -> str:
     attributes = certificate.subject.get_attributes_for_oid(oid)
     return str(attributes[0].value) if attributes else ""
-
-
-def _key_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    from cryptography.hazmat.primitives import serialization
-
-    return key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
-    )
-
-
-def _certificate_pem(certificate: x509.Certificate) -> bytes:
-    from cryptography.hazmat.primitives import serialization
-
-    return certificate.public_bytes(serialization.Encoding.PEM)
