@@ -97,7 +97,7 @@ def real(home: Path) -> Iterator[tuple[InstalledSky, Any, Any]]:
 
     silent = mock.create_autospec(sdk)
     installed = InstalledSky()
-    installed.modules = (sky, silent)
+    installed.sky, installed.sdk = sky, silent
     yield installed, silent, sky
     skypilot_config._set_loaded_config(before)
 
@@ -551,7 +551,7 @@ def test_an_api_server_of_another_skypilot_is_named_and_ended_only_when_idle(
 
     assert {"version"} <= set(APIHealthResponse.model_fields)
     installed, sdk = InstalledSky(), mock.create_autospec(sky.client.sdk)
-    installed.modules = (sky, sdk)
+    installed.sky, installed.sdk = sky, sdk
     local = mock.Mock(return_value=True)
     monkeypatch.setattr("sky.server.common.is_api_server_local", local)
     sdk.api_info.return_value = SimpleNamespace(version=sky.__version__)

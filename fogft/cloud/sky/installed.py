@@ -50,7 +50,11 @@ def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
     def decorate(call: F) -> F:
         @functools.wraps(call)
         def limited(self: InstalledSky, *args: Any) -> Any:
-            return self._calls.within(limit_s, subject.format(*args), lambda: call(self, *args))
+            def run() -> Any:
+                self._load()
+                return call(self, *args)
+
+            return self._calls.within(limit_s, subject.format(*args), run)
 
         return cast(F, limited)
 
@@ -67,7 +71,8 @@ class InstalledSky:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.modules: tuple[Any, Any] | None = None
+        self.sky: Any = None  # the two modules, once they are used
+        self.sdk: Any = None
         self._calls = Calls()
         self._settings = Settings()
 
@@ -75,62 +80,53 @@ class InstalledSky:
     def launch(self, task: Mapping[str, Any], name: str, group: str = "") -> str:
         """Order a cluster; return the request's id, long before the cluster runs.
 
-        Args:
-            task: The task, as SkyPilot reads it.
-            name: The cluster's name.
-            group: The security group that it is in, on AWS; empty for SkyPilot's own.
+        `group` is the security group that it is in, on AWS; empty for SkyPilot's own.
         """
-        sky, sdk = self._sky()
         with as_answer():
-            made = sky.Task.from_yaml_config(dict(task))
+            made = self.sky.Task.from_yaml_config(dict(task))
         cloud = str((task.get("resources") or {}).get("infra", "")).split("/")[0]
         self._settings.apply([cloud], replica_of(name), group)
-        return str(sdk.launch(made, cluster_name=name))
+        return str(self.sdk.launch(made, cluster_name=name))
 
     @_limited(ASK_LIMIT_S, "the requests of `{0}`")
     def launches(self, name: str) -> Sequence[Request]:
         """List the launch requests of a cluster that the API server knows, oldest first."""
-        _, sdk = self._sky()
-        found = _asked(sdk, all_status=True, cluster_name=name)
+        found = self._asked(all_status=True, cluster_name=name)
         found = [r for r in found if r.name == "sky.launch" and r.cluster_name == name]
         return [request_of(r) for r in sorted(found, key=lambda r: r.created_at)]
 
     @_limited(ASK_LIMIT_S, "request {0}")
     def request(self, id: str) -> Request | None:
         """Return how a request is doing; None when the API server does not know it."""
-        _, sdk = self._sky()
-        found = _asked(sdk, request_ids=[id])
+        found = self._asked(request_ids=[id])
         return next((request_of(r) for r in found if r.request_id == id), None)
 
     @_limited(ASK_LIMIT_S, "the outcome of request {0}")
     def launched_job(self, id: str) -> int | None:
         """Return the job's number of a launch request; refused if that failed or was cancelled."""
-        _, sdk = self._sky()
         with as_answer():
-            job, _ = sdk.get(id)
+            job, _ = self.sdk.get(id)
         return None if job is None else int(job)
 
     @_limited(ASK_LIMIT_S, "the abort of request {0}")
     def cancel(self, id: str) -> None:
         """Abort a request; return when that is done. One that has ended is no error."""
-        _, sdk = self._sky()
-        sdk.get(sdk.api_cancel([id], silent=True))
+        self.sdk.get(self.sdk.api_cancel([id], silent=True))
 
     def clusters(self, name: str | None, *, refresh: bool) -> Sequence[Cluster]:
-        """List one cluster, or all of them.
+        """List one cluster, or all where no name is given.
 
-        Args:
-            name: The only one of interest; None for all.
-            refresh: Ask the clouds themselves (seconds), instead of SkyPilot's memory.
+        `refresh` asks the clouds themselves (seconds), instead of SkyPilot's memory.
         """
 
         def run() -> Sequence[Cluster]:
-            sky, sdk = self._sky()
-            mode = sky.StatusRefreshMode.FORCE if refresh else sky.StatusRefreshMode.NONE
+            self._load()
+            modes = self.sky.StatusRefreshMode
+            mode = modes.FORCE if refresh else modes.NONE
             names = None if name is None else [name]
             # Of all users: who lost `~/.sky/user_hash` is another user to SkyPilot, and the
             # machines still cost the same person. The pool's uid tells them apart.
-            found = sdk.get(sdk.status(names, refresh=mode, all_users=True))
+            found = self.sdk.get(self.sdk.status(names, refresh=mode, all_users=True))
             return [cluster_of(record) for record in found]
 
         limit_s = REFRESH_LIMIT_S if refresh else ASK_LIMIT_S
@@ -140,17 +136,15 @@ class InstalledSky:
     @_limited(JOB_LIMIT_S, "the job of `{0}`")
     def job(self, name: str, number: int | None) -> JobState:
         """Return the state of a cluster's job, its last one if `number` is None."""
-        _, sdk = self._sky()
-        states = sdk.get(sdk.job_status(name, None if number is None else [number]))
+        states = self.sdk.get(self.sdk.job_status(name, None if number is None else [number]))
         state = next(iter(states.values()), None)
         return JobState.MISSING if state is None else JOBS.get(state.value, JobState.ENDED)
 
     @_limited(ASK_LIMIT_S, "the address of `{0}`")
     def endpoint(self, name: str, port: int) -> str:
         """Return ``host:port`` where a port of a cluster is reached; refused until it is mapped."""
-        _, sdk = self._sky()
         with as_answer():
-            found = sdk.get(sdk.endpoints(name, port))
+            found = self.sdk.get(self.sdk.endpoints(name, port))
         told = {int(key): str(value) for key, value in found.items()}
         if not told.get(port):
             raise RefusedError("ValueError", [f"port {port} of `{name}` is not mapped"])
@@ -158,31 +152,23 @@ class InstalledSky:
 
     def job_log(self, name: str, number: int | None, lines: int) -> str:
         """Return the end of a job's log; empty when there is none."""
-        _, sdk = self._sky()
-        return self._log(
-            lambda out: sdk.tail_logs(name, number, follow=False, tail=lines, output_stream=out)
-        )
+        return self._log(lines, lambda **how: self.sdk.tail_logs(name, number, **how))
 
     def provision_log(self, name: str, lines: int) -> str:
         """Return the end of the log of a cluster's launch; empty when there is none."""
-        _, sdk = self._sky()
-        return self._log(
-            lambda out: sdk.tail_provision_logs(name, follow=False, tail=lines, output_stream=out)
-        )
+        return self._log(lines, lambda **how: self.sdk.tail_provision_logs(name, **how))
 
     @_limited(DOWN_LIMIT_S, "the stop of `{0}`")
     def stop(self, name: str) -> None:
         """Stop a cluster; return when SkyPilot says that it has stopped."""
-        _, sdk = self._sky()
         with as_answer():
-            sdk.get(sdk.stop(name))
+            self.sdk.get(self.sdk.stop(name))
 
     @_limited(DOWN_LIMIT_S, "the end of `{0}`")
     def down(self, name: str) -> None:
         """End a cluster; return when SkyPilot says that it is gone. Missing is no error."""
-        _, sdk = self._sky()
         try:
-            sdk.get(sdk.down(name))
+            self.sdk.get(self.sdk.down(name))
         except Exception as error:
             if type(error).__name__ != "ClusterDoesNotExist":
                 raise
@@ -190,31 +176,28 @@ class InstalledSky:
     @_limited(REFRESH_LIMIT_S, "the catalogue of prices")
     def offers(self, resources: Mapping[str, Any]) -> Sale:
         """Return what the catalogue sells for a `resources` section as it will be launched."""
-        sky, sdk = self._sky()
         with as_answer():
-            asked = sky.Resources.from_yaml_config(copy.deepcopy(dict(resources)))
+            asked = self.sky.Resources.from_yaml_config(copy.deepcopy(dict(resources)))
+        names = []
         if any(one.cloud is None for one in asked):
-            enabled = sdk.get(sdk.enabled_clouds())
-            return catalogue.sale(asked, [sky.CLOUD_REGISTRY.from_str(name) for name in enabled])
-        return catalogue.sale(asked, ())
+            names = self.sdk.get(self.sdk.enabled_clouds())
+        return catalogue.sale(asked, [self.sky.CLOUD_REGISTRY.from_str(name) for name in names])
 
     @_limited(REFRESH_LIMIT_S, "the features of clouds")
     def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
         """Return what each cloud with VMs lacks for such a `resources` section."""
-        sky, _ = self._sky()
         found = {}
         for name in VM_CLOUDS:
-            (asked,) = sky.Resources.from_yaml_config({**resources, "cloud": name})
-            found[name] = catalogue.missing(sky.CLOUD_REGISTRY.from_str(name), asked)
+            (asked,) = self.sky.Resources.from_yaml_config({**resources, "cloud": name})
+            found[name] = catalogue.missing(self.sky.CLOUD_REGISTRY.from_str(name), asked)
         return found
 
     @_limited(CHECK_LIMIT_S, "the check of credentials")
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
         """Test the credentials of clouds, all if none is named: cloud -> "" or what is wrong."""
-        _, sdk = self._sky()
         told = io.StringIO()
-        request = sdk.check(tuple(clouds) or None, verbose=False)
-        enabled = sdk.stream_and_get(request, output_stream=told)
+        request = self.sdk.check(tuple(clouds) or None, verbose=False)
+        enabled = self.sdk.stream_and_get(request, output_stream=told)
         usable = {
             cloud.lower()
             for workspace in enabled.values()
@@ -234,23 +217,22 @@ class InstalledSky:
 
         The next call starts one of the installed SkyPilot.
         """
-        sky, sdk = self._sky()
         try:
-            found = str(getattr(sdk.api_info(), "version", None) or sky.__version__)
+            found = str(getattr(self.sdk.api_info(), "version", None) or self.sky.__version__)
         except Exception as error:
             if type(error).__name__ in ("ApiServerConnectionError", "RuntimeError"):
                 return ""  # there is none: it will be of this version
             raise
-        if found == sky.__version__:
+        if found == self.sky.__version__:
             return ""
-        both = f"SkyPilot's API server is {found}, but {sky.__version__} is installed here"
+        both = f"SkyPilot's API server is {found}, but {self.sky.__version__} is installed here"
         if not importlib.import_module("sky.server.common").is_api_server_local():
             return both
         own = importlib.import_module("sky.skylet.constants").SKYPILOT_SYSTEM_USER_ID
-        asked = [one for one in sdk.api_status() if own not in (one.user_id, one.user_name)]
+        asked = [one for one in self.sdk.api_status() if own not in (one.user_id, one.user_name)]
         if any(request_of(one).active for one in asked):  # what it does for itself never ends
             return f"{both}: it is busy; run `sky api stop` once it is idle"
-        sdk.api_stop()
+        self.sdk.api_stop()
         return f"{both}: it was idle and has been restarted"
 
     @_limited(REFRESH_LIMIT_S, "the credentials that a VM would get")
@@ -259,36 +241,38 @@ class InstalledSky:
 
         None: the API server is elsewhere, and decides which of its own it gives away.
         """
-        self._sky()
         return self._settings.uploaded(clouds)
 
-    def _log(self, read: Callable[[io.StringIO], object]) -> str:
+    def _log(self, lines: int, read: Callable[..., object]) -> str:
+        self._load()
         out = io.StringIO()
         with contextlib.suppress(CloudError):  # a log that is missing must not hide the failure
-            self._calls.within(JOB_LIMIT_S, f"log {id(out)}", lambda: read(out))
+            self._calls.within(
+                JOB_LIMIT_S,
+                f"log {id(out)}",
+                lambda: read(follow=False, tail=lines, output_stream=out),
+            )
         return out.getvalue()
 
-    def _sky(self) -> tuple[Any, Any]:
+    def _load(self) -> None:
         with self._lock:
-            if self.modules is None:
-                report_nothing()
-                try:
-                    self.modules = (
-                        importlib.import_module("sky"),
-                        importlib.import_module("sky.client.sdk"),
-                    )
-                except ImportError as error:
-                    raise CloudError(
-                        f"SkyPilot cannot be used here: {error}",
-                        "`pip install 'fogft[cloud]'`, or run with `--cloud local`",
-                    ) from error
-            return self.modules
+            if self.sdk is not None:
+                return
+            report_nothing()
+            try:
+                self.sky = importlib.import_module("sky")
+                self.sdk = importlib.import_module("sky.client.sdk")
+            except ImportError as error:
+                raise CloudError(
+                    f"SkyPilot cannot be used here: {error}",
+                    "`pip install 'fogft[cloud]'`, or run with `--cloud local`",
+                ) from error
 
-
-def _asked(sdk: Any, **filters: Any) -> list[Any]:
-    """Return requests. Without the first call a local server that died would say "none"."""
-    try:
-        sdk.api_info()  # also tells the client which filters this server knows
-    except Exception:
-        sdk.status(["fogft-is-the-server-there"])  # starts a local one; says what ails a remote one
-    return list(sdk.api_status(**filters))
+    def _asked(self, **filters: Any) -> list[Any]:
+        """Return requests. Without the first call a local server that died would say "none"."""
+        try:
+            self.sdk.api_info()  # also tells the client which filters this server knows
+        except Exception:
+            # Starts a local one; says what ails a remote one.
+            self.sdk.status(["fogft-is-the-server-there"])
+        return list(self.sdk.api_status(**filters))
