@@ -1,8 +1,9 @@
 """Watch for the preemption notice of the machine that this process runs on.
 
 A thread asks the cloud's metadata server (AWS, GCP, Azure: a link-local address that only the
-machine itself reaches) or looks at a file, about once a second, and reports each kind of
-notice once. A metadata server that does not answer is no news: on most machines there is none.
+machine itself reaches) or looks at a file. A source says whether it exists here (`is_here`), and
+yields the notices in force (`ask`), again each time; OSError where it does not answer, which is
+no news: on most machines there is no metadata server.
 
 Not here: reading the answers (`notice_formats`) and what a replica does about it.
 """
@@ -14,7 +15,7 @@ import http.client
 import logging
 import os
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from fogft.cloud import notice_formats
@@ -24,7 +25,7 @@ from fogft.model.names import NOTICE_SOURCES
 
 log = logging.getLogger(__name__)
 
-__all__ = ["Notice", "NoticeKind", "Watch", "watch"]
+__all__ = ["Notice", "NoticeKind", "Watch"]
 
 POLL_S = 1.0
 FILE_POLL_S = 0.1  # costs nothing, and a local machine may live for a second only
@@ -35,29 +36,29 @@ _METADATA = "169.254.169.254"
 _ELSEWHERE = {"aws": "AWS_EC2_METADATA_SERVICE_ENDPOINT", "gcp": "GCE_METADATA_HOST"}
 
 
-class Source:
-    """Something that can be asked for notices."""
-
-    def is_here(self) -> bool:
-        """Whether this source exists on this machine. Raises OSError: it does not answer."""
-        raise NotImplementedError
-
-    def ask(self) -> Iterator[Notice | None]:
-        """Yield the notices in force now, again each time. Raises OSError: it does not answer."""
-        raise NotImplementedError
-
-
 class Watch:
-    """A watch that runs until it is closed."""
+    """A watch on a thread of its own, which runs until it is closed.
+
+    Args:
+        source: ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers.
+        on_notice: Called from that thread, once for each kind of notice; must not block.
+        metadata: ``host[:port]`` of the metadata server; None for where the environment says.
+    """
 
     def __init__(
-        self, sources: Sequence[Source], on_notice: Callable[[Notice], None], poll_s: float
+        self,
+        source: str,
+        on_notice: Callable[[Notice], None],
+        *,
+        poll_s: float | None = None,
+        metadata: str | None = None,
     ) -> None:
-        self._sources = list(sources)
+        self._sources = _sources(source, metadata)
         self._on_notice = on_notice
-        self._poll_s = poll_s
+        usual_s = FILE_POLL_S if isinstance(self._sources[0], _File) else POLL_S
+        self._poll_s = usual_s if poll_s is None else poll_s
         self._told: set[NoticeKind] = set()
-        self._source: Source | None = None
+        self._source: _Source | None = None
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="notice", daemon=True)
         self._thread.start()
@@ -88,7 +89,7 @@ class Watch:
             lost = source is None or failures >= 5
             self._closed.wait(max(self._poll_s, LOST_POLL_S) if lost else self._poll_s)
 
-    def _tell(self, source: Source) -> None:
+    def _tell(self, source: _Source) -> None:
         for notice in source.ask():
             if notice is None or notice.kind in self._told or self._closed.is_set():
                 continue
@@ -100,36 +101,20 @@ class Watch:
             self._on_notice(notice)
 
 
-def watch(
-    source: str,
-    on_notice: Callable[[Notice], None],
-    *,
-    poll_s: float | None = None,
-    metadata: str | None = None,
-) -> Watch:
-    """Start to watch on a thread of its own.
-
-    Args:
-        source: ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers.
-        on_notice: Called from that thread, once for each kind of notice; must not block.
-        metadata: ``host[:port]`` of the metadata server; None for where the environment says.
-    """
+def _sources(source: str, metadata: str | None) -> list[_Source]:
     if source.startswith("file:") and source != "file:":
-        sources: list[Source] = [_File(Path(source.removeprefix("file:")))]
-        poll_s = FILE_POLL_S if poll_s is None else poll_s
-    elif source in NOTICE_SOURCES:
-        known: dict[str, Source] = {
-            "aws": _Aws(metadata or _address("aws")),
-            "gcp": _Gcp(metadata or _address("gcp"), **{"Metadata-Flavor": "Google"}),
-            "azure": _Azure(metadata or _METADATA, Metadata="true"),
-        }
-        sources = list(known.values()) if source == "auto" else [known[source]]
-    else:
+        return [_File(Path(source.removeprefix("file:")))]
+    if source not in NOTICE_SOURCES:
         raise CloudError(
             f"unknown source of preemption notices `{source}`",
             f"`file:PATH`, {', '.join(f'`{name}`' for name in NOTICE_SOURCES)}",
         )
-    return Watch(sources, on_notice, POLL_S if poll_s is None else poll_s)
+    known: dict[str, _Source] = {
+        "aws": _Aws(metadata or _address("aws")),
+        "gcp": _Gcp(metadata or _address("gcp"), **{"Metadata-Flavor": "Google"}),
+        "azure": _Azure(metadata or _METADATA, Metadata="true"),
+    }
+    return list(known.values()) if source == "auto" else [known[source]]
 
 
 def _address(cloud: str) -> str:
@@ -137,13 +122,13 @@ def _address(cloud: str) -> str:
     return told or _METADATA
 
 
-def _is_here(source: Source) -> bool:
+def _is_here(source: _Source) -> bool:
     with contextlib.suppress(OSError):
         return source.is_here()
     return False
 
 
-class _File(Source):
+class _File:
     def __init__(self, path: Path) -> None:
         self._path = path
 
@@ -158,7 +143,7 @@ class _File(Source):
             yield notice_formats.file_notice(self._path.read_text(errors="replace"))
 
 
-class _Server(Source):
+class _Server:
     """A metadata server: plain HTTP, never through a proxy, answers of a few kilobytes."""
 
     def __init__(self, address: str, **headers: str) -> None:
@@ -232,3 +217,6 @@ class _Azure(_Server):
         # The first question of all can take two minutes, while Azure begins to schedule.
         path = "/metadata/scheduledevents?api-version=2020-07-01"
         yield notice_formats.azure_events(self._read(path), self._machine)
+
+
+_Source = _File | _Aws | _Gcp | _Azure

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.cloud import notice_formats as formats
-from fogft.cloud.notice import Notice, NoticeKind, Watch, watch
+from fogft.cloud.notice import Notice, NoticeKind, Watch
 from fogft.errors import CloudError
 from tests.cloud.fake_metadata import FakeMetadata, serving
 
@@ -30,7 +30,7 @@ class Heard:
         self.watches: list[Watch] = []
 
     def watch(self, source: str, metadata: str | None = "127.0.0.1:1") -> None:
-        self.watches.append(watch(source, self.notices.put, poll_s=0.01, metadata=metadata))
+        self.watches.append(Watch(source, self.notices.put, poll_s=0.01, metadata=metadata))
 
     def next(self) -> Notice:
         return self.notices.get(timeout=WITHIN_S)
@@ -160,7 +160,7 @@ def test_where_there_is_no_metadata_server_nothing_is_heard():
     """`auto` on a robot or a workstation is silent, and its thread ends when told to."""
     told: list[Notice] = []
     before = set(threading.enumerate())
-    one = watch("auto", told.append, poll_s=0.01, metadata="127.0.0.1:1")
+    one = Watch("auto", told.append, poll_s=0.01, metadata="127.0.0.1:1")
     [thread] = set(threading.enumerate()) - before
     one.close()
     thread.join(WITHIN_S)
@@ -171,7 +171,7 @@ def test_where_there_is_no_metadata_server_nothing_is_heard():
 @pytest.mark.parametrize("source", ["", "ibm", "file:", "AWS"])
 def test_an_unknown_source_is_refused_with_the_known_ones(source: str):
     with pytest.raises(CloudError) as caught:
-        watch(source, lambda notice: None)
+        Watch(source, lambda notice: None)
     assert "`auto`" in caught.value.hint
 
 

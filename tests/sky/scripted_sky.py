@@ -11,6 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from fogft.cloud.port import Launch
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.provider import Instance, NotAllowedError
 from fogft.cloud.sky.sdk import (
@@ -314,6 +315,11 @@ class ScriptedSky:
             raise CloudUnreachable("SkyPilot did not answer")
         if self.errors.get(call):
             raise self.errors[call].pop(0)
+
+
+def labels(id: ReplicaId, usd_per_hour: float = 0.02) -> dict[str, str]:
+    """Return the labels of a replica's machine."""
+    return naming.labels(Launch(id, "p", EAST, usd_per_hour, "abcd"), "ann@robot")
 
 
 def replica(slot: int = 0, generation: int = 1, uid: str = "00000000000000aa") -> ReplicaId:

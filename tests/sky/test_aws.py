@@ -15,9 +15,8 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.provider import NotAllowedError
 from fogft.errors import CloudError, CloudUnreachable
-from fogft.model.replica import ReplicaId
 from tests.needs import needs
-from tests.sky.scripted_sky import replica
+from tests.sky.scripted_sky import labels, replica
 
 IMAGE = "ami-1e749f67"
 OTHER = replica(uid="00000000000000bb")
@@ -33,10 +32,6 @@ def launch(region: str, labels: dict[str, str], **more: Any) -> str:
         TagSpecifications=[{"ResourceType": "instance", "Tags": tags}], **more,
     )  # fmt: skip
     return str(made["Instances"][0]["InstanceId"])
-
-
-def labels(id: ReplicaId) -> dict[str, str]:
-    return naming.labels(id, pool="p", owner="ann", spec_hash="abcd", usd_per_hour=0.02)
 
 
 @pytest.fixture

@@ -75,8 +75,8 @@ def test_a_permission_that_is_missing_is_named_however_long_the_caller_is_called
 
 def test_the_tail_of_a_log_is_its_last_lines_that_say_something():
     log = "\n".join(f"\x1b[36mline {n}\x1b[0m\n" for n in range(50))
-    assert tail(log, lines=3) == "line 47\nline 48\nline 49"
-    assert tail("x" * 900, width=10) == "x" * 10
+    assert tail(log, lines=3) == "\nline 47\nline 48\nline 49"
+    assert tail("x" * 900, width=10) == "\n" + "x" * 10
     assert tail("") == ""
 
 
@@ -87,7 +87,7 @@ def test_the_tail_leaves_out_who_spoke_and_what_skypilot_says_of_itself():
         "(perception, pid=12) (not a speaker) stays\n"
         "\x1b[32m✓ Job finished (status: FAILED_SETUP).\x1b[0m\n"
     )
-    assert tail(log) == "no such package: yolo\n(not a speaker) stays"
+    assert tail(log) == "\nno such package: yolo\n(not a speaker) stays"
 
 
 def test_of_a_launchs_log_the_last_try_counts():

@@ -18,7 +18,7 @@ from fogft.planning.observed.backoff import LIMIT_S
 from fogft.planning.observed.history import EventKind
 from fogft.pool.manager import teardown
 from tests.sky.pool_on_sky import NORTH, UID, PoolOnSky
-from tests.sky.scripted_sky import EAST, WEST, replica
+from tests.sky.scripted_sky import EAST, WEST, labels, replica
 
 FIRST = cluster_name(replica(0, 1))
 EVERYWHERE = {infra(EAST), infra(WEST), infra(NORTH)}
@@ -345,11 +345,8 @@ def end(pool: PoolOnSky, ended: list[str], known: teardown.Known | None = None) 
 
 def resources(id: ReplicaId) -> dict[str, object]:
     """Return the resources of an order for `EAST`, as SkyPilot gets them."""
-    from fogft.cloud.sky import naming
-
-    labels = naming.labels(id, pool="p", owner="ann@robot", spec_hash="x", usd_per_hour=0.02)
     return {
-        "infra": infra(EAST), "instance_type": "m6i.large", "use_spot": True, "labels": labels
+        "infra": infra(EAST), "instance_type": "m6i.large", "use_spot": True, "labels": labels(id)
     }  # fmt: skip
 
 

@@ -14,12 +14,13 @@ from typing import Any
 
 import pytest
 
-from fogft.cloud.sky import gcp, naming
+from fogft.cloud.sky import gcp
 from fogft.cloud.sky.gcp import Gcp
 from fogft.cloud.sky.provider import NotAllowedError
 from fogft.errors import CloudUnreachable
 from fogft.model.replica import ReplicaId
 from tests.needs import needs
+from tests.sky import scripted_sky
 from tests.sky.scripted_sky import replica
 
 pytestmark = needs("skypilot")
@@ -40,7 +41,7 @@ class Compute:
         name = f"vm-{len(self.machines)}"
         labels = {"team": "arms"}
         if id is not None:
-            labels |= naming.labels(id, pool="p", owner="ann", spec_hash="abcd", usd_per_hour=0.02)
+            labels |= scripted_sky.labels(id)
         url = f"https://www.googleapis.com/compute/v1/projects/{PROJECT}/zones/{zone}"
         self.machines[f"zones/{zone}/instances/{name}"] = {
             "name": name, "zone": url, "machineType": f"{url}/machineTypes/n2-standard-2",

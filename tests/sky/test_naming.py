@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from fogft.cloud.sky import naming
 from fogft.model.replica import Placement, ReplicaId
+from tests.sky.scripted_sky import labels
 
 ids = st.builds(
     ReplicaId,
@@ -21,7 +22,7 @@ ids = st.builds(
 def test_a_name_and_its_labels_give_the_id_back(id: ReplicaId):
     """Whoever finds the machine, by name or by labels, knows whose it is."""
     assert naming.replica_of(naming.cluster_name(id)) == id
-    found = naming.labels(id, pool="p", owner="o", spec_hash="s", usd_per_hour=0.0213)
+    found = labels(id, 0.0213)
     assert naming.replica_of_labels(found) == id
     assert naming.usd_per_hour(found) == 0.0213
 

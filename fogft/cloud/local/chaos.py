@@ -1,8 +1,4 @@
-"""Inject faults into the local cloud. Called by ``fogft chaos``.
-
-Everything is written to files that the machines watch, or is a signal; nothing here has to
-live on for a fault to last or to end.
-"""
+"""Inject faults into the local cloud, by files that the machines watch and by signals."""
 
 from __future__ import annotations
 
@@ -10,15 +6,16 @@ import contextlib
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from fogft import disk
 from fogft.cloud.local import ending, faults, processes
 from fogft.cloud.local.catalogue import CLOUD
 from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.local.faults import CloudFaults, LinkFaults
-from fogft.cloud.local.folder import LINK, MachineFolder
+from fogft.cloud.local.folder import LINK, NOTICE, MachineFolder
 from fogft.errors import CloudError
 from fogft.model.replica import ReplicaId
 from fogft.poolfile.tree import nearest, shown
@@ -45,7 +42,7 @@ class Chaos:
         now = time.time()
         if notice_s is None:
             notice_s = folder.record().zone.notice_s
-        return max(0.0, folder.ask_end(now + notice_s, notice=True) - now)
+        return max(0.0, folder.ask_end(now + notice_s, NOTICE) - now)
 
     def kill(self, id: ReplicaId) -> None:
         """End a machine at once, with SIGKILL; return when it is gone."""
@@ -81,16 +78,12 @@ class Chaos:
         """
         if not 0 <= delay_s <= 3600 or not (rate_bytes_per_s is None or rate_bytes_per_s >= 1):
             raise CloudError("the delay is out of range", "give a delay of 0 to 3600 s")
-        until, rate = _deadline(for_s), rate_bytes_per_s
-        self._change_link(
-            id,
-            lambda old: replace(old, delay_s=delay_s, rate_bytes_per_s=rate, slow_until=until),
-        )
+        until = _deadline(for_s)
+        self._change_link(id, delay_s=delay_s, rate_bytes_per_s=rate_bytes_per_s, slow_until=until)
 
     def blackhole(self, id: ReplicaId, for_s: float | None = None) -> None:
         """Drop all traffic to and from a machine; connections stay open. None: until `clear`."""
-        until = _deadline(for_s)
-        self._change_link(id, lambda old: replace(old, blackhole=True, blackhole_until=until))
+        self._change_link(id, blackhole=True, blackhole_until=_deadline(for_s))
 
     # -- locations; `region`, `region/zone`, with or without `local/` before -----------------
 
@@ -122,7 +115,7 @@ class Chaos:
         for folder, _ in self._cloud.living():
             with contextlib.suppress(CloudError):  # it has just ended, or has no relay
                 self.thaw(folder.id)
-                self._change_link(folder.id, lambda _: LinkFaults())
+                self._change_link(folder.id, **asdict(LinkFaults()))
 
     # -- inside -----------------------------------------------------------------------------
 
@@ -135,7 +128,7 @@ class Chaos:
             )
         return folder
 
-    def _change_link(self, id: ReplicaId, change: Callable[[LinkFaults], LinkFaults]) -> None:
+    def _change_link(self, id: ReplicaId, **changes: Any) -> None:
         folder = self._living(id)
         if not folder.record().zone.relay:
             raise CloudError(
@@ -144,7 +137,7 @@ class Chaos:
             )
         with disk.locked(folder.path / "link.lock"):
             path = folder.path / LINK
-            faults.write(path, change(faults.read_link(path)))
+            faults.write(path, replace(faults.read_link(path), **changes))
 
     def _change_cloud(self, change: Callable[[CloudFaults], CloudFaults]) -> None:
         with ending.cloud_lock(self._root):

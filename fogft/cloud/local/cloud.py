@@ -39,8 +39,7 @@ _UNKNOWN = Placement("local", "unknown", "unknown", "unknown")
 class LocalCloud:
     """Replicas as processes on this machine (`fogft.cloud.port.Cloud`). Any thread, any process.
 
-    `serve` starts a server proxy; it gets ``--config``, ``--listen``, ``--domain-id``,
-    ``--workdir`` and ``--notice-file``.
+    `serve` is the command that starts a server proxy, without its options.
     """
 
     def __init__(self, root: Path, serve: Sequence[str] = SERVE) -> None:

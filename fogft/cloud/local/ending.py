@@ -1,8 +1,7 @@
 """End machines for good: their processes, their folder, their shared memory. Keep their log.
 
-Owns: what "gone" means. A machine is gone when none of its processes is left and its folder
-has been removed; then its log stands in ``logs/``, which also marks its id as used.
-Not here: who decides that one goes (`cloud`, `chaos`). `CloudUnreachable` says that it is not sure.
+A machine is gone when none of its processes is left and its folder has been removed; then its
+log stands in ``logs/``, which also marks its id as used. `CloudUnreachable`: it is not sure.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.cloud.local import processes
-from fogft.cloud.local.folder import LOCK, STATE, Life, MachineFolder, remove
+from fogft.cloud.local.folder import END, LOCK, NOTICE, STATE, Life, MachineFolder, remove
 from fogft.errors import CloudUnreachable, StateError
 from fogft.model.replica import ReplicaId
 
@@ -69,10 +68,10 @@ def bury(root: Path, folder: MachineFolder) -> bool:
 def overdue(folder: MachineFolder, now: float, patience_s: float = 1.0) -> bool:
     """Return whether a machine should have ended by itself and has not: it is frozen."""
     try:
-        times = (folder.notice_at(), folder.end_at())
-        return folder.life(now) is Life.ALIVE and any(
-            at is not None and now > at + patience_s for at in times
+        late = any(
+            at is not None and now > at + patience_s for at in map(folder.due, (NOTICE, END))
         )
+        return late and folder.life(now) is Life.ALIVE
     except StateError:
         return False
 
@@ -108,17 +107,12 @@ def _remove(root: Path, folder: MachineFolder, *, keep_log: bool) -> None:
             folder.log.touch(mode=0o600)
             disk.make_folder(root / "logs")
             os.replace(folder.log, kept_log(root, folder.id))
-            _prune(root / "logs")
+            logs = sorted((root / "logs").glob("*.log"), key=lambda path: path.stat().st_mtime)
+            for path in logs[:-LOGS_KEPT]:
+                path.unlink(missing_ok=True)
         remove(folder.path)
     except (OSError, StateError) as error:
         raise CloudUnreachable(f"`{folder.path}` cannot be removed: {error}") from error
-
-
-def _prune(logs: Path) -> None:
-    """Keep the last logs only."""
-    kept = sorted(logs.glob("*.log"), key=lambda path: path.stat().st_mtime)
-    for path in kept[:-LOGS_KEPT]:
-        path.unlink(missing_ok=True)
 
 
 def sweep_shared_memory() -> None:

@@ -1,13 +1,12 @@
 """Injected faults, as files that both sides can read at any time.
 
-A fault with a duration carries its deadline (seconds since the epoch), so it ends by
-itself, whoever set it.
+A fault with a duration carries its deadline (seconds since the epoch): it ends by itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fogft import disk
@@ -28,13 +27,10 @@ class LinkFaults:
 
     def at(self, now: float) -> LinkFaults:
         """Return the faults active at a time."""
-        slow = self.slow_until is None or now < self.slow_until
         black = self.blackhole and (self.blackhole_until is None or now < self.blackhole_until)
-        return LinkFaults(
-            delay_s=self.delay_s if slow else 0.0,
-            rate_bytes_per_s=self.rate_bytes_per_s if slow else None,
-            blackhole=black,
-        )
+        if self.slow_until is not None and now >= self.slow_until:
+            return LinkFaults(blackhole=black)
+        return replace(self, blackhole=black)
 
 
 @dataclass(frozen=True)

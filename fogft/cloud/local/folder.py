@@ -153,30 +153,18 @@ class MachineFolder:
         """Return the machine's state; None if its process never ran."""
         return disk.read_as(State, self.path / STATE)
 
-    def write_state(self, state: State) -> None:
-        """Store the machine's state. Raises `StateError` on a full disk."""
-        disk.write_json(self.path / STATE, to_plain(state), durable=False)
-
-    def notice_at(self) -> float | None:
-        """Return when a preempted machine ends; None without a notice."""
-        return self._at(NOTICE)
-
-    def end_at(self) -> float | None:
-        """Return when the machine is to end; None if no end was requested."""
-        return self._at(END)
-
-    def ask_end(self, at: float, *, notice: bool = False) -> float:
-        """Request the machine's end at a time; an earlier request wins. Returns the time."""
-        known = self._at(NOTICE if notice else END)
-        if known is not None and known <= at:
-            return known
-        value = {"action": "terminate", "at": at}
-        disk.write_json(self.path / (NOTICE if notice else END), value, durable=False)
-        return at
-
-    def _at(self, name: str) -> float | None:
+    def due(self, name: str) -> float | None:
+        """Return when the machine is to end by a `NOTICE` or a request (`END`); None for never."""
         found = disk.read_as(_Moment, self.path / name)
         return None if found is None else found.at
+
+    def ask_end(self, at: float, name: str = END) -> float:
+        """Request the machine's end at a time; an earlier request wins. Returns the time."""
+        known = self.due(name)
+        if known is not None and known <= at:
+            return known
+        disk.write_json(self.path / name, {"action": "terminate", "at": at}, durable=False)
+        return at
 
 
 @dataclass(frozen=True)

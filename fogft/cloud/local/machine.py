@@ -10,6 +10,7 @@ Not here: the path to it (`relay`), cleaning up after it (`processes`, `ending`)
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import logging
 import os
 import signal
@@ -23,8 +24,18 @@ from typing import TYPE_CHECKING
 from fogft import child, disk, logfile
 from fogft.cloud.local import faults, processes, task_commands
 from fogft.cloud.local.ending import sweep_shared_memory
-from fogft.cloud.local.folder import LINK, LOCK, NOTICE, MachineFolder, Record, State
+from fogft.cloud.local.folder import (
+    END,
+    LINK,
+    LOCK,
+    NOTICE,
+    STATE,
+    MachineFolder,
+    Record,
+    State,
+)
 from fogft.errors import FogftError, StateError
+from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from fogft.process import ENDING_SIGNALS, start_log
@@ -63,7 +74,7 @@ def main(arguments: list[str]) -> int:
     start_log()
     lock = disk.Lock(folder.path / LOCK)
     try:
-        begins = lock.acquire(wait=False) and folder.end_at() != 0
+        begins = lock.acquire(wait=False) and folder.due(END) != 0
     except FileNotFoundError:  # it has just been ended
         return 0
     if begins:
@@ -94,7 +105,9 @@ class Machine:
         for number in ENDING_SIGNALS:
             signal.signal(number, self._on_signal)
         try:
-            self._live()
+            workdir = self._boot()
+            self._set_up(workdir)
+            self._serve(workdir)
         except _Ended as ended:
             log.info("machine_ended replica=%s reason=%r", self._folder.id.short, str(ended))
         except _Failed as failed:
@@ -108,19 +121,12 @@ class Machine:
         processes.end_machine(str(self._folder.id), spare=spare)
         sweep_shared_memory()
 
-    def _live(self) -> None:
+    def _boot(self) -> Path:
+        """Return where `setup` and `run` run: the pool's own folder, used in place."""
         id, placement = self._folder.id, self._record.order.placement
         log.info("machine_boots replica=%s zone=%s", id.short, placement.location)
         booted_at = time.monotonic() + self._record.zone.boot_s
         self._wait(lambda: time.monotonic() >= booted_at)
-        workdir = self._workdir()
-        self._set_up(workdir)
-        self._serve(workdir)
-
-    # -- setup ------------------------------------------------------------------------------
-
-    def _workdir(self) -> Path:
-        """Return where `setup` and `run` run: the pool's own folder, used in place."""
         wanted = self._record.order.task.get("workdir")
         if wanted is None:
             workdir = self._folder.path / "workdir"
@@ -138,14 +144,10 @@ class Machine:
         if not command:
             return
         # One at a time in a folder: machines share it, and two builds in it would clash.
-        turn = disk.Lock(task_commands.turn_file(self._folder.path.parent.parent, workdir))
-        self._say(
-            State(
-                MachinePhase.PROVISIONING,
-                progress="waiting for another machine's setup",
-                setting_up=True,
-            )
-        )
+        name = hashlib.sha256(str(workdir.resolve()).encode()).hexdigest()[:16]
+        turn = disk.Lock(self._folder.path.parents[1] / f"setup-{name}.lock")
+        waits = "waiting for another machine's setup"
+        self._say(State(MachinePhase.PROVISIONING, progress=waits, setting_up=True))
         self._wait(lambda: turn.acquire(wait=False))
         self._say(State(MachinePhase.PROVISIONING, progress="setup", setting_up=True))
         log.info("setup_started command=%r", command)
@@ -238,12 +240,9 @@ class Machine:
             raise _Ended(f"signal {signal.Signals(self._signal).name}")
         if os.getppid() != self._guard:
             raise _Ended("its guard was killed")
-        for reason, asked in (
-            ("preempted", self._folder.notice_at),
-            ("told to", self._folder.end_at),
-        ):
+        for reason, name in (("preempted", NOTICE), ("told to", END)):
             with contextlib.suppress(StateError):  # it is damaged: nobody of ours wrote it
-                at = asked()
+                at = self._folder.due(name)
                 if at is not None and time.time() >= at:
                     raise _Ended(reason)
         if self._folder.exists:
@@ -279,7 +278,7 @@ class Machine:
 
     def _say(self, state: State) -> None:
         try:
-            self._folder.write_state(state)
+            disk.write_json(self._folder.path / STATE, to_plain(state), durable=False)
         except StateError as error:
             if not self._folder.exists:
                 raise _Ended("its folder is gone") from error

@@ -1,14 +1,13 @@
 """Find and end all processes of a machine or a pool, and tie a machine's together.
 
-All of them carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in their environment, which
-``/proc`` shows as it was when they began, whatever session or parent they have since. A
-process that was started with a clean environment is found as a descendant of one that was not.
+All of them carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in their environment, which ``/proc``
+shows as it was when they began. One that was started with a clean environment is found as a
+descendant of one that was not.
 
 None outlives the others. The process that the cloud started forks: the child is the machine, the
-parent its guard, which waits and then kills whatever is left. Both are subreapers, so even an
-orphan with a clean environment stays below one of them. The guard shares the machine's lock: the
-machine counts as alive until all of it is gone. If the guard is killed, the machine sees that its
-parent changed, and ends.
+parent its guard, which waits and then kills whatever is left. Both are subreapers. The guard shares
+the machine's lock: the machine counts as alive until all of it is gone. If the guard is killed,
+the machine sees that its parent changed, and ends.
 """
 
 from __future__ import annotations
@@ -138,18 +137,14 @@ _PR_SET_CHILD_SUBREAPER = 36
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-def become_subreaper() -> None:
-    """Inherit every orphan below this process, so that it stays a descendant."""
-    _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-
-
 def start(end_the_rest: Callable[[], None]) -> int:
     """Become the machine, before there are threads; return the process id of the guard above it."""
-    become_subreaper()
+    # Every orphan below this process stays a descendant.
+    _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     guard = os.getpid()
     machine = os.fork()
     if machine == 0:
-        become_subreaper()  # it is not inherited
+        _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # it is not inherited
         return guard
     try:
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

@@ -6,8 +6,6 @@ does not take stops the reading, so backpressure is the kernel's own.
 
 As on a network, the server sees from which host who connects, and a host that floods the port costs
 the others little: of those that wait for the server, the newest are kept.
-
-Not here: who sets the faults (`chaos`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""How a machine runs a task's commands: environment, ROS domain, and taking turns."""
+"""How a machine runs a task's commands: environment and ROS domain."""
 
 from __future__ import annotations
 
-import hashlib
 import os
 import sys
 from collections.abc import Mapping
@@ -46,9 +45,3 @@ def sourced(command: list[str], workdir: Path) -> list[str]:
     if not setup.is_file():
         return command
     return ["bash", "-c", '. "$0"; exec "$@"', str(setup), *command]
-
-
-def turn_file(root: Path, workdir: Path) -> Path:
-    """Return the file whose lock a `setup` in a folder holds."""
-    name = hashlib.sha256(str(workdir.resolve()).encode()).hexdigest()[:16]
-    return root / f"setup-{name}.lock"

@@ -85,7 +85,9 @@ class SkyCloud:
         self._census = Census(by_name, clock, submit)
         self._presence = Presence(sky, journal, self._census, clock, submit)
         self._ending = Ending(sky, journal, self._census, self.sleep, clock)
-        self._following = Following(sky, journal, self._ending, clock, self._presence.forget)
+        self._following = Following(
+            sky, journal, self._ending, clock, self._presence.clusters.forget
+        )
         self._prices = Prices(sky, by_name, clock, submit)
         self._lock = threading.Lock()
         self._followed: set[ReplicaId] = set()
@@ -160,7 +162,7 @@ class SkyCloud:
         try:
             self._ending.end(id)
         finally:
-            self._presence.forget()
+            self._presence.clusters.forget()
         self.journal.close(id)
         self._census.forget(id)
 
@@ -171,7 +173,7 @@ class SkyCloud:
         disk_size = resources.get("disk_size", task.DISK_GB)
         usd_per_hour = disk_usd_per_hour(order.placement.cloud, disk_size)
         self.journal.update(order.id, stage=Stage.STANDBY, usd_per_hour=usd_per_hour)
-        self._presence.forget()
+        self._presence.clusters.forget()
 
     def start(self, order: Launch) -> None:
         """See `Stopping`. SkyPilot starts a cluster that it has when it is to launch it."""
@@ -289,7 +291,7 @@ class SkyCloud:
 
     def audit(self, pool_uid: str = "") -> Audit:
         """See `Auditing`. Of all pools only those whose machines carry this user's label."""
-        self._presence.forget()
+        self._presence.clusters.forget()
         machines: dict[ReplicaId, Machine] = {}
         for uid in {pool_uid} if pool_uid else self._pools():
             entries = self.journal.entries(uid)
@@ -308,7 +310,7 @@ class SkyCloud:
     def _pools(self) -> set[str]:
         """Return the uids of this user's pools, as the journal and SkyPilot know them."""
         uids = {entry.id.pool_uid for entry in self.journal.entries()}
-        for cluster in self._presence.everywhere():
+        for cluster in self._presence.clusters.renew():
             id = replica_of(cluster.name)
             if id is not None and self._mine(cluster.labels):
                 uids.add(id.pool_uid)
@@ -354,7 +356,7 @@ class SkyCloud:
             more = False
         finally:
             if not more:
-                self._presence.forget()
+                self._presence.clusters.forget()
                 with self._lock:
                     self._followed.discard(id)
         return more

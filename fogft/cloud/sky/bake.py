@@ -34,17 +34,12 @@ RUN export HOME=/root && {exports}bash /root/.fogft/setup.sh && rm -rf /root/.fo
 def write(
     folder: Path, asked: Mapping[str, Any], image: str, wheel: Path, lock: Mapping[str, bytes]
 ) -> None:
-    """Write the context of a build into an empty folder.
+    """Write the context of a build into an empty folder; see `Baking`.
 
     Args:
-        folder: Where to.
         asked: The pool file's task, with absolute paths.
-        image: The image that it is built on.
         wheel: Folder with fogft's wheel.
         lock: What fogft needs, as files; see `wheel.LockFolder`.
-
-    Raises:
-        SpecError: The set-up needs what no image may have.
     """
     for key in ("secrets", "file_mounts"):
         if asked.get(key):

@@ -2,8 +2,6 @@
 
 SkyPilot chooses one machine without accelerators; one type alone often has no capacity. So others
 of a cloud's general families are offered beside it: as many vCPUs, no less memory.
-
-Owns: the reading of SkyPilot's catalogue. Not here: which of it is offered (`prices`).
 """
 
 from __future__ import annotations
@@ -54,7 +52,8 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
                     key = place.instance, place.spot
                     if key not in quotas:
                         quotas[key] = _quota_code(name, *key)
-                        vcpus[place.instance] = _vcpus(cloud, machine.instance_type)
+                        has = cloud.get_vcpus_mem_from_instance_type(machine.instance_type)
+                        vcpus[place.instance] = float(has[0] or 0.0)
     fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in prices}}
     offers = [Offer(p, price, "catalogue", fetched[p.cloud]) for p, price in prices.items()]
     offers.sort(key=lambda o: (o.usd_per_hour, o.placement))
@@ -137,11 +136,6 @@ def _price(cloud: str, machine: Any) -> Callable[[str, str | None], float]:
         return lambda region, zone: machine.copy(region=region, zone=zone).get_cost(3600)
     own = rows[rows["InstanceType"] == machine.instance_type]
     return lambda *place: search(own, machine.instance_type, machine.use_spot, *place)
-
-
-def _vcpus(cloud: Any, instance: str) -> float:
-    found = cloud.get_vcpus_mem_from_instance_type(instance)[0]
-    return float(found or 0.0)
 
 
 def _quota_code(cloud: str, instance: str, spot: bool) -> str:

@@ -2,8 +2,6 @@
 
 A machine's absence counts only where the provider has listed it before. The credentials here may be
 of another account than those that SkyPilot, or its API server elsewhere, launches with.
-
-Not here: the providers' interfaces (`provider`, `aws`).
 """
 
 from __future__ import annotations
@@ -42,9 +40,7 @@ class Census:
     def of(self, id: ReplicaId, entry: Entry | None) -> list[Instance] | None:
         """Return a replica's instances, asked now; None if only SkyPilot can be asked.
 
-        Args:
-            id: The replica.
-            entry: What the journal knows of it; None where it may be anywhere.
+        Without an `entry` of the journal it may be anywhere.
         """
         if entry is None:
             found, _ = self.everywhere(id.pool_uid)
@@ -138,9 +134,8 @@ class Census:
         except NotAllowedError as error:
             if provider.cloud not in self._refused:
                 log.warning("census_not_allowed cloud=%s reason=%r", provider.cloud, str(error))
-            self._refused[provider.cloud] = (
-                f"this account has no permission to list machines: {error}"
-            )
+            reason = f"this account has no permission to list machines: {error}"
+            self._refused[provider.cloud] = reason
             return []
         self._refused.pop(provider.cloud, None)
         self._seen.update(instance.id for instance in found)

@@ -3,8 +3,6 @@
 "Down" that returned without an error is not believed. SkyPilot's list is read again with a
 refresh from the cloud, and the provider is asked itself where it can be. What SkyPilot has
 forgotten is ended through the provider, by its labels.
-
-Not here: which replicas shall end (`fogft.planning.endings`).
 """
 
 from __future__ import annotations
@@ -51,12 +49,14 @@ class Ending:
         begun_at = self.clock()
         quiet, enough = 0, self._looks_needed(id)
         for attempt in range(_TRIES + enough - 1):
-            if attempt and self.clock() - begun_at > _LIMIT_S:
-                break
             if attempt:
+                if self.clock() - begun_at > _LIMIT_S:
+                    break
                 self.sleep(_PAUSE_S)
             try:
-                self._abort_launches(name)
+                for request in self.sky.launches(name):
+                    if request.active:
+                        self.sky.cancel(request.id)
                 self.sky.down(name)
                 left = self._left(id, name)
             except (CloudUnreachable, RefusedError) as error:
@@ -85,11 +85,6 @@ class Ending:
         on_its_way = entry is not None and not entry.request
         young = entry is not None and self.clock() - entry.launched_at < _HEARD_WITHIN_S
         return 2 if on_its_way and young else 1
-
-    def _abort_launches(self, name: str) -> None:
-        for request in self.sky.launches(name):
-            if request.active:
-                self.sky.cancel(request.id)
 
     def _left(self, id: ReplicaId, name: str) -> list[str]:
         """Return what still exists; ask the provider to end what SkyPilot did not."""

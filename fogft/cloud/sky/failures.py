@@ -83,10 +83,10 @@ def plain(text: str) -> str:
 
 
 def tail(log: str, lines: int = 20, width: int = 200) -> str:
-    """Return the last non-empty lines of a log, each cut to `width` characters."""
+    """Return the last non-empty lines of a log, each after a line break and cut to `width`."""
     lines_of_log = (_SPEAKER.sub("", line.rstrip()) for line in _COLOUR.sub("", log).splitlines())
     told = [line for line in lines_of_log if line.strip() and not line.startswith(_DECORATION)]
-    return "\n".join(line[:width] for line in told[-lines:])
+    return "".join(f"\n{line[:width]}" for line in told[-lines:])
 
 
 def _short(text: str, pattern: str, room: int = 300) -> str:

@@ -2,10 +2,7 @@
 
 Each step reads where the launch stands, asks SkyPilot once, and writes where it stands now.
 So a step can be lost, repeated, or made by another process after a crash. A launch that
-fails or hangs is taken down at once, whoever is watching: a machine that was made before the
-failure would cost money until somebody looks.
-
-Not here: threads and waiting (`adapter`), taking down (`ending`).
+fails or hangs is taken down at once: a machine that was made before would cost money.
 """
 
 from __future__ import annotations
@@ -191,12 +188,10 @@ class Following:
         return Reason(Cause.TIMEOUT, words=words + log_tail, because=(awaited,))
 
     def _job_tail(self, entry: Entry) -> str:
-        told = tail(self.sky.job_log(cluster_name(entry.id), entry.job, 30))
-        return f"\n{told}" if told else ""
+        return tail(self.sky.job_log(cluster_name(entry.id), entry.job, 30))
 
     def _provision_tail(self, entry: Entry) -> str:
-        told = tail(self.sky.provision_log(cluster_name(entry.id), 30))
-        return f"\n{told}" if told else ""
+        return tail(self.sky.provision_log(cluster_name(entry.id), 30))
 
     def _move(self, entry: Entry, **changes: object) -> None:
         moved = self.journal.update(entry.id, **changes)

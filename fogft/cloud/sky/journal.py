@@ -2,12 +2,8 @@
 
 SkyPilot's own list misses a launch in its first seconds, and forgets why one failed. The
 journal is written before SkyPilot is asked, so a replica is listed from then on, even
-if the manager dies in that moment. It holds no secret. Losing it loses no machine: names
-and labels in the cloud say the same.
-
-Owns: these files, and the folder with each replica's own files. All raise `StateError` where one
-cannot be read or written.
-Not here: what is true in the cloud (`adapter`).
+if the manager dies in that moment. Losing it loses no machine: names and labels in the cloud
+say the same. All raise `StateError` where a file cannot be read or written.
 """
 
 from __future__ import annotations

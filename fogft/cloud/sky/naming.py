@@ -1,7 +1,6 @@
 """Names and labels of a replica's machine in a cloud. Pure.
 
-A cluster's name and its labels each carry the pool's uid, the slot and the generation. What
-does not match is not ours, and nothing that is not ours is ever touched: every name that
+What does not match is not ours, and nothing that is not ours is ever touched: every name that
 reaches SkyPilot is made by `cluster_name`.
 """
 
@@ -10,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 
+from fogft.cloud.port import Launch
 from fogft.model.names import LINK_PORT, POOL_UID_PATTERN
 from fogft.model.replica import Placement, ReplicaId
 
@@ -52,25 +52,17 @@ def replica_of(name: str) -> ReplicaId | None:
     return id if name == f"{PREFIX}{id.pool_uid}-{id.slot}-{id.generation}" else None
 
 
-def labels(
-    id: ReplicaId,
-    *,
-    pool: str,
-    owner: str,
-    spec_hash: str,
-    usd_per_hour: float,
-    port: int = LINK_PORT,
-) -> dict[str, str]:
-    """Return the labels of a replica's machine, in characters that every cloud takes."""
+def labels(order: Launch, owner: str) -> dict[str, str]:
+    """Return the labels of an ordered machine, in characters that every cloud takes."""
     return {
-        POOL: id.pool_uid,
-        SLOT: str(id.slot),
-        GENERATION: str(id.generation),
+        POOL: order.id.pool_uid,
+        SLOT: str(order.id.slot),
+        GENERATION: str(order.id.generation),
         OWNER: label_value(owner),
-        SPEC: label_value(spec_hash),
-        PRICE: str(round(usd_per_hour * 1e6)),
-        PORT: str(port),
-        NAME: label_value(pool),
+        SPEC: label_value(order.spec_hash),
+        PRICE: str(round(order.usd_per_hour * 1e6)),
+        PORT: str(order.link_port),
+        NAME: label_value(order.pool),
     }
 
 

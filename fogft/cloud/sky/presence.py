@@ -2,23 +2,20 @@
 
 SkyPilot's list decides what exists; the journal says what a launch is waiting for and why it
 failed; the provider is heard where SkyPilot is silent.
-
-Owns: what each machine looks like by what they say, which of them is asked when, SkyPilot's list
-for five seconds, and who is known to be gone though SkyPilot still lists it.
 """
 
 from __future__ import annotations
 
 import logging
-import math
-import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import ON_THE_MACHINE, Entry, Journal, Stage
+from fogft.cloud.sky.kept import Kept
 from fogft.cloud.sky.naming import cluster_name, replica_of
 from fogft.cloud.sky.provider import Instance
 from fogft.cloud.sky.sdk import Cluster, ClusterState
@@ -31,24 +28,24 @@ NOWHERE = Placement("", "", "", "")
 
 def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -> Machine:
     """Return a machine that the journal knows; the others may say nothing of it."""
-    phase, failure, progress = MachinePhase.PROVISIONING, entry.failure, entry.stage.value
-    if entry.stage is Stage.ENDING:
+    stage, failure, progress = entry.stage, entry.failure, ""
+    if stage is Stage.ENDING:
         # Listed until it is certain that nothing runs, so that a crash in between is repaired.
         failure = failure or _error("its end was not confirmed")
     is_stopped = cluster is not None and cluster.state is ClusterState.STOPPED
-    if is_stopped and entry.stage in (Stage.SETTING_UP, Stage.RUNNING):
+    if is_stopped and stage in (Stage.SETTING_UP, Stage.RUNNING):
         failure = _error("the machine was stopped")
     if failure is not None:
-        phase, progress = MachinePhase.FAILED, ""
-    elif entry.stage is Stage.SETTING_UP:
-        phase = MachinePhase.RUNNING  # the machine runs; its services do not answer yet
-    elif entry.stage is Stage.RUNNING:
-        phase, progress = MachinePhase.RUNNING, ""
-    elif entry.stage is Stage.STANDBY:  # unless somebody else has started it
-        is_up = cluster is not None and not is_stopped
-        phase, progress = MachinePhase.RUNNING if is_up else MachinePhase.STOPPED, ""
-    elif cluster is not None:
-        progress = cluster.progress or progress
+        phase = MachinePhase.FAILED
+    elif stage is Stage.STANDBY and (cluster is None or is_stopped):
+        phase = MachinePhase.STOPPED  # unless somebody else has started it
+    elif stage in ON_THE_MACHINE:
+        phase = MachinePhase.RUNNING
+        progress = stage.value if stage is Stage.SETTING_UP else ""
+    else:
+        phase = MachinePhase.PROVISIONING
+        progress = cluster.progress if cluster else ""
+        progress = progress or stage.value
     placement = entry.placement
     if cluster is not None and cluster.placement is not None:
         placement = _as_found(entry, cluster.placement)
@@ -75,23 +72,22 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
 
 def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
     """Return a machine that SkyPilot lists and the journal has lost."""
-    phase, failure = MachinePhase.FAILED, None
+    phase, failure, endpoint = MachinePhase.PROVISIONING, None, None
     if cluster.state is ClusterState.UP:
         phase = MachinePhase.RUNNING
-    elif launching:
-        phase = MachinePhase.PROVISIONING
-    else:
+        cloud = cluster.placement.cloud if cluster.placement else ""
+        if cluster.head_ip and cloud not in naming.MAPPING_CLOUDS:
+            endpoint = f"{cluster.head_ip}:{naming.link_port(cluster.labels)}"
+    elif not launching:
+        phase = MachinePhase.FAILED
         said = f"SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}"
         failure = _error(said)
-    cloud = cluster.placement.cloud if cluster.placement else ""
-    known = cluster.head_ip and cloud not in naming.MAPPING_CLOUDS
-    running = phase is MachinePhase.RUNNING and known
     return Machine(
         id=id,
         placement=cluster.placement or NOWHERE,
         phase=phase,
         launched_at=cluster.launched_at,
-        endpoint=f"{cluster.head_ip}:{naming.link_port(cluster.labels)}" if running else None,
+        endpoint=endpoint,
         usd_per_hour=naming.usd_per_hour(cluster.labels),
         spec_hash=cluster.labels.get(naming.SPEC, ""),
         failure=failure,
@@ -150,22 +146,21 @@ class Presence:
     submit: Callable[[Callable[[], None]], object]
 
     def __post_init__(self) -> None:
-        self._lock = threading.Lock()
-        self._listed: tuple[float, Sequence[Cluster]] = (-math.inf, ())
-        self._listing = False
+        self.clusters = Kept(  # SkyPilot's list, of all pools and of everybody's clusters
+            partial(self.sky.clusters, None, refresh=False),
+            *(CLUSTERS_FRESH_S, CLUSTERS_USABLE_S, self.clock, self.submit),
+            failed=lambda error: log.info("list_not_renewed reason=%r", error.message),
+        )
         self._gone: set[ReplicaId] = set()
 
     def machines(
         self, pool_uid: str, entries: Iterable[Entry], regions: Mapping[str, Iterable[str]]
     ) -> list[Machine]:
-        """Return a pool's machines, ordered by id.
-
-        `entries` is what the journal holds of it, `regions` where machines of it can be, by cloud.
-        """
+        """Return a pool's machines, ordered by id; `regions` is where they can be, by cloud."""
         known = {entry.id: entry for entry in entries}
-        clusters = self._clusters(pool_uid)
+        clusters = _of_pool(pool_uid, self.clusters.get())
         if any(e.stage in ON_THE_MACHINE and e.id not in clusters for e in known.values()):
-            clusters = self._clusters(pool_uid, fresh=True)
+            clusters = _of_pool(pool_uid, self.clusters.renew())
         found: dict[ReplicaId, Machine] = {}
         for id, entry in known.items():
             machine = self._of_entry(entry, clusters.get(id))
@@ -173,7 +168,8 @@ class Presence:
                 found[id] = machine
         for id, cluster in clusters.items():
             if id not in found and id not in self._gone and self.journal.get(id) is None:
-                found[id] = self._of_cluster(id, cluster)
+                launching = any(request.active for request in self.sky.launches(cluster.name))
+                found[id] = of_cluster(id, cluster, launching=launching)
         for instance in self.census.latest(pool_uid, regions):
             if instance.id not in found and self.journal.get(instance.id) is None:
                 found[instance.id] = of_instance(instance)
@@ -191,20 +187,7 @@ class Presence:
             if all(one.running for one in alive) and (alive or gone_for_sure):
                 return
         self.sky.clusters(cluster_name(id), refresh=True)
-        self.forget()
-
-    def everywhere(self) -> Sequence[Cluster]:
-        """Return SkyPilot's list as it is now, of all pools and of everybody's clusters."""
-        begun_at = self.clock()
-        clusters = self.sky.clusters(None, refresh=False)
-        with self._lock:
-            self._listed = (begun_at, clusters)
-        return clusters
-
-    def forget(self) -> None:
-        """Read SkyPilot's list anew the next time."""
-        with self._lock:
-            self._listed = (-math.inf, ())
+        self.clusters.forget()
 
     def _of_entry(self, entry: Entry, cluster: Cluster | None) -> Machine | None:
         alive = None
@@ -214,10 +197,6 @@ class Presence:
                 self._is_gone(entry)
                 return None
         return of_entry(entry, cluster, alive[0] if alive else None)
-
-    def _of_cluster(self, id: ReplicaId, cluster: Cluster) -> Machine:
-        launching = any(request.active for request in self.sky.launches(cluster.name))
-        return of_cluster(id, cluster, launching=launching)
 
     def _is_gone(self, entry: Entry) -> None:
         log.info("machine_gone replica=%s", entry.id.short)
@@ -232,31 +211,7 @@ class Presence:
         except CloudError as error:
             log.warning("record_not_dropped replica=%s reason=%r", id.short, error.message)
 
-    def _list_later(self) -> None:
-        """Read SkyPilot's list on another thread: it may be slow, and no loss waits for it."""
-        with self._lock:
-            if self._listing:
-                return
-            self._listing = True
 
-        def read() -> None:
-            try:
-                self.everywhere()
-            except CloudError as error:
-                log.info("list_not_renewed reason=%r", error.message)
-            finally:
-                with self._lock:
-                    self._listing = False
-
-        self.submit(read)
-
-    def _clusters(self, pool_uid: str, *, fresh: bool = False) -> dict[ReplicaId, Cluster]:
-        with self._lock:
-            at, clusters = self._listed
-        age_s = self.clock() - at
-        if fresh or age_s >= CLUSTERS_USABLE_S:
-            clusters = self.everywhere()
-        elif age_s >= CLUSTERS_FRESH_S:
-            self._list_later()
-        named = ((replica_of(cluster.name), cluster) for cluster in clusters)
-        return {id: cluster for id, cluster in named if id and id.pool_uid == pool_uid}
+def _of_pool(pool_uid: str, clusters: Iterable[Cluster]) -> dict[ReplicaId, Cluster]:
+    named = ((replica_of(cluster.name), cluster) for cluster in clusters)
+    return {id: cluster for id, cluster in named if id and id.pool_uid == pool_uid}

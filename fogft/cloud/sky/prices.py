@@ -3,8 +3,6 @@
 The catalogue is a file that SkyPilot renews every few hours; spot prices move meanwhile. So an
 offer says where its price comes from and how old it is. Prices are kept for a while: the
 planner asks every half minute, and the answer must not cost a second each time.
-
-Not here: the catalogue (`installed`) and the provider's interface (`provider`).
 """
 
 from __future__ import annotations
@@ -17,10 +15,12 @@ import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, TypeVar
 
 from fogft.cloud.sky.catalogue import best
 from fogft.cloud.sky.installed import InstalledSky
+from fogft.cloud.sky.kept import Kept
 from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError, Sale
 from fogft.cloud.sky.task import DISK_GB, alternative, as_launched
@@ -55,8 +55,7 @@ class Prices:
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
-        self._kept: dict[str, tuple[float, tuple[Offer, ...]]] = {}
-        self._renewing: set[str] = set()
+        self._kept: dict[str, Kept[tuple[Offer, ...]]] = {}
         self._instead: dict[Placement, Sequence[Offer]] = {}
         self._left_out: dict[str, dict[str, None]] = {}  # by what was asked: sentences
         self._quotas: dict[tuple[str, str], tuple[float, float | None]] = {}
@@ -69,20 +68,18 @@ class Prices:
         """
         key = json.dumps(resources, sort_keys=True, default=str)
         with self._lock:
-            at, offers = self._kept.get(key, (-math.inf, ()))
-        age_s = self.clock() - at
-        if age_s > USABLE_S:
-            return self._renewed(key, resources)
-        if age_s > FRESH_S:
-            self._renew_later(key, resources)
-        return offers
+            kept = self._kept.setdefault(
+                key,
+                Kept(
+                    partial(self._sold, key, resources),
+                    *(FRESH_S, USABLE_S, self.clock, self.submit),
+                    failed=lambda error: log.warning("prices_not_renewed reason=%r", error.message),
+                ),
+            )
+        return kept.get()
 
     def instead(self, placement: Placement, limit: float | None) -> Sequence[Offer]:
-        """Return what else would do in the place of an offer, the cheapest first.
-
-        Args:
-            limit: US dollars per hour that one may cost; None for no limit.
-        """
+        """Return what else would do for at most `limit` US dollars per hour, the cheapest first."""
         with self._lock:
             found = self._instead.get(placement, ())
         return [offer for offer in found if limit is None or offer.usd_per_hour <= limit]
@@ -97,29 +94,12 @@ class Prices:
         """Cloud -> regions that were offered: where machines of ours can be."""
         with self._lock:
             out: dict[str, set[str]] = {}
-            for _, offers in self._kept.values():
-                for offer in offers:
+            for kept in self._kept.values():
+                for offer in kept.answer or ():
                     out.setdefault(offer.placement.cloud, set()).add(offer.placement.region)
             return out
 
-    def _renew_later(self, key: str, resources: Mapping[str, Any]) -> None:
-        with self._lock:
-            if key in self._renewing:
-                return
-            self._renewing.add(key)
-
-        def renew() -> None:
-            try:
-                self._renewed(key, resources)
-            except (CloudUnreachable, SpecError) as error:
-                log.warning("prices_not_renewed reason=%r", error.message)
-            finally:
-                with self._lock:
-                    self._renewing.discard(key)
-
-        self.submit(renew)
-
-    def _renewed(self, key: str, resources: Mapping[str, Any]) -> tuple[Offer, ...]:
+    def _sold(self, key: str, resources: Mapping[str, Any]) -> tuple[Offer, ...]:
         try:
             sale = self.sky.offers(as_launched(resources))
         except RefusedError as error:
@@ -136,12 +116,10 @@ class Prices:
                 "you can use",
             )
         firsts, instead = best([_with_extras(o, resources) for o in self._priced(within)])
-        offers = tuple(firsts)
         with self._lock:
-            self._kept[key] = self.clock(), offers
             self._instead |= instead
             self._left_out[key] = left_out
-        return offers
+        return tuple(firsts)
 
     def _within_quotas(self, sale: Sale, left_out: dict[str, None]) -> Sequence[Offer]:
         """Return the offers that the account's quotas have room for, were nothing else running."""

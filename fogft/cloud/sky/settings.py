@@ -1,18 +1,9 @@
 """SkyPilot settings that fogft applies to a launch, unless the user has set them.
 
 A VM gets no credentials: by SkyPilot's default it would get the files of every cloud that they
-exist for, and with any of them SkyPilot's own ssh key. Usage reports are off.
-
-It gets a guard that ends it where no replica ever runs on it. SkyPilot sets `autostop` when a
-machine is wholly set up; before that one whose launcher dies, SkyPilot's API server with it, would
-run until somebody looks. On AWS only: SkyPilot has no such setting for others.
-
-A request carries these settings to the API server. To one elsewhere it carries the guard only:
-which of its own credentials that server gives away its administrator has decided.
-
-A pool that says who may connect has a security group named for its clusters, before the user's own.
-
-Not here: which roles, ports and security groups a VM has (`aws`, `task`).
+exist for, and with any of them SkyPilot's own ssh key. On AWS it gets a guard that ends it where
+no replica ever runs on it: SkyPilot sets `autostop` only when a machine is wholly set up. To an API
+server elsewhere goes the guard only: what that gives away its administrator has decided.
 """
 
 from __future__ import annotations
@@ -69,10 +60,7 @@ class Settings:
     def apply(self, clouds: Iterable[str], id: ReplicaId | None = None, group: str = "") -> None:
         """Set what a launch on some clouds is to have; the user's own commands come first.
 
-        Args:
-            clouds: Where it may be.
-            id: The replica that is launched; None where nothing is.
-            group: The security group of its pool's machines; empty for SkyPilot's own.
+        `group` is the security group of the pool's machines; empty for SkyPilot's own.
         """
         config = importlib.import_module("sky.skypilot_config")
         with self._lock:

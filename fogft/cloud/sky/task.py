@@ -2,8 +2,6 @@
 
 What the pool file says passes through untouched, but for the few fields that a pool decides
 itself; those are refused, since a field that is ignored is a promise broken in silence.
-
-Not here: the files on disk (`journal`) and what SkyPilot thinks of the result (`sdk`).
 """
 
 from __future__ import annotations
@@ -94,11 +92,9 @@ def build(
     """Return the task of one replica, for exactly one location.
 
     Args:
-        order: What is launched.
-        template: `templates/sky_task.yaml`, read.
+        template: What `read` returns.
         files: Folder with the order's files.
         wheel: Folder with fogft's wheel.
-        owner: Whose machine it is, for its labels.
         base: Folder that relative paths of the pool file start from.
         instead: What else is tried there, in this order, where the first has no capacity.
     """
@@ -151,14 +147,7 @@ def _resources(order: Launch, owner: str) -> dict[str, Any]:
     out["infra"] = naming.infra(order.placement)
     out["use_spot"] = order.placement.spot
     out |= _kind(order.placement)
-    out["labels"] = dict(chosen.get("labels") or {}) | naming.labels(
-        order.id,
-        pool=order.pool,
-        owner=owner,
-        spec_hash=order.spec_hash,
-        usd_per_hour=order.usd_per_hour,
-        port=order.link_port,
-    )
+    out["labels"] = dict(chosen.get("labels") or {}) | naming.labels(order, owner)
     return out
 
 

@@ -3,10 +3,8 @@
 No build tool and no index is needed for the wheel: it is made of the imported package's own files
 and of what pip recorded of it, the same bytes each time.
 
-For the lock `uv` resolves for every platform and Python at once, and marks what is for which: it
-fits every image. `up` makes it; a generation keeps the one of its first launch for all replicas.
-
-Not here: installing (`templates/sky_task.yaml`).
+For the lock `uv` resolves for every platform and Python at once. `up` makes it; a generation keeps
+the one of its first launch for all replicas.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ Not here: who gets one (`fogft.pool`), how they are used (`fogft.link.zenoh.sett
 from __future__ import annotations
 
 import datetime
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,11 +38,8 @@ class Credential:
     """A certificate with its key, and the CA that both ends trust; all PEM."""
 
     certificate_pem: bytes
-    key_pem: bytes
-    authority_pem: bytes
-
-    def __repr__(self) -> str:
-        return f"Credential(certificate_pem={self.certificate_pem!r}, key_pem=<hidden>)"
+    key_pem: bytes = field(repr=False)
+    authority_pem: bytes = field(repr=False)
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,9 @@
 """A bundle: one file that sets up a robot, gateway, replica or manager on another machine.
 
-It is readable JSON around sealed content: the key that seals it is made from a passphrase
-(scrypt), and the readable part is sealed along with it (AES-GCM), so whoever changes a
-byte, the date included, is left with nothing. It can be opened for a limited time only. What is
-wrong raises `CredentialError`.
+Readable JSON around sealed content: the key that seals it is made from a passphrase (scrypt), and
+the readable part is sealed along with it (AES-GCM). What is wrong raises `CredentialError`.
 
-Owns: sealing and opening. Not here: what is in it (`joining`), and that it is used once.
+Not here: what is in it (`joining`), and that it is used once (`claiming`).
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
 """Claim a join bundle at the rendezvous before it is used, so that it is used only once.
 
-The claim is the holder's own record, signed with the key that the bundle brings: whoever
-joined has spoken under that name and generation, and everybody keeps that. A second machine
-finds the record of the first and joins nothing. Of two that join in the same moment the
-earlier one stands, whichever rendezvous each has reached.
-
-Owns: making a claim and finding another's. Not here: opening bundles (`joining`), records.
+The claim is the holder's own record, signed with the key that the bundle brings. A second machine
+finds the record of the first and joins nothing. Of two that join in the same moment the earlier
+one stands, whichever rendezvous each has reached.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """The certificates that a pool's CA has issued and revoked.
 
-Every issue is on disk before its certificate leaves this module, so nothing that the CA
-ever signed is missing from the list, and no generation of a name is used twice. Keys are
-not in it. What cannot be written down was not done, and raises `StateError`; what cannot be
-certified raises `CredentialError`.
+``issued.json`` beside the CA, written under its lock. Every issue is on disk before its certificate
+leaves this module, so nothing that the CA ever signed is missing from the list, and no generation
+of a name is used twice. What cannot be written down was not done, and raises `StateError`; what
+cannot be certified raises `CredentialError`.
 
-Owns: ``issued.json`` beside the CA, written under its lock by the manager and by commands.
-Not here: making certificates (`credentials`), telling others of a revocation (`manager`).
+Not here: making certificates (`authority`), telling others of a revocation (`manager`).
 """
 
 from __future__ import annotations
@@ -77,21 +76,22 @@ class Ledger:
 
     def by_hand(self) -> frozenset[ReplicaId]:
         """Return the manually started replicas with valid certificates."""
-        good = [e.holder for e in self.entries() if e.state(self._clock()) == "good"]
         return frozenset(
             ReplicaId(h.pool_uid, int(h.name), h.generation)
-            for h in good
-            if h.role is Role.REPLICA and int(h.name) >= FIRST_BY_HAND
+            for h in self._good(Role.REPLICA)
+            if int(h.name) >= FIRST_BY_HAND
         )
 
     def gateways(self) -> dict[str, tuple[int, ...]]:
         """Return the generations of each gateway's valid certificates, by name."""
         found: dict[str, tuple[int, ...]] = {}
-        for entry in self.entries():
-            holder = entry.holder
-            if holder.role is Role.GATEWAY and entry.state(self._clock()) == "good":
-                found[holder.name] = (*found.get(holder.name, ()), holder.generation)
+        for holder in self._good(Role.GATEWAY):
+            found[holder.name] = (*found.get(holder.name, ()), holder.generation)
         return found
+
+    def _good(self, role: Role) -> list[Holder]:
+        good = (e.holder for e in self.entries() if e.state(self._clock()) == "good")
+        return [holder for holder in good if holder.role is role]
 
     def issue(self, holder: Holder, *, days: float = authority.LEAF_DAYS) -> Credential:
         """Certify a holder, and record it."""
@@ -104,7 +104,8 @@ class Ledger:
         """Certify the next generation of a name, and record it."""
         with disk.locked(self._lock):
             entries = self.entries()
-            used = [e.holder.generation for e in entries if _is(e, role, name)]
+            holders = (e.holder for e in entries)
+            used = (h.generation for h in holders if (h.role, h.name) == (role, name))
             holder = Holder(role, name, max(used, default=0) + 1, pool_uid)
             try:
                 holder_of(holder.common_name)
@@ -162,8 +163,3 @@ class Ledger:
 
     def _write(self, entries: Iterable[Entry]) -> None:
         disk.write_json(self.path, to_plain(_Issued(tuple(entries))))
-
-
-def _is(entry: Entry, role: Role, name: str) -> bool:
-    holder = entry.holder
-    return (holder.role, holder.name) == (role, name)

@@ -100,7 +100,7 @@ def run(
 
     second = _second_domain(config) if config.spare else None
     proxy = _make(config, answered if spans is not None else None, second)
-    watching = None if config.notice == "none" else notice.watch(config.notice, proxy.noticed)
+    watching = None if config.notice == "none" else notice.Watch(config.notice, proxy.noticed)
     presence: Presence | None = None
     scrape = Scrape(
         lambda: proxies.of_server(proxy.report()), {"pool": config.pool, "slot": str(config.slot)}

@@ -122,7 +122,7 @@ def main() -> None:
         service.delay_s = command.pop("delay_s", service.delay_s)
         listener.revoke(command.pop("revoke", ()))
         for source, state_file in command.pop("watch", {}).items():
-            notice.watch(f"file:{source}", partial(noted, Path(state_file)))
+            notice.Watch(f"file:{source}", partial(noted, Path(state_file)))
         state.update(command)
         lease = listener.lease()
         told = {"lease": 0 if lease is None else lease.sequence}

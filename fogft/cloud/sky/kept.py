@@ -1,0 +1,59 @@
+"""Answers that are kept for a while, and renewed elsewhere before they are too old."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+from fogft.errors import CloudError, SpecError
+
+T = TypeVar("T")
+
+
+@dataclass
+class Kept(Generic[T]):
+    """The answer to `ask`: asked anew by `submit` after `fresh_s`, waited for after `usable_s`.
+
+    `failed` hears why it was not renewed elsewhere.
+    """
+
+    ask: Callable[[], T]
+    fresh_s: float
+    usable_s: float
+    clock: Callable[[], float]
+    submit: Callable[[Callable[[], None]], object]
+    failed: Callable[[CloudError | SpecError], None]
+    answer: T | None = field(default=None, init=False)  # None: there was none yet
+    _at: float = field(default=-math.inf, init=False)
+    _renewing: bool = field(default=False, init=False)
+
+    def get(self) -> T:
+        """Return the answer."""
+        age_s = self.clock() - self._at
+        if self.answer is None or age_s >= self.usable_s:
+            return self.renew()
+        if age_s >= self.fresh_s and not self._renewing:
+            self._renewing = True
+            self.submit(self._renew_elsewhere)
+        return self.answer
+
+    def renew(self) -> T:
+        """Ask now; return the answer."""
+        begun_at = self.clock()
+        answer = self.ask()
+        self._at, self.answer = begun_at, answer
+        return answer
+
+    def forget(self) -> None:
+        """Ask the next time."""
+        self._at = -math.inf
+
+    def _renew_elsewhere(self) -> None:
+        try:
+            self.renew()
+        except (CloudError, SpecError) as error:
+            self.failed(error)
+        finally:
+            self._renewing = False
