@@ -37,7 +37,7 @@ class Launch:
     link_port: int = LINK_PORT
     # A machine of another type in the same place may cost so much at most; None for no limit.
     limit_usd_per_hour: float | None = None
-    # Its machine exists, and is stopped; see `Stopping`.
+    # Its machine exists and is stopped (`Stopping`): it is started under its id.
     is_there: bool = False
     # Others that are opened beside it.
     more_ports: tuple[int, ...] = ()
@@ -53,18 +53,14 @@ class Cloud(Protocol):
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """List what can be bought for a task's `resources`.
 
-        They hold ``ports: []`` where the machines need to be reached by nobody.
-
-        Raises:
-            CloudUnreachable: Prices cannot be had now.
-            SpecError: The resources can never be met (message names the key).
+        They hold ``ports: []`` where the machines need to be reached by nobody. Raises
+        `CloudUnreachable` where prices cannot be had now, `SpecError` for what can never be met.
         """
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         """List this pool's machines that exist now, in any phase, ordered by id.
 
-        Raises:
-            CloudUnreachable: It cannot tell; the caller must conclude nothing.
+        Raises `CloudUnreachable`: it cannot tell; the caller must conclude nothing.
         """
 
     def launch(self, order: Launch) -> None:
@@ -81,8 +77,7 @@ class Cloud(Protocol):
     def terminate(self, id: ReplicaId) -> None:
         """End a machine and all that runs on it; return when it is gone. Repeatable.
 
-        Raises:
-            CloudUnreachable: Unknown whether it is gone.
+        Raises `CloudUnreachable`: unknown whether it is gone.
         """
 
     def log(self, id: ReplicaId) -> str | None:
@@ -94,10 +89,7 @@ class Accounts(Protocol):
     """A cloud that costs money and needs credentials for each provider behind it."""
 
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
-        """Test credentials: cloud -> empty, or the problem and how to fix it.
-
-        Without names of clouds it tests all that can be used.
-        """
+        """Test credentials, of all clouds if none is named: cloud -> empty, or what to fix."""
 
     def check_task(self, task: Mapping[str, Any]) -> None:
         """Raise `SpecError` for what cannot be honoured on these clouds, before it is ordered."""
@@ -109,9 +101,9 @@ class Accounts(Protocol):
         """Return what each cloud lacks for machines of a pool; empty where it lacks nothing."""
 
     def credentials_end_at(self) -> float | None:
-        """Return when the first credentials expire, in seconds since the epoch; None for never.
+        """Return when the first credentials expire, in seconds since the epoch; None for unknown.
 
-        Cheap. None where nobody knows of an end.
+        Cheap.
         """
 
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
@@ -122,12 +114,8 @@ class Accounts(Protocol):
     ) -> Sequence[str]:
         """Return, in sentences, unneeded credentials and open ports of machines there.
 
-        Args:
-            clouds: Where they may be.
-            open_port: The link's; None where the replicas dial out.
-            allow_from: See `Launch`.
-
-        Raises CloudError: it cannot be told now.
+        `open_port` is the link's; None where the replicas dial out. Raises `CloudError`: it cannot
+        be told now.
         """
 
     def unverified(self, cloud: str) -> str:
@@ -144,23 +132,16 @@ class Stopping(Protocol):
         Raises `CloudError`: it may run on.
         """
 
-    def start(self, order: Launch) -> None:
-        """Start a stopped machine under its id, as `launch` does."""
-
 
 @runtime_checkable
 class Baking(Protocol):
     """A cloud whose machines may start from an image that has a replica's environment already."""
 
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
-        """Write the build context for `docker build` into a folder.
+        """Write the build context for `docker build` into an empty folder.
 
-        Args:
-            task: A pool file's task, with paths from its folder.
-            image: The image that it is built on.
-            folder: Empty; the build's context.
-
-        Raises `SpecError` for what an image cannot have.
+        `task` is a pool file's, with absolute paths; `image` is what it is built on. Raises
+        `SpecError` for what an image cannot have.
         """
 
 

@@ -80,7 +80,7 @@ def test_a_machine_is_stopped_for_the_price_of_its_disk_and_started_under_its_id
     assert stopped.usd_per_hour == pytest.approx(64 * 0.08 / 730)
     scene.work(60)
     assert scene.machine().phase is MachinePhase.STOPPED, "nobody takes it for a failure"
-    scene.cloud.start(replace(order, files={"replica.yaml": b"newer"}, is_there=True))
+    scene.cloud.launch(replace(order, files={"replica.yaml": b"newer"}, is_there=True))
     assert scene.machine().phase is MachinePhase.PROVISIONING
     scene.sky.finish(NAME)
     scene.work()

@@ -1,7 +1,6 @@
 """Replicas on real clouds: `fogft.cloud.port.Cloud` through SkyPilot. See docs/design/sky.md.
 
 Owns: the order of steps of each call, and the threads that follow launches.
-Not here: each step's own module: `task`, `journal`, `following`, `ending`, `presence`, `prices`.
 """
 
 from __future__ import annotations
@@ -83,17 +82,14 @@ class SkyCloud:
         self.journal = journal = Journal(self.folder / "launches")
         self._locks = wheel.LockFolder(self.folder / "locks", self.make_lock)
         self._census = Census(by_name, clock, submit)
-        self._presence = Presence(sky, journal, self._census, clock, submit)
+        self._presence = seen = Presence(sky, journal, self._census, clock, submit)
         self._ending = Ending(sky, journal, self._census, self.sleep, clock)
-        self._following = Following(
-            sky, journal, self._ending, clock, self._presence.clusters.forget
-        )
+        self._following = Following(sky, journal, self._ending, clock, seen.clusters.forget)
         self._prices = Prices(sky, by_name, clock, submit)
         self._lock = threading.Lock()
         self._followed: set[ReplicaId] = set()
-        self._closed = threading.Event()
-        self._ends_asked_at = -math.inf
-        self._ends_at: float | None = None
+        self._closed = False
+        self._ends: tuple[float, float | None] = (-math.inf, None)  # asked at, and the answer
 
     # -- the port -------------------------------------------------------------------------
 
@@ -113,6 +109,8 @@ class SkyCloud:
 
     def launch(self, order: Launch) -> None:
         """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
+        if order.is_there:  # SkyPilot starts a cluster that it has when it is to launch it
+            self.journal.close(order.id)
         cloud = order.placement.cloud
         if order.more_ports and cloud in MAPPING_CLOUDS:
             raise CloudError(
@@ -120,9 +118,9 @@ class SkyCloud:
                 "name another cloud in `fogft.gateway.resources`",
             )
         group = self._firewall(order)
-        instead = self._prices.instead(order.placement, order.limit_usd_per_hour)
-        if order.is_there:
-            instead = ()
+        instead: Sequence[Offer] = ()
+        if not order.is_there:
+            instead = self._prices.instead(order.placement, order.limit_usd_per_hour)
         packed = self.make_wheel(self.folder / "wheels")
         generation = f"{order.id.pool_uid}-{order.spec_hash}"
         made = task.build(
@@ -175,16 +173,9 @@ class SkyCloud:
         self.journal.update(order.id, stage=Stage.STANDBY, usd_per_hour=usd_per_hour)
         self._presence.clusters.forget()
 
-    def start(self, order: Launch) -> None:
-        """See `Stopping`. SkyPilot starts a cluster that it has when it is to launch it."""
-        self.journal.close(order.id)
-        self.launch(order)
-
     def log(self, id: ReplicaId) -> str | None:
         """See `Cloud`. Fetches the end of the log from the machine first; takes seconds."""
-        entry = self.journal.get(id)
-        name = cluster_name(id)
-        told = ""
+        entry, name, told = self.journal.get(id), cluster_name(id), ""
         if entry is None or entry.stage in ON_THE_MACHINE:
             told = self.sky.job_log(name, entry.job if entry else None, _LOG_LINES)
         if not told and entry is not None:
@@ -211,12 +202,11 @@ class SkyCloud:
     def credentials_end_at(self) -> float | None:
         """See `Accounts`. What is known is looked at again after a minute."""
         now = self.clock()
-        if not 0 <= now - self._ends_asked_at < _ENDS_FRESH_S:
-            self._ends_asked_at = now
+        if not 0 <= now - self._ends[0] < _ENDS_FRESH_S:
             used = [one for one in self.providers if one.cloud in self._prices.regions]
             ends = [provider.credentials_end_at() for provider in used]
-            self._ends_at = min((at for at in ends if at is not None), default=None)
-        return self._ends_at
+            self._ends = now, min((at for at in ends if at is not None), default=None)
+        return self._ends[1]
 
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
         """See `Accounts`. An API server of another SkyPilot is ended where it is idle."""
@@ -268,14 +258,10 @@ class SkyCloud:
         world = ", ".join(f"`{one}`" for one in clouds if one not in held)
         if world and (open_port or allow_from):
             port = f"port {open_port} of every VM (mutual TLS) and " if open_port else ""
-            found.append(
-                f"on {world}, {port}ssh's port (keys only) are open to the world: "
-                + (
-                    "SkyPilot cannot enforce `fogft.allow_from` there"
-                    if allow_from
-                    else "on AWS, `fogft.allow_from` limits who may connect"
-                )
-            )
+            limit = "on AWS, `fogft.allow_from` limits who may connect"
+            if allow_from:
+                limit = "SkyPilot cannot enforce `fogft.allow_from` there"
+            found.append(f"on {world}, {port}ssh's port (keys only) are open to the world: {limit}")
         return [one for one in found if one]
 
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
@@ -305,7 +291,7 @@ class SkyCloud:
 
     def close(self) -> None:
         """Stop to follow launches; they go on. Repeatable."""
-        self._closed.set()
+        self._closed = True
 
     def _pools(self) -> set[str]:
         """Return the uids of this user's pools, as the journal and SkyPilot know them."""
@@ -326,9 +312,8 @@ class SkyCloud:
         if provider is None or not order.allow_from:
             return ""
         links = () if order.dials_out else (order.link_port, *order.more_ports)
-        ports = (SSH_PORT, *links)
         try:
-            return provider.firewall(place.region, ports, order.allow_from)
+            return provider.firewall(place.region, (SSH_PORT, *links), order.allow_from)
         except NotAllowedError as error:
             raise CloudError(
                 f"`fogft.allow_from` cannot be enforced in `{place.location}`: {error}",
@@ -339,7 +324,7 @@ class SkyCloud:
 
     def _follow(self, id: ReplicaId) -> None:
         with self._lock:
-            if id in self._followed or self._closed.is_set():
+            if id in self._followed or self._closed:
                 return
             self._followed.add(id)
         self.repeat(lambda: self._step(id))
@@ -347,7 +332,7 @@ class SkyCloud:
     def _step(self, id: ReplicaId) -> bool:
         more = True
         try:
-            more = not self._closed.is_set() and self._following.step(id)
+            more = not self._closed and self._following.step(id)
         except CloudUnreachable as error:
             log.warning("launch_unknown replica=%s reason=%r", id.short, error.message)
         except CloudError as error:  # an answer that no step expects; the limits end it

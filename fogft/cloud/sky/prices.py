@@ -11,7 +11,6 @@ import json
 import logging
 import math
 import re
-import threading
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -44,6 +43,13 @@ _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kmgtp]?)i?b?\+?", re.IGNORECASE)
 _GB = {"k": 1e-6, "m": 1e-3, "": 1.0, "g": 1.0, "t": 1e3, "p": 1e6}
 
 
+@dataclass(frozen=True)
+class _Sold:
+    offers: tuple[Offer, ...]  # of each location the cheapest
+    instead: Mapping[Placement, Sequence[Offer]]  # what else would do
+    left_out: Collection[str]  # in sentences
+
+
 @dataclass
 class Prices:
     """Offers with prices, cached for a while; `submit` runs a function elsewhere."""
@@ -54,58 +60,50 @@ class Prices:
     submit: Callable[[Callable[[], None]], object]
 
     def __post_init__(self) -> None:
-        self._lock = threading.Lock()
-        self._kept: dict[str, Kept[tuple[Offer, ...]]] = {}
-        self._instead: dict[Placement, Sequence[Offer]] = {}
-        self._left_out: dict[str, dict[str, None]] = {}  # by what was asked: sentences
+        self._kept: dict[str, Kept[_Sold]] = {}  # by what was asked
         self._quotas: dict[tuple[str, str], tuple[float, float | None]] = {}
         self._unread: dict[str, str] = {}  # cloud -> why its quotas cannot be read
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """See `fogft.cloud.port.Cloud.offers`. The first call takes seconds, later ones none.
-
-        Prices of `FRESH_S` to `USABLE_S` seconds of age are returned while new ones are fetched.
-        """
+        """See `fogft.cloud.port.Cloud.offers`. The first call takes seconds, later ones none."""
         key = json.dumps(resources, sort_keys=True, default=str)
-        with self._lock:
-            kept = self._kept.setdefault(
-                key,
-                Kept(
-                    partial(self._sold, key, resources),
-                    *(FRESH_S, USABLE_S, self.clock, self.submit),
-                    failed=lambda error: log.warning("prices_not_renewed reason=%r", error.message),
-                ),
+        if key not in self._kept:
+            self._kept[key] = Kept(
+                partial(self._ask, resources),
+                *(FRESH_S, USABLE_S, self.clock, self.submit),
+                failed=lambda error: log.warning("prices_not_renewed reason=%r", error.message),
             )
-        return kept.get()
+        return self._kept[key].get().offers
 
     def instead(self, placement: Placement, limit: float | None) -> Sequence[Offer]:
         """Return what else would do for at most `limit` US dollars per hour, the cheapest first."""
-        with self._lock:
-            found = self._instead.get(placement, ())
+        found: Sequence[Offer] = ()
+        for sold in self._answers():
+            found = sold.instead.get(placement, found)
         return [offer for offer in found if limit is None or offer.usd_per_hour <= limit]
 
     def left_out(self) -> Sequence[str]:
         """Return, in sentences, what is not offered because it could not be launched."""
-        with self._lock:
-            return sorted({said for one in self._left_out.values() for said in one})
+        return sorted({said for sold in self._answers() for said in sold.left_out})
 
     @property
     def regions(self) -> Mapping[str, set[str]]:
         """Cloud -> regions that were offered: where machines of ours can be."""
-        with self._lock:
-            out: dict[str, set[str]] = {}
-            for kept in self._kept.values():
-                for offer in kept.answer or ():
-                    out.setdefault(offer.placement.cloud, set()).add(offer.placement.region)
-            return out
+        out: dict[str, set[str]] = {}
+        for place in (offer.placement for sold in self._answers() for offer in sold.offers):
+            out.setdefault(place.cloud, set()).add(place.region)
+        return out
 
-    def _sold(self, key: str, resources: Mapping[str, Any]) -> tuple[Offer, ...]:
+    def _answers(self) -> list[_Sold]:
+        return [kept.answer for kept in list(self._kept.values()) if kept.answer is not None]
+
+    def _ask(self, resources: Mapping[str, Any]) -> _Sold:
         try:
             sale = self.sky.offers(as_launched(resources))
         except RefusedError as error:
             what = f"SkyPilot rejects this section: {error.reason.words}"
             raise SpecError.of_key("resources", what) from error
-        left_out = {f"`{name}` is left out: {why}": None for name, why in sale.left_out.items()}
+        left_out = [f"`{name}` is left out: {why}" for name, why in sale.left_out.items()]
         within = self._within_quotas(sale, left_out)
         if not within:
             told = f" ({'; '.join(left_out)})" if left_out else ""
@@ -116,12 +114,9 @@ class Prices:
                 "you can use",
             )
         firsts, instead = best([_with_extras(o, resources) for o in self._priced(within)])
-        with self._lock:
-            self._instead |= instead
-            self._left_out[key] = left_out
-        return tuple(firsts)
+        return _Sold(tuple(firsts), instead, left_out)
 
-    def _within_quotas(self, sale: Sale, left_out: dict[str, None]) -> Sequence[Offer]:
+    def _within_quotas(self, sale: Sale, left_out: list[str]) -> Sequence[Offer]:
         """Return the offers that the account's quotas have room for, were nothing else running."""
 
         def asked(offer: Offer) -> tuple[str, str, str]:
@@ -133,7 +128,7 @@ class Prices:
         if not wanted:
             return sale.offers
         limits = _side_by_side(wanted, self._quota)
-        left_out |= dict.fromkeys(self._unread.values())
+        left_out += self._unread.values()
         kept = []
         for offer in sale.offers:
             limit, place = limits.get(asked(offer)), offer.placement
@@ -142,11 +137,13 @@ class Prices:
                 continue
             kind = "spot" if place.spot else "on demand"
             where = f"{place.cloud}/{place.region}"
-            left_out[
+            said = (
                 f"`{place.instance}` {kind} in `{where}` is left out: the quota {asked(offer)[2]} "
                 f"allows {limit:g} vCPUs, but it needs {sale.vcpus[place.instance]:g}; request an "
                 "increase"
-            ] = None
+            )
+            if said not in left_out:  # once for all its zones
+                left_out.append(said)
         return kept
 
     def _quota(self, wanted: tuple[str, str, str]) -> float | None:

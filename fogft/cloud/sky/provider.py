@@ -1,8 +1,7 @@
 """The provider itself, asked directly: what exists with our labels, and what it costs.
 
-SkyPilot's database is a file that can be lost; the provider's own list cannot. Where a cloud
-can be asked directly, every "it is gone" is checked there, and what SkyPilot has forgotten
-is found and ended there.
+SkyPilot's database is a file that can be lost; the provider's own list cannot. So every "it is
+gone" is checked there, and what SkyPilot has forgotten is found and ended there.
 """
 
 from __future__ import annotations

@@ -417,9 +417,7 @@ class Reconciler:
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
         )
-        stopping = self._stopping
-        start = stopping.start if stopping and order.is_there else self._cloud.launch
-        self.operations.start(order.id, expected, lambda: start(order))
+        self.operations.start(order.id, expected, lambda: self._cloud.launch(order))
 
     def _terminate(
         self, id: ReplicaId, reason: Reason, history: History, *, stopped: Launch | None = None

@@ -155,7 +155,7 @@ class Proof:
         assert self.phase(id) is MachinePhase.STOPPED
         assert not [i for i in running() if i["labels"]["fogft-slot"] == "100"]
         with step("it is started, until it answers"):
-            self.cloud.start(replace(order, is_there=True))
+            self.cloud.launch(replace(order, is_there=True))
             until("it answers", lambda: (m := self.machine(id)) and get(m.endpoint or ""))
         after = self.machine(id)
         assert after is not None
