@@ -38,10 +38,7 @@ class Notice:
 
 
 def aws_action(body: str) -> Notice | None:
-    """Read ``spot/instance-action``. What cannot be read is a notice without a time.
-
-    The address exists only when there is one, so its very answer is the news.
-    """
+    """Read ``spot/instance-action``: that it exists is the news, whether or not it can be read."""
     value = _map(body)
     action = value.get("action", "unknown")
     if action == "none":
@@ -81,10 +78,7 @@ def azure_events(body: str, machine: str) -> Notice | None:
 
 
 def file_notice(content: str) -> Notice:
-    """Read a notice file: ``{"action": "terminate" | "rebalance", "at": seconds}``.
-
-    That the file exists is the news; one that is empty or says something else is a preemption.
-    """
+    """Read a notice file: ``{"action": "terminate" | "rebalance", "at": s}``; it may be empty."""
     value = _map(content)
     at = value.get("at")
     kind = NoticeKind.REBALANCE if value.get("action") == "rebalance" else NoticeKind.PREEMPTION

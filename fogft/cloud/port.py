@@ -58,10 +58,7 @@ class Cloud(Protocol):
         """
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
-        """List this pool's machines that exist now, in any phase, ordered by id.
-
-        Raises `CloudUnreachable`: it cannot tell; the caller must conclude nothing.
-        """
+        """List this pool's machines in any phase, by id. CloudUnreachable: conclude nothing."""
 
     def launch(self, order: Launch) -> None:
         """Order a machine; return before it runs. Repeating an id does nothing.
@@ -75,10 +72,7 @@ class Cloud(Protocol):
         """
 
     def terminate(self, id: ReplicaId) -> None:
-        """End a machine and all that runs on it; return when it is gone. Repeatable.
-
-        Raises `CloudUnreachable`: unknown whether it is gone.
-        """
+        """End a machine; return when it is gone. Repeatable. CloudUnreachable: it may run on."""
 
     def log(self, id: ReplicaId) -> str | None:
         """Return the path of the machine's log on this computer, if it is kept here."""
@@ -101,10 +95,7 @@ class Accounts(Protocol):
         """Return what each cloud lacks for machines of a pool; empty where it lacks nothing."""
 
     def credentials_end_at(self) -> float | None:
-        """Return when the first credentials expire, in seconds since the epoch; None for unknown.
-
-        Cheap.
-        """
+        """Return when the first credentials expire, in seconds since the epoch; None: unknown."""
 
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
         """Return, in sentences, what may make launches fail until a time; None for no limit."""
@@ -127,10 +118,7 @@ class Stopping(Protocol):
     """A cloud whose on-demand machines can be stopped, and started with what is on their disks."""
 
     def stop(self, order: Launch) -> None:
-        """Stop the machine of an order; return when it has stopped, and is listed as that.
-
-        Raises `CloudError`: it may run on.
-        """
+        """Stop a machine; return when it is listed as that. Raises `CloudError`: it may run on."""
 
 
 @runtime_checkable
@@ -160,10 +148,7 @@ class Auditing(Protocol):
     """A cloud that can list all machines that exist, even those fogft forgot."""
 
     def audit(self, pool_uid: str = "") -> Audit:
-        """List the machines of a pool, or of all of this user's pools. Takes seconds.
-
-        Raises CloudUnreachable: it cannot tell; nothing may be concluded.
-        """
+        """List the machines of a pool, or all of this user's. CloudUnreachable: conclude nothing."""
 
 
 @runtime_checkable
@@ -171,7 +156,4 @@ class Refreshing(Protocol):
     """A cloud whose list is cached and may still show machines that are gone."""
 
     def refresh(self, id: ReplicaId) -> None:
-        """Ask the provider about one machine, so that `machines` is up to date about it.
-
-        Takes seconds: not from the manager's loop. Raises CloudUnreachable: it cannot tell.
-        """
+        """Ask the provider about one machine, which takes seconds. Raises CloudUnreachable."""

@@ -34,10 +34,7 @@ class Chaos:
     # -- one machine; all raise CloudError if it does not exist ------------------------------
 
     def preempt(self, id: ReplicaId, notice_s: float | None = None) -> float:
-        """Preempt a machine with notice (None: its zone's); return the seconds until it ends.
-
-        A second notice never puts the end off.
-        """
+        """Preempt a machine with notice (None: its zone's); return the seconds until it ends."""
         folder = self._living(id)
         now = time.time()
         if notice_s is None:
@@ -72,10 +69,7 @@ class Chaos:
         rate_bytes_per_s: float | None = None,
         for_s: float | None = None,
     ) -> None:
-        """Delay traffic to and from a machine, each way, and limit its rate.
-
-        ``for_s=None`` lasts until `clear`.
-        """
+        """Delay traffic to and from a machine, each way, and limit its rate; None: until `clear`."""
         if not 0 <= delay_s <= 3600 or not (rate_bytes_per_s is None or rate_bytes_per_s >= 1):
             raise CloudError("the delay is out of range", "give a delay of 0 to 3600 s")
         until = _deadline(for_s)

@@ -1,7 +1,4 @@
-"""The local cloud: replicas as folders, locks and processes. See docs/design/local-cloud.md.
-
-Not here: what a machine does (`machine`), how it ends (`ending`), what is sold (`catalogue`).
-"""
+"""The local cloud: replicas as folders, locks and processes. See docs/design/local-cloud.md."""
 
 from __future__ import annotations
 

@@ -1,10 +1,7 @@
 """A machine: ``python -m fogft.cloud.local.machine FOLDER``. Boots, sets up, serves, ends.
 
-It ends when it is told to (``end.json``, ``notice.json``, a signal) or when what it serves
-has ended, and takes everything that ran on it along. One thread: the kernel ties children to
-the thread that started them.
-
-Not here: the path to it (`relay`), cleaning up after it (`processes`, `ending`).
+It ends when it is told to (``end.json``, ``notice.json``, a signal) or when what it serves has
+ended. One thread: the kernel ties children to the thread that started them.
 """
 
 from __future__ import annotations

@@ -32,10 +32,7 @@ _POLL_S = 0.005
 
 
 def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
-    """Return the living processes of a pool, a machine (as `ReplicaId` text), or any machine.
-
-    Sorted, and never this one.
-    """
+    """Return the living processes of a pool, a machine (`ReplicaId` text) or any, but this one."""
     marks = [f"{MACHINE}={machine}".encode()] if machine else []
     marks += [f"{POOL}={pool_uid}".encode()] if pool_uid else []
     parents: dict[int, int] = {}

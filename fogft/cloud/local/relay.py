@@ -113,11 +113,7 @@ class _Pipe:
 class Relay:
     """Relays the connections of one machine, as slow or broken as its faults say.
 
-    Its event loop runs only within `step`, which the machine calls in its own loop.
-
-    Args:
-        upstream: Where the server listens, or will.
-        begins: What clients say first, if they always do: who says else is not passed on.
+    Its event loop runs only within `step`. Who does not begin with `begins` is not passed on.
     """
 
     def __init__(self, upstream: tuple[str, int], begins: bytes = b"") -> None:

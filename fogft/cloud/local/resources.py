@@ -1,8 +1,7 @@
 """Which of the local cloud's offers meet a task's `resources`. Pure.
 
-Keys of SkyPilot's that say neither where a machine may be nor what it is do nothing here.
-A pool written for another cloud can be run here: ``aws/us-west-1`` then means the region of
-that name in the local cloud.
+A pool written for another cloud can run here: ``aws/us-west-1`` is then the local region of that
+name. Keys of SkyPilot's that say neither where a machine may be nor what it is do nothing.
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ _ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
 
 
 def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
-    """Return for each zone the cheapest instance that meets the resources, the cheapest first.
-
-    Raises SpecError, which names the key: they can never be met here.
-    """
+    """Return each zone's cheapest instance that meets the resources. Raises `SpecError`: none."""
     best: dict[Placement, Offer] = {}
     for where, entry in alternatives(resources):
         spot = use_spot(where, entry)

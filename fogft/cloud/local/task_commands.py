@@ -12,10 +12,7 @@ from fogft.ros.environment import child_environment
 
 
 def environment(task: Mapping[str, Any]) -> dict[str, str]:
-    """Return the environment of `setup`: the user's own, with the task's variables.
-
-    In a virtual environment its own programs come first, as they do for `run`.
-    """
+    """Return the environment of `setup`: the user's own, with the task's variables."""
     environ = child_environment(os.environ)
     if sys.prefix != sys.base_prefix:
         environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
@@ -23,10 +20,7 @@ def environment(task: Mapping[str, Any]) -> dict[str, str]:
 
 
 def server_environment(task: Mapping[str, Any], domain: int) -> dict[str, str]:
-    """Return the environment of the server proxy, which includes the task's variables.
-
-    So both ends on a machine have one `RMW_IMPLEMENTATION`, as on a VM.
-    """
+    """Return the server proxy's environment, so that both ends have one `RMW_IMPLEMENTATION`."""
     given = variables(task)
     if "PYTHONPATH" in given and "PYTHONPATH" in os.environ:  # where fogft itself may lie
         given["PYTHONPATH"] += os.pathsep + os.environ["PYTHONPATH"]

@@ -1,7 +1,4 @@
-"""Real clouds through SkyPilot's public SDK: one cluster for each replica.
-
-Not here: which offer is bought (`fogft.planning`). See docs/design/sky.md.
-"""
+"""Real clouds through SkyPilot's public SDK: a cluster for each replica. See docs/design/sky.md."""
 
 from __future__ import annotations
 

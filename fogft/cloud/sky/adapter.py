@@ -1,7 +1,4 @@
-"""Replicas on real clouds: `fogft.cloud.port.Cloud` through SkyPilot. See docs/design/sky.md.
-
-Owns: the order of steps of each call, and the threads that follow launches.
-"""
+"""Replicas on real clouds: `fogft.cloud.port.Cloud` through SkyPilot. See docs/design/sky.md."""
 
 from __future__ import annotations
 

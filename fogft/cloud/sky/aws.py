@@ -1,7 +1,4 @@
-"""AWS through its own API (boto3, which comes with SkyPilot's AWS support). See `provider`.
-
-Credentials and regions come from the same places as SkyPilot's.
-"""
+"""AWS through its own API (boto3, which comes with SkyPilot's AWS support). See `provider`."""
 
 from __future__ import annotations
 
@@ -99,10 +96,7 @@ class Aws:
         return name
 
     def credentials_end_at(self) -> float | None:
-        """See `Provider`. Of a login by `aws sso login`, or of what says when it ends.
-
-        A login that renews itself has no end that is known.
-        """
+        """See `Provider`. A login that renews itself has no end that is known."""
         try:
             session = importlib.import_module("botocore.session").Session()
             told = dict(session.get_scoped_config())
@@ -228,10 +222,7 @@ def _moment(text: str) -> float:
 
 
 def _mighty(iam: Any) -> list[str] | None:
-    """Return the policies of SkyPilot's role that allow all of a service; None without the role.
-
-    An attached one is judged by its name, which AWS gives to its own.
-    """
+    """Return the role's policies that allow all of a service, by AWS's own names; None: no role."""
     try:
         attached = iam.list_attached_role_policies(RoleName=ROLE)["AttachedPolicies"]
     except iam.exceptions.NoSuchEntityException:

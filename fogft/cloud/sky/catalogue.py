@@ -121,10 +121,7 @@ def _sold(cloud: str, machine: Any) -> Iterator[tuple[Placement, float]]:
 
 
 def _price(cloud: str, machine: Any) -> Callable[[str, str | None], float]:
-    """Return what tells a machine's price in a region and zone.
-
-    SkyPilot searches its whole catalogue for each; this machine's rows say the same.
-    """
+    """Return what tells a machine's price in a place; SkyPilot would search its whole catalogue."""
     try:
         of_cloud = importlib.import_module(f"sky.catalog.{cloud}_catalog")
         common = importlib.import_module("sky.catalog.common")

@@ -39,11 +39,7 @@ class Ending:
     clock: Callable[[], float]
 
     def end(self, id: ReplicaId) -> None:
-        """End a replica's machine; return when nothing of it is left. The journal's entry stays.
-
-        Raises:
-            CloudUnreachable: Something may still run; the hint says how to look.
-        """
+        """End a replica's machine; return when nothing is left. CloudUnreachable: it may run."""
         name = cluster_name(id)
         trouble: Exception | None = None
         begun_at = self.clock()
@@ -76,11 +72,7 @@ class Ending:
         ) from trouble
 
     def _looks_needed(self, id: ReplicaId) -> int:
-        """Return how often nothing must be found: twice for an order that may be on its way.
-
-        Whoever ordered may have been killed before SkyPilot's answer came, and SkyPilot may
-        hear of the order only after our first look.
-        """
+        """Return how often nothing must be found: twice if SkyPilot may yet hear of the order."""
         entry = self.journal.get(id)
         on_its_way = entry is not None and not entry.request
         young = entry is not None and self.clock() - entry.launched_at < _HEARD_WITHIN_S

@@ -52,11 +52,7 @@ class Following:
         self._job_not_before: dict[ReplicaId, float] = {}
 
     def step(self, id: ReplicaId) -> bool:
-        """Move a launch on if it can be. Returns whether there is more to follow.
-
-        Raises:
-            CloudUnreachable: Nothing was learned; try again later.
-        """
+        """Move a launch on; return whether there is more. CloudUnreachable: nothing was learned."""
         entry = self.journal.get(id)
         if entry is None or entry.stage not in UNDER_WAY:
             return False
@@ -101,10 +97,7 @@ class Following:
                 self.ending.census.of(entry.id, entry)  # seen once, its absence counts
 
     def _meet(self, entry: Entry) -> None:
-        """Look at a machine on demand as soon as its provider lists it; SkyPilot lists it last.
-
-        Its guard is to end it, and not merely stop it.
-        """
+        """Have a machine on demand end itself, and not merely stop, once its provider lists it."""
         for instance in self.ending.census.of(entry.id, entry) or ():
             self.ending.census.end_when_shut_down(instance)
             if instance.public_ip:

@@ -114,10 +114,7 @@ class InstalledSky:
         self.sdk.get(self.sdk.api_cancel([id], silent=True))
 
     def clusters(self, name: str | None, *, refresh: bool) -> Sequence[Cluster]:
-        """List one cluster, or all where no name is given.
-
-        `refresh` asks the clouds themselves (seconds), instead of SkyPilot's memory.
-        """
+        """List one cluster, or all for None. `refresh` asks the clouds: it takes seconds."""
 
         def run() -> Sequence[Cluster]:
             self._load()
@@ -213,10 +210,7 @@ class InstalledSky:
 
     @_limited(ASK_LIMIT_S, "the version of the API server")
     def renew_server(self) -> str:
-        """End a local API server of another SkyPilot if it is idle; return what to say of it.
-
-        The next call starts one of the installed SkyPilot.
-        """
+        """End a local API server of another SkyPilot if it is idle; return what to say of it."""
         try:
             found = str(getattr(self.sdk.api_info(), "version", None) or self.sky.__version__)
         except Exception as error:
@@ -237,10 +231,7 @@ class InstalledSky:
 
     @_limited(REFRESH_LIMIT_S, "the credentials that a VM would get")
     def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:
-        """Return the files of credentials that go to a VM on some clouds whatever fogft sets.
-
-        None: the API server is elsewhere, and decides which of its own it gives away.
-        """
+        """Return the credentials' files that a VM gets anyway; None: a server elsewhere decides."""
         return self._settings.uploaded(clouds)
 
     def _log(self, lines: int, read: Callable[..., object]) -> str:

@@ -44,10 +44,7 @@ class Provider(Protocol):
         """Its name, as in `Placement.cloud`."""
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
-        """List what carries our labels (of one pool or, if empty, of all) and is not terminated.
-
-        ``regions=None`` looks everywhere.
-        """
+        """List what has our labels, of one pool or (empty) all, in some regions or (None) all."""
 
     def terminate(self, instances: Iterable[Instance]) -> None:
         """Ask for the end of instances. Those that are gone are no error."""

@@ -30,11 +30,7 @@ class RefusedError(CloudError):
 
 @dataclass(frozen=True)
 class Request:
-    """A launch request that the API server knows of, and whether it is still under way.
-
-    Attributes:
-        queued: No worker has begun with it: a local server on two cores has two.
-    """
+    """A launch request that the API server knows of. `queued`: no worker has begun with it."""
 
     id: str
     active: bool

@@ -38,10 +38,7 @@ def report_nothing() -> None:
 
 
 def guard() -> str:
-    """Return the guard's command: one line, for a shell, which returns at once.
-
-    cloud-init runs it at the first boot, and what it leaves at each boot.
-    """
+    """Return the guard's command for cloud-init: one line, for a shell, which returns at once."""
     text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(ALONE_MINUTES))
     packed = base64.b64encode(text.encode()).decode()
     script = f"{EACH_BOOT}/fogft-guard"
@@ -82,10 +79,7 @@ class Settings:
                 config.apply_cli_config(changes)  # as `sky launch --config` does
 
     def uploaded(self, clouds: Iterable[str]) -> list[str] | None:
-        """Return the files of credentials that go to a VM on some clouds all the same.
-
-        None: an API server elsewhere decides.
-        """
+        """Return the credentials' files that a VM gets anyway; None: a server elsewhere decides."""
         self.apply(clouds)
         if _is_elsewhere():
             return None

@@ -110,10 +110,7 @@ class Locks:
 
 
 def lock(wheel: Path) -> Locks:
-    """Return the locks for the wheel in a folder.
-
-    Raises CloudError: no package index can be asked, or `uv` is not installed.
-    """
+    """Return the locks for the wheel in a folder. CloudError: no package index, or no `uv`."""
     (file,) = wheel.glob("*.whl")
     wanted = [f"{name} @ {file.as_uri()}" for name in FILES.values()]
     with ThreadPoolExecutor(len(wanted)) as both:
@@ -142,10 +139,7 @@ class LockFolder:
         self._resolve = resolve
 
     def renew(self, wheel: Path) -> Mapping[str, bytes]:
-        """Renew the lock for the next generations of a wheel; return it as files.
-
-        Raises CloudError: it cannot be made, and there is none of before.
-        """
+        """Renew the lock for a wheel's next generations; return it. CloudError: there is none."""
         try:
             self._write(self._newest(wheel), self._resolve(wheel))
         except CloudError:

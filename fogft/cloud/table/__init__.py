@@ -2,10 +2,7 @@
 
 ``InstanceType, vCPUs, MemoryGiB, AcceleratorName, AcceleratorCount, Region,
 AvailabilityZone, Price, SpotPrice``; with ``Cloud``, ``AsOf`` (YYYY-MM-DD) and ``Source``
-where a table spans clouds or is dated. Without ``Cloud`` the file's folder names it, as in
-SkyPilot's own ``catalogs/v8/aws/vms.csv``.
-
-Not here: launching, which a table cannot do.
+where a table spans clouds or is dated. Without ``Cloud`` the file's folder names it.
 """
 
 from __future__ import annotations

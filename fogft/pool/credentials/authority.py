@@ -74,11 +74,7 @@ def create_authority(folder: Path, pool_uid: str) -> None:
 
 
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
-    """Create a key, certified by the folder's CA under a name of 1 to 64 characters.
-
-    Args:
-        days: How long it is valid from now; never beyond the CA's own end.
-    """
+    """Certify a new key under a name of 1 to 64 characters, for some days or until the CA's end."""
     if not 0 < len(common_name) <= _COMMON_NAME_LIMIT:
         raise ValueError(f"a common name has 1 to {_COMMON_NAME_LIMIT} characters: {common_name!r}")
     certificate, key = _made(common_name, role=role, days=days, issuer=_load_authority(folder))
@@ -86,10 +82,7 @@ def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS
 
 
 def write(credential: Credential, folder: Path, stem: str) -> None:
-    """Write ``<stem>.key``, ``<stem>.crt`` and ``ca.crt`` to a folder (0700), each 0600.
-
-    The certificate comes last: where it stands, its key does too.
-    """
+    """Write ``<stem>.key``, ``ca.crt`` and, last, ``<stem>.crt`` to a folder (0700), each 0600."""
     disk.make_folder(folder)
     disk.write_whole(folder / AUTHORITY_CERTIFICATE, credential.authority_pem)
     disk.write_whole(folder / f"{stem}.key", credential.key_pem)

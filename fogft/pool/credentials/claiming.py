@@ -34,10 +34,7 @@ _KINDS = {
 
 
 def new_token(now: float) -> str:
-    """Return a token that identifies a claim; of two, the earlier is the greater text.
-
-    Records of one order are told apart by their bytes, and the greater stands (`record_set`).
-    """
+    """Return a claim's token: the earlier is the greater text, and the greater record stands."""
     return f"{_LATEST_MS - int(now * 1000):013d}.{secrets.token_hex(8)}"
 
 
@@ -62,11 +59,8 @@ def claim(
 ) -> None:
     """Claim a holder's certificate for this machine. Repeatable with the same token.
 
-    A rendezvous's own is not claimed: it can neither ask, answer nor sign anything. Another's word
-    may take `settle_s` on its way, when several join at once.
-
-    Raises:
-        CredentialError: Another machine has joined with it, or nobody can tell.
+    A rendezvous's own is not claimed: it can neither ask, answer nor sign anything. Raises
+    `CredentialError`: another machine has joined with it, or nobody can tell.
     """
     if holder.role not in _KINDS:
         return
