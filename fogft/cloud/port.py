@@ -148,7 +148,7 @@ class Auditing(Protocol):
     """A cloud that can list all machines that exist, even those fogft forgot."""
 
     def audit(self, pool_uid: str = "") -> Audit:
-        """List the machines of a pool, or all of this user's. CloudUnreachable: conclude nothing."""
+        """List the machines of a pool, or all of this user's. CloudUnreachable: it cannot tell."""
 
 
 @runtime_checkable

@@ -69,7 +69,7 @@ class Chaos:
         rate_bytes_per_s: float | None = None,
         for_s: float | None = None,
     ) -> None:
-        """Delay traffic to and from a machine, each way, and limit its rate; None: until `clear`."""
+        """Delay traffic to and from a machine, each way, and limit its rate; None: till `clear`."""
         if not 0 <= delay_s <= 3600 or not (rate_bytes_per_s is None or rate_bytes_per_s >= 1):
             raise CloudError("the delay is out of range", "give a delay of 0 to 3600 s")
         until = _deadline(for_s)

@@ -189,9 +189,8 @@ def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes])
     except (OSError, StateError, TypeError, ValueError) as error:
         with contextlib.suppress(OSError):
             remove(beside)
-        reason = error.message if isinstance(error, StateError) else str(error)
         raise CloudError(
-            f"machine `{folder.id.short}` cannot be created: {reason}",
+            f"machine `{folder.id.short}` cannot be created: {error}",
             "check the disk's free space and the folder's owner",
         ) from error
 

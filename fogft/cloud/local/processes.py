@@ -51,7 +51,9 @@ def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
         ours = any(item.startswith(f"{MACHINE}=".encode()) for item in environ)
         if ours and all(mark in environ for mark in marks):
             marked.add(int(entry))
-    return sorted(_with_descendants(marked, parents) - {os.getpid()})
+    while below := {pid for pid, parent in parents.items() if parent in marked} - marked:
+        marked |= below
+    return sorted(marked - {os.getpid()})
 
 
 def end(pids: Iterable[int], limit_s: float = _LIMIT_S) -> None:
@@ -112,20 +114,6 @@ def _parent(pid: str) -> int | None:
 def _stat(pid: str) -> list[str]:
     # The second field, the program's name in parentheses, may hold anything.
     return (_PROC / pid / "stat").read_text(errors="replace").rpartition(")")[2].split()
-
-
-def _with_descendants(roots: set[int], parents: dict[int, int]) -> set[int]:
-    children: dict[int, list[int]] = {}
-    for pid, parent in parents.items():
-        children.setdefault(parent, []).append(pid)
-    found: set[int] = set()
-    waiting = list(roots)
-    while waiting:
-        pid = waiting.pop()
-        if pid not in found:
-            found.add(pid)
-            waiting += children.get(pid, [])
-    return found
 
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,6 @@ class Calls:
     """Runs calls, and remembers those that timed out, by subject."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._given_up: dict[str, Future[Any]] = {}
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
@@ -32,8 +31,7 @@ class Calls:
         `subject` says what it is about: the same words are the same question.
         """
         ends_at = time.monotonic() + limit_s
-        with self._lock:
-            running = self._given_up.get(subject)
+        running = self._given_up.get(subject)
         if running is not None:
             wait([running], limit_s)
         if running is None or running.done():
@@ -41,15 +39,13 @@ class Calls:
             threading.Thread(target=_run, args=(call, running), daemon=True).start()
             wait([running], max(0.0, ends_at - time.monotonic()))
             if running.done():
-                with self._lock:
-                    self._given_up.pop(subject, None)
+                self._given_up.pop(subject, None)
                 error = running.exception()
                 if error is not None:
                     raise translated(error, subject) from error
                 answer: T = running.result()
                 return answer
-        with self._lock:
-            self._given_up[subject] = running
+        self._given_up[subject] = running
         raise CloudUnreachable(
             f"SkyPilot did not answer within {limit_s:.0f} s about {subject}",
             "`sky api info` and `sky api logs` show the state of its API server",

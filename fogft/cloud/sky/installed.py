@@ -11,6 +11,7 @@ import copy
 import functools
 import importlib
 import io
+import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, cast
@@ -30,7 +31,7 @@ from fogft.cloud.sky.sdk import (
     request_of,
     told_reasons,
 )
-from fogft.cloud.sky.settings import Settings, report_nothing
+from fogft.cloud.sky.settings import NO_REPORTS, Settings
 from fogft.errors import CloudError
 from fogft.model.names import VM_CLOUDS
 
@@ -249,7 +250,7 @@ class InstalledSky:
         with self._lock:
             if self.sdk is not None:
                 return
-            report_nothing()
+            os.environ.setdefault(NO_REPORTS, "1")  # unless the user chose
             try:
                 self.sky = importlib.import_module("sky")
                 self.sdk = importlib.import_module("sky.client.sdk")

@@ -108,8 +108,7 @@ JOBS = {
 
 ENDED = frozenset(("SUCCEEDED", "FAILED", "CANCELLED"))
 _QUEUED = frozenset(("PENDING", "WAITING"))
-_SAID_BY_SERVER = ("CloudError", "NoCloudAccessError", "CloudUserIdentityError",
-                   "InvalidCloudCredentials")  # fmt: skip
+_CREDENTIALS = ("NoCloudAccessError", "CloudUserIdentityError", "InvalidCloudCredentials")
 
 
 def translated(error: BaseException, subject: str) -> CloudError:
@@ -130,7 +129,8 @@ def as_answer() -> Iterator[None]:
         yield
     except Exception as error:
         kind = type(error).__name__
-        if kind not in _SAID_BY_SERVER and _is_unknown(error):
+        said_by_server = kind == "CloudError" or kind in _CREDENTIALS
+        if _is_unknown(error) and not said_by_server:
             raise
         raise RefusedError(kind, _texts(error)) from error
 
@@ -150,7 +150,7 @@ def _texts(error: BaseException) -> list[str]:
 
 
 def _hint(kind: str) -> str:
-    if kind in ("CloudUserIdentityError", "InvalidCloudCredentials", "NoCloudAccessError"):
+    if kind in _CREDENTIALS:
         return (
             "renew the credentials of this cloud; `sky check` tests them. SkyPilot's API server "
             "keeps running: `sky api stop` ends it"

@@ -11,7 +11,6 @@ from __future__ import annotations
 import base64
 import importlib
 import json
-import os
 import threading
 from collections.abc import Iterable
 from typing import Any
@@ -30,11 +29,6 @@ EACH_BOOT = "/var/lib/cloud/scripts/per-boot"
 ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60
 """A launch takes 15 minutes at most (`following.LAUNCH_LIMIT_S`), a set-up its own limit."""
 NO_REPORTS = "SKYPILOT_DISABLE_USAGE_COLLECTION"
-
-
-def report_nothing() -> None:
-    """Turn SkyPilot's usage reports off, unless the user chose. Before it is imported."""
-    os.environ.setdefault(NO_REPORTS, "1")
 
 
 def guard() -> str:

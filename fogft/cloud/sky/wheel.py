@@ -30,6 +30,7 @@ from fogft.model.plain import to_plain
 _PACKAGE = Path(__file__).resolve().parents[2]
 _EPOCH = (2020, 1, 1, 0, 0, 0)
 _KEPT = ("METADATA", "WHEEL", "entry_points.txt")
+_REPLACED = ("Tag:", "Build:")  # in the file `WHEEL`
 FILES = {"requirements.txt": "fogft", "requirements-ros.txt": "fogft[ros]"}
 _COMPILE = ("pip", "compile", "--quiet", "--generate-hashes", "--no-header", "--no-annotate")
 _FOR_ALL = ("--universal", "--python-version", "3.10", "--no-emit-package", "fogft", "-")
@@ -61,11 +62,15 @@ def pack(package: Path = _PACKAGE) -> tuple[str, bytes]:
     files = {f"fogft/{name}": content for name, content in _sources(package).items()}
     for name in _KEPT:
         text = installed.read_text(name)
+        if name == "WHEEL" and text is not None:
+            kept = [line for line in text.splitlines() if not line.startswith(_REPLACED)]
+            text = "\n".join([*filter(None, kept), "Tag: py3-none-any"]) + "\n"
         if text is not None:
-            files[f"{info}/{name}"] = _wheel_tag(text) if name == "WHEEL" else text.encode()
-    record = "".join(
-        f"{name},sha256={_digest(content)},{len(content)}\n" for name, content in files.items()
-    )
+            files[f"{info}/{name}"] = text.encode()
+    record = ""
+    for name, content in files.items():
+        digest = base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+        record += f"{name},sha256={digest},{len(content)}\n"
     files[f"{info}/RECORD"] = (record + f"{info}/RECORD,,\n").encode()
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -78,33 +83,20 @@ def pack(package: Path = _PACKAGE) -> tuple[str, bytes]:
 
 
 def _sources(package: Path) -> dict[str, bytes]:
-    found = dict(_files_below(package))
+    paths = {str(path.relative_to(package)): path for path in package.rglob("*")}
     beside = package.parent / "templates"
-    if not (package / "templates").is_dir() and beside.is_dir():  # a checkout, not an installation
-        found |= {f"templates/{name}": content for name, content in _files_below(beside)}
-    return dict(sorted(found.items()))
-
-
-def _files_below(folder: Path) -> list[tuple[str, bytes]]:
-    return [
-        (str(path.relative_to(folder)), path.read_bytes())
-        for path in folder.rglob("*")
+    if not (package / "templates").is_dir():  # a checkout, not an installation
+        paths |= {str(path.relative_to(package.parent)): path for path in beside.rglob("*")}
+    return {
+        name: path.read_bytes()
+        for name, path in sorted(paths.items())
         if path.is_file() and "__pycache__" not in path.parts and path.suffix != ".pyc"
-    ]
-
-
-def _wheel_tag(text: str) -> bytes:
-    kept = [line for line in text.splitlines() if line and not line.startswith(("Tag:", "Build:"))]
-    return ("\n".join([*kept, "Tag: py3-none-any"]) + "\n").encode()
-
-
-def _digest(content: bytes) -> str:
-    return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
+    }
 
 
 @dataclass(frozen=True)
 class Locks:
-    """Lock files without and with ROS 2; None if they could not be created."""
+    """Lock files without and with ROS 2; none if they could not be created."""
 
     files: Mapping[str, str]
 
@@ -135,21 +127,22 @@ class LockFolder:
     """The locks on disk: the newest of each wheel, and each generation's."""
 
     def __init__(self, folder: Path, resolve: Callable[[Path], Locks]) -> None:
+        make_folder(folder)
         self._folder = folder
         self._resolve = resolve
 
     def renew(self, wheel: Path) -> Mapping[str, bytes]:
         """Renew the lock for a wheel's next generations; return it. CloudError: there is none."""
+        newest = self._newest(wheel)
         try:
-            self._write(self._newest(wheel), self._resolve(wheel))
+            write_json(newest, to_plain(self._resolve(wheel)))
         except CloudError:
-            if read_as(Locks, self._newest(wheel)) is None:
+            if read_as(Locks, newest) is None:
                 raise
-        return _as_files(read_as(Locks, self._newest(wheel)))
+        return _as_files(read_as(Locks, newest))
 
     def of(self, generation: str, wheel: Path) -> Mapping[str, bytes]:
         """Return a generation's lock as files; none where none can be made at its first launch."""
-        make_folder(self._folder)
         kept = self._folder / f"{generation}-{wheel.name}.json"
         with locked(self._folder / "locks.lock"):
             found = read_as(Locks, kept)
@@ -158,15 +151,11 @@ class LockFolder:
                 if not found.files:
                     with contextlib.suppress(CloudError):  # as `up` has told
                         found = self._resolve(wheel)
-                self._write(kept, found)
+                write_json(kept, to_plain(found))
         return _as_files(found)
 
     def _newest(self, wheel: Path) -> Path:
         return self._folder / f"{wheel.name}.json"
-
-    def _write(self, path: Path, locks: Locks) -> None:
-        make_folder(self._folder)
-        write_json(path, to_plain(locks))
 
 
 def _as_files(locks: Locks | None) -> Mapping[str, bytes]:
