@@ -37,7 +37,7 @@ class Launch:
     link_port: int = LINK_PORT
     # A machine of another type in the same place may cost so much at most; None for no limit.
     limit_usd_per_hour: float | None = None
-    # Its machine exists and is stopped (`Stopping`): it is started under its id.
+    # Its machine exists and is stopped (`RealCloud.stop`): it is started under its id.
     is_there: bool = False
     # Others that are opened beside it.
     more_ports: tuple[int, ...] = ()
@@ -79,7 +79,7 @@ class Cloud(Protocol):
 
 
 @runtime_checkable
-class Accounts(Protocol):
+class RealCloud(Protocol):
     """A cloud that costs money and needs credentials for each provider behind it."""
 
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
@@ -112,21 +112,11 @@ class Accounts(Protocol):
     def unverified(self, cloud: str) -> str:
         """Return why a cloud's machines cannot be listed directly; empty when they can."""
 
-
-@runtime_checkable
-class Stopping(Protocol):
-    """A cloud whose on-demand machines can be stopped, and started with what is on their disks."""
-
     def stop(self, order: Launch) -> None:
         """Stop a machine; return when it is listed as that. Raises `CloudError`: it may run on."""
 
-
-@runtime_checkable
-class Baking(Protocol):
-    """A cloud whose machines may start from an image that has a replica's environment already."""
-
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
-        """Write the build context for `docker build` into an empty folder.
+        """Write the build context of an image with a replica's environment into an empty folder.
 
         `task` is a pool file's, with absolute paths; `image` is what it is built on. Raises
         `SpecError` for what an image cannot have.

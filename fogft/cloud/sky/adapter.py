@@ -162,7 +162,7 @@ class SkyCloud:
         self._census.forget(id)
 
     def stop(self, order: Launch) -> None:
-        """See `Stopping`."""
+        """See `RealCloud`."""
         self.sky.stop(cluster_name(order.id))
         resources = task.alternative(order.task.get("resources") or {}, order.placement)
         disk_size = resources.get("disk_size", task.DISK_GB)
@@ -189,15 +189,15 @@ class SkyCloud:
         self._presence.refresh(id)
 
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
-        """See `Accounts`."""
+        """See `RealCloud`."""
         return self.sky.check(clouds)
 
     def check_task(self, task: Mapping[str, Any]) -> None:
-        """See `Accounts`."""
+        """See `RealCloud`."""
         refuse_what_cannot_be_honoured(task)
 
     def credentials_end_at(self) -> float | None:
-        """See `Accounts`. What is known is looked at again after a minute."""
+        """See `RealCloud`. What is known is looked at again after a minute."""
         now = self.clock()
         if not 0 <= now - self._ends[0] < _ENDS_FRESH_S:
             used = [one for one in self.providers if one.cloud in self._prices.regions]
@@ -206,7 +206,7 @@ class SkyCloud:
         return self._ends[1]
 
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
-        """See `Accounts`. An API server of another SkyPilot is ended where it is idle."""
+        """See `RealCloud`. An API server of another SkyPilot is ended where it is idle."""
         found = [self.sky.renew_server()]
         for provider in self.providers:
             at = provider.credentials_end_at() if provider.cloud in clouds else None
@@ -219,18 +219,18 @@ class SkyCloud:
         return [one for one in found if one]
 
     def left_out(self) -> Sequence[str]:
-        """See `Accounts`."""
+        """See `RealCloud`."""
         return self._prices.left_out()
 
     def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
-        """See `Accounts`."""
+        """See `RealCloud`."""
         asked = task.as_launched(resources)
         return self.sky.lacking({key: asked[key] for key in task.FEATURES if key in asked})
 
     def exposures(
         self, clouds: Sequence[str], *, open_port: int | None, allow_from: Sequence[str] = ()
     ) -> Sequence[str]:
-        """See `Accounts`."""
+        """See `RealCloud`."""
         files = self.sky.uploaded_credentials(clouds)
         found = [one.warning() for one in self.providers if one.cloud in clouds or not clouds]
         try:
@@ -262,14 +262,14 @@ class SkyCloud:
         return [one for one in found if one]
 
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
-        """See `Baking`."""
+        """See `RealCloud`."""
         packed, lock = self.make_wheel(self.folder / "wheels"), dict[str, bytes]()
         with contextlib.suppress(CloudError):  # then the image resolves, as a VM would
             lock |= self._locks.renew(packed)
         bake.write(folder, task, image, packed, lock)
 
     def unverified(self, cloud: str) -> str:
-        """See `Accounts`."""
+        """See `RealCloud`."""
         return self._census.unverified(cloud)
 
     def audit(self, pool_uid: str = "") -> Audit:

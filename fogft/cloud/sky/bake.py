@@ -34,7 +34,7 @@ RUN export HOME=/root && {exports}bash /root/.fogft/setup.sh && rm -rf /root/.fo
 def write(
     folder: Path, asked: Mapping[str, Any], image: str, wheel: Path, lock: Mapping[str, bytes]
 ) -> None:
-    """Write the context of a build into an empty folder; see `Baking`.
+    """Write the context of a build into an empty folder; see `RealCloud`.
 
     Args:
         asked: The pool file's task, with absolute paths.

@@ -1,6 +1,6 @@
 """``fogft bake``: build an image that has a pool file's environment already.
 
-Not here: what the image is built of (`fogft.cloud.port.Baking`).
+Not here: what the image is built of (`fogft.cloud.port.RealCloud`).
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from fogft.cloud.port import Baking
+from fogft.cloud.port import RealCloud
 from fogft.errors import CloudError, SpecError
 from fogft.pool.commands.composition import make_cloud
 from fogft.pool.manager.configuration import absolute, with_build
@@ -36,7 +36,7 @@ def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
     text = read_text(file)
     spec = parse(text, file=str(file))
     cloud = make_cloud(cloud_named_by(spec, text, file), file.parent)
-    if not isinstance(cloud, Baking):
+    if not isinstance(cloud, RealCloud):
         raise SpecError(f"`{file}` names no real cloud", "the local cloud needs no image")
     task = with_build(absolute(spec.task, file.parent.resolve()))
     named = {str(one.get("image_id", "")) for _, one in alternatives(task.get("resources") or {})}

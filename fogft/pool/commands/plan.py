@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from fogft.cloud.port import Accounts
+from fogft.cloud.port import RealCloud
 from fogft.cloud.table import PriceTable
 from fogft.errors import CloudError, PoolNotFound, SpecError
 from fogft.model.choices import TrafficSpec
@@ -88,7 +88,7 @@ def plan_file(
             "relax the resources, or name other places",
         )
     distances, notes = far(spec, sold, offline=offline, told=told)
-    notes += seller.left_out() if isinstance(seller, Accounts) else ()
+    notes += seller.left_out() if isinstance(seller, RealCloud) else ()
     notes += [
         f"the gateway's VM costs ${one.offer.usd_per_hour:.3f}/h more: "
         f"`{one.offer.placement.instance}` on demand in `{one.offer.placement.location}`"
@@ -113,7 +113,7 @@ def plan_file(
     ready_p90_s = took_s[int(0.9 * len(took_s))] if len(took_s) >= LEAST_LAUNCHES else None
     explained = explain(spec, intent, observed, history, on_demand, recovery_s=ready_p90_s)
     clouds = (
-        seller.lacking(spec.task.get("resources") or {}) if isinstance(seller, Accounts) else {}
+        seller.lacking(spec.task.get("resources") or {}) if isinstance(seller, RealCloud) else {}
     )
     return PlanShown(
         *(spec, now, name, explained, distances, tuple(notes), counted, ready_p90_s, len(took_s)),

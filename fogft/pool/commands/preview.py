@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from fogft.cloud.port import Accounts
+from fogft.cloud.port import RealCloud
 from fogft.errors import CloudError, PoolNotFound, SpecError
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer
@@ -97,7 +97,7 @@ def order(
     sold: tuple[Offer, ...] = ()
     beside: tuple[PlannedLaunch, ...] = ()
     try:
-        if isinstance(concrete, Accounts):
+        if isinstance(concrete, RealCloud):
             told("asking SkyPilot for usable clouds and prices")
             concrete.check_task(spec.task)
             accounts, found = _tested(concrete, clouds_named(spec), may_fail=before is not None)
@@ -118,7 +118,7 @@ def order(
         try:
             sold = offers.ask(concrete, spec)
             beside = launched_gateway.planned(concrete, spec)
-            notes += concrete.left_out() if isinstance(concrete, Accounts) else ()
+            notes += concrete.left_out() if isinstance(concrete, RealCloud) else ()
         except CloudError as error:
             notes.append(f"prices are not available now: {error.message}")
     except SpecError as error:
@@ -150,7 +150,7 @@ def order(
         new_before_old=has_room(spec, usd_per_hour, cheapest),
         rolled_back=rolled_back,
         notes=(*notes, *(map(words, planned.notes) if before is None and sold else ())),
-        costs_money=isinstance(concrete, Accounts),
+        costs_money=isinstance(concrete, RealCloud),
         accounts=accounts,
     )
 
@@ -181,7 +181,7 @@ def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:
 
 
 def _tested(
-    cloud: Accounts, named: Sequence[str], *, may_fail: bool
+    cloud: RealCloud, named: Sequence[str], *, may_fail: bool
 ) -> tuple[Mapping[str, str], list[str]]:
     """Test credentials; return the outcome by cloud, and what is worth knowing besides."""
     try:

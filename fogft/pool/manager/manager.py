@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft import __version__, disk, logfile
-from fogft.cloud.port import Accounts, Cloud, Launch
+from fogft.cloud.port import Cloud, Launch, RealCloud
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.metrics.scrape import Scrape
 from fogft.model.reason import Cause, Reason, because
@@ -316,7 +316,7 @@ class Manager:
         if (report is None or not fresh) and not tick.over:
             cause = Cause.STALE_PROXY_REPORT if report else Cause.NO_PROXY_REPORT
             notes.append(Reason(cause))
-        ends_at = self._cloud.credentials_end_at() if isinstance(self._cloud, Accounts) else None
+        ends_at = self._cloud.credentials_end_at() if isinstance(self._cloud, RealCloud) else None
         seen = status.of_tick(
             tick,
             history=self._store.history(),

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fogft import logfile
-from fogft.cloud.port import Cloud, Launch, Refreshing, Stopping
+from fogft.cloud.port import Cloud, Launch, RealCloud, Refreshing
 from fogft.errors import CloudError, CloudUnreachable, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.model.groups import GATEWAY_SLOT, replica_hash, sales, task_at
 from fogft.model.intent import Intent
@@ -131,7 +131,7 @@ class Reconciler:
     ) -> None:
         self._cloud = cloud
         self._refreshing = cloud if isinstance(cloud, Refreshing) else None
-        self._stopping = cloud if isinstance(cloud, Stopping) else None
+        self._stopping = cloud if isinstance(cloud, RealCloud) else None
         self._distances = distances
         self._store = store
         self._links = links
