@@ -11,8 +11,8 @@ import pytest
 
 from fogft import disk
 from fogft.cli import main
-from fogft.cloud import sky
 from fogft.cloud.local import processes
+from fogft.cloud.sky import adapter as sky
 from fogft.errors import CloudUnreachable
 from fogft.pool.commands import preview
 from fogft.pool.commands.sweep import left_of

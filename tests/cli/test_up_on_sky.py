@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from fogft.cli import main, progress
-from fogft.cloud import sky
+from fogft.cloud.sky import adapter as sky
 from fogft.errors import CloudUnreachable
 from fogft.pool.commands import startup
 from fogft.pool.commands.status import Seen

@@ -12,8 +12,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fogft.cloud import sky
 from fogft.cloud.port import Launch
+from fogft.cloud.sky import adapter as sky
 from fogft.model.replica import MachinePhase, ReplicaId
 
 ID = ReplicaId("00000000000000aa", 0, 1)

@@ -197,9 +197,6 @@ class Relay:
                 first = await asyncio.wait_for(self._first_of(client), _FIRST_S)
                 server = stack.enter_context(await self._connected(client, host))
                 sides.append(server)
-                connection = asyncio.current_task()
-                assert connection is not None
-                self._young.pop(connection, None)
                 await self._exchange(client, server, first)
             except (OSError, asyncio.TimeoutError, asyncio.CancelledError):
                 for side in sides:
@@ -244,6 +241,7 @@ class Relay:
             pipes[0].put(first)
         connection = asyncio.current_task()
         assert connection is not None
+        self._young.pop(connection, None)
         self._connections[connection] = pipes
         ways = [asyncio.ensure_future(way) for p in pipes for way in (p.receive(), p.send())]
         try:

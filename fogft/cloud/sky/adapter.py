@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import getpass
+import importlib.util
 import logging
 import math
+import socket
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,18 +17,14 @@ from typing import Any
 
 from fogft.cloud.port import Audit, Launch
 from fogft.cloud.sky import bake, presence, task, wheel
+from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.census import Census
 from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.following import Following
+from fogft.cloud.sky.gcp import Gcp
 from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import ON_THE_MACHINE, UNDER_WAY, Entry, Journal, Stage
-from fogft.cloud.sky.naming import (
-    MAPPING_CLOUDS,
-    OWNER,
-    cluster_name,
-    label_value,
-    replica_of,
-)
+from fogft.cloud.sky.naming import MAPPING_CLOUDS, OWNER, cluster_name, label_value, replica_of
 from fogft.cloud.sky.presence import Presence
 from fogft.cloud.sky.prices import Prices, disk_usd_per_hour
 from fogft.cloud.sky.provider import NotAllowedError, Provider
@@ -54,6 +53,14 @@ def _each_second(step: Callable[[], bool]) -> None:
             time.sleep(1.0)
 
     _on_thread(run)
+
+
+def make(folder: Path, base: Path) -> SkyCloud:
+    """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until it is asked."""
+    owner = f"{getpass.getuser()}-{socket.gethostname()}"
+    google = importlib.util.find_spec("google") and importlib.util.find_spec("google.auth")
+    providers = [Aws(), Gcp()] if google else [Aws()]
+    return SkyCloud(folder, InstalledSky(), providers, owner=owner, base=base)
 
 
 @dataclass

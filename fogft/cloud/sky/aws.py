@@ -272,7 +272,10 @@ def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:
         by_group = [{"Name": "group-id", "Values": [group["GroupId"]]}]
         listed = ec2.describe_security_group_rules(Filters=by_group)["SecurityGroupRules"]
         found = {
-            (one["IpProtocol"], one["FromPort"], one["ToPort"], _source(one))
+            (
+                *(one["IpProtocol"], one["FromPort"], one["ToPort"]),
+                one.get("CidrIpv4") or one.get("CidrIpv6") or "others",
+            )
             for one in listed
             if not one["IsEgress"]
         }
@@ -285,10 +288,6 @@ def _permission(port: int, source: str) -> dict[str, Any]:
     ranges = {"Ipv6Ranges": [{"CidrIpv6": source}]} if ":" in source else {}
     ranges = ranges or {"IpRanges": [{"CidrIp": source}]}
     return {"IpProtocol": "tcp", "FromPort": port, "ToPort": port, **ranges}
-
-
-def _source(rule: Mapping[str, Any]) -> str:
-    return str(rule.get("CidrIpv4") or rule.get("CidrIpv6") or "others")
 
 
 @contextlib.contextmanager

@@ -72,9 +72,9 @@ def make_cloud(name: str, base: Path) -> Cloud:
             f"clouds: {known}; `sky` stands for the real clouds that the pool file names",
         )
     if name == SKY:
-        from fogft.cloud import sky
+        from fogft.cloud.sky import adapter
 
-        return sky.make(home() / "sky", base)
+        return adapter.make(home() / "sky", base)
     from fogft.cloud.local.cloud import LocalCloud
 
     return LocalCloud(local_root())

@@ -83,7 +83,11 @@ def claim(
             time.sleep(pause_s)
             found = _standing(hearer, holder, sequence)
             if found is None or found.content.get(_KEY) != token:
-                raise _used_elsewhere(holder)
+                raise CredentialError(
+                    f"this bundle for `{holder.short}` was used before, on another machine",
+                    "a bundle can be used only once: request a new one. If you do not know who "
+                    f"used it, run `fogft credentials revoke {holder.role.value} {holder.name}`",
+                )
     finally:
         speaker.close()
         hearer.close()
@@ -95,14 +99,6 @@ def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record
         if record.subject == holder.name and record.order >= (holder.generation, sequence):
             return record
     return None
-
-
-def _used_elsewhere(holder: Holder) -> CredentialError:
-    return CredentialError(
-        f"this bundle for `{holder.short}` was used before, on another machine",
-        "a bundle can be used only once: request a new one. If you do not know who used it, run "
-        f"`fogft credentials revoke {holder.role.value} {holder.name}`",
-    )
 
 
 def _nobody_tells(client: RendezvousClient) -> CredentialError:
