@@ -150,22 +150,17 @@ class LocalCloud:
     def _machine(self, folder: MachineFolder, now: float) -> Machine | None:
         """Return a machine as listed; None if it is gone."""
         try:
-            life = folder.life(now)
-        except StateError as error:
-            self._warn_once(folder.path.name, error.message)
-            return _damaged(folder, now, error) if folder.locked else None
-        if life is Life.DEAD:
-            # Later, if the cloud is busy: a list never waits.
-            with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
-                ending.bury(self.root, folder)
-            return None
-        try:
-            return _listed(folder, folder.record(), folder.state())
+            if folder.life(now) is not Life.DEAD:
+                return _listed(folder, folder.record(), folder.state())
         except StateError as error:
             if not folder.exists:  # it was ended while we looked
                 return None
             self._warn_once(folder.path.name, error.message)
-            return _damaged(folder, now, error) if life is Life.ALIVE else None
+            return _damaged(folder, now, error) if folder.locked else None
+        # Later, if the cloud is busy: a list never waits.
+        with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
+            ending.bury(self.root, folder)
+        return None
 
     def _is_new(self, folder: MachineFolder) -> bool:
         """Whether an order's machine has yet to be started. The cloud's lock is held."""

@@ -1,1 +1,4 @@
-"""Real clouds through SkyPilot's public SDK: a cluster for each replica. See docs/design/sky.md."""
+"""Real clouds through SkyPilot's public SDK: a cluster for each replica. See docs/design/sky.md.
+
+Not here: which offer is bought (`fogft.planning`).
+"""

@@ -3,6 +3,8 @@
 ``InstanceType, vCPUs, MemoryGiB, AcceleratorName, AcceleratorCount, Region,
 AvailabilityZone, Price, SpotPrice``; with ``Cloud``, ``AsOf`` (YYYY-MM-DD) and ``Source``
 where a table spans clouds or is dated. Without ``Cloud`` the file's folder names it.
+
+Not here: launching, which a table cannot do.
 """
 
 from __future__ import annotations
