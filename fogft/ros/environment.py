@@ -62,11 +62,11 @@ def profile_variable(environ: Mapping[str, str] = os.environ) -> str:
     return "FASTDDS_DEFAULT_PROFILES_FILE"
 
 
-def largest_segment_bytes(process: str = "self") -> int:
-    """Return the size of the largest Fast DDS segment that a process maps; 0 for none."""
+def largest_segment_bytes() -> int:
+    """Return the size of the largest Fast DDS segment that this process maps; 0 for none."""
     largest = 0
     with contextlib.suppress(OSError):
-        for line in Path("/proc", process, "maps").read_text().splitlines():
+        for line in Path("/proc/self/maps").read_text().splitlines():
             if _SEGMENT.search(line):
                 first, _, last = line.split(" ", 1)[0].partition("-")
                 largest = max(largest, int(last, 16) - int(first, 16))

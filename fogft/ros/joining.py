@@ -68,15 +68,11 @@ class Timers:
     """
 
     def __init__(self) -> None:
-        self._ahead_s = self._seen()
-
-    @staticmethod
-    def _seen() -> float:
-        return time.time() - time.monotonic()
+        self._ahead_s = time.time() - time.monotonic()
 
     def look(self, node: Any) -> None:
         """Wake the timers of a node's participant if the clock was set back since the last look."""
-        before, self._ahead_s = self._ahead_s, self._seen()
+        before, self._ahead_s = self._ahead_s, time.time() - time.monotonic()
         if before - self._ahead_s > _SET_BACK_S:
             from rcl_interfaces.msg import Log
 

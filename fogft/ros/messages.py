@@ -15,7 +15,7 @@ from functools import lru_cache
 from typing import Any
 
 from fogft.errors import RosError, Unreadable
-from fogft.model.cdr import NUMBER_BYTES, Shape
+from fogft.model.cdr import NUMBER_BYTES
 from fogft.ros.types import load_service_type, shape
 from fogft.topics import goals
 
@@ -42,9 +42,7 @@ def from_bytes(payload: bytes, message_type: Any) -> Any:
     raise Unreadable(f"{len(payload)} bytes are not a serialised {message_type.__name__}: {fault}")
 
 
-@lru_cache(maxsize=256)
-def _shape_of(message_type: Any) -> Shape:
-    return shape(message_type)
+_shape_of = lru_cache(maxsize=256)(shape)
 
 
 def default_response(name: str) -> bytes:

@@ -204,9 +204,11 @@ class SerialisedNode:
         for name, namespace in nodes:
             if not ros_names.is_application(name):
                 continue
-            for service, kinds in self._services_of(name, namespace):
-                if kinds and ros_names.is_of_application(service, kinds[0]):
-                    found.setdefault(service, kinds[0])
+            with contextlib.suppress(Exception):  # the node has gone since
+                services = self._node.get_service_names_and_types_by_node(name, namespace)
+                for service, kinds in services:
+                    if kinds and ros_names.is_of_application(service, kinds[0]):
+                        found.setdefault(service, kinds[0])
         return found
 
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
@@ -305,12 +307,6 @@ class SerialisedNode:
         with contextlib.suppress(Exception):  # rclpy's InvalidHandle
             return list(find(topic, no_mangle=True))
         return []
-
-    def _services_of(self, name: str, namespace: str) -> Any:
-        try:
-            return self._node.get_service_names_and_types_by_node(name, namespace)
-        except Exception:  # the node has gone since
-            return []
 
     def look(self) -> None:
         """Keep this process known to others. Call it every second or more often."""

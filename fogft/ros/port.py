@@ -117,14 +117,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True)
 class Status:
-    """One status of `/diagnostics`.
-
-    Attributes:
-        name: Whose it is; the same each time.
-        message: In a few words.
-        hardware_id: The robot or the replica.
-        values: What is known, by name.
-    """
+    """One status of `/diagnostics`; `hardware_id` names the robot or the replica."""
 
     level: Level
     name: str

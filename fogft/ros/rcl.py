@@ -28,6 +28,7 @@ from ctypes import (
     c_void_p,
     py_object,
 )
+from functools import lru_cache
 from typing import Any
 
 from fogft.errors import RosError
@@ -86,38 +87,26 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 }
 
 
-class Rcl:
-    """The functions of `_SIGNATURES` as attributes."""
-
-    def __init__(self, library: CDLL) -> None:
-        for name, (result, arguments) in _SIGNATURES.items():
-            function = getattr(library, name)
-            function.restype = result
-            function.argtypes = arguments
-            setattr(self, name, function)
-
-    def __getattr__(self, name: str) -> Any:
-        raise AttributeError(name)
+def _declared(library: CDLL) -> CDLL:
+    for name, (result, arguments) in _SIGNATURES.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
 
 
-_loaded: tuple[Rcl, Rcl] | None = None
-
-
-def load() -> tuple[Rcl, Rcl]:
+@lru_cache(maxsize=1)
+def load() -> tuple[CDLL, CDLL]:
     """Load the functions: a set that holds the GIL, and a set that releases it.
 
     Raises:
         RosError: The library or one of its functions is missing.
     """
-    global _loaded  # noqa: PLW0603
-    if _loaded is None:
-        try:
-            import rclpy.impl.implementation_singleton  # noqa: F401  loads librcl itself
+    try:
+        import rclpy.impl.implementation_singleton  # noqa: F401  loads librcl itself
 
-            _loaded = Rcl(PyDLL("librcl.so")), Rcl(CDLL("librcl.so"))
-        except (OSError, AttributeError, ImportError) as error:
-            raise RosError(f"the C library of ROS 2 cannot be used: {error}") from error
-    return _loaded
+        return _declared(PyDLL("librcl.so")), _declared(CDLL("librcl.so"))
+    except (OSError, AttributeError, ImportError) as error:
+        raise RosError(f"the C library of ROS 2 cannot be used: {error}") from error
 
 
 def error_text() -> str:

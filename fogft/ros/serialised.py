@@ -17,7 +17,7 @@ Not here: threads and locks (`node`), loading types (`types`), C signatures (`rc
 
 from __future__ import annotations
 
-from ctypes import addressof, byref, c_int64, string_at
+from ctypes import CDLL, addressof, byref, c_int64, string_at
 from functools import lru_cache
 from typing import Any
 
@@ -68,7 +68,7 @@ class CMessage:
             reason = rcl.error_text()
             raise Unreadable(f"{size} bytes are not a serialised {self._name}: {reason}")
 
-    def write(self, functions: rcl.Rcl) -> bytes:
+    def write(self, functions: CDLL) -> bytes:
         """Return the message as serialised bytes. Raises RosError: out of memory."""
         code = functions.rmw_serialize(self.address, self._type_support, self._output_address)
         if code != rcl.OK:
@@ -105,7 +105,7 @@ class _End:
         self._functions = self._held if len(payload) < LARGE_BYTES else self._released
         return payload
 
-    def _functions_for(self, payload: bytes) -> rcl.Rcl:
+    def _functions_for(self, payload: bytes) -> CDLL:
         small = len(payload) < LARGE_BYTES and not self._refused
         return self._held if small else self._released
 

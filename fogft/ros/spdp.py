@@ -21,7 +21,7 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 PREFIX_BYTES = 12
 _FAST_DDS, _CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # who else keeps to this is not known
@@ -84,11 +84,12 @@ def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.enviro
                 with contextlib.suppress(OSError):
                     to = port + _UNICAST_OFFSET + _ID_GAIN * id
                     sending.sendto(message, (host, to))
-        for index in _interfaces():
-            with contextlib.suppress(OSError):
-                through = struct.pack("=4s4si", b"", b"", index)
-                sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, through)
-                sending.sendto(message, (_GROUP, port))
+        with contextlib.suppress(OSError):
+            for index, _ in socket.if_nameindex():
+                with contextlib.suppress(OSError):
+                    through = struct.pack("=4s4si", b"", b"", index)
+                    sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, through)
+                    sending.sendto(message, (_GROUP, port))
 
 
 def declare_gone(
@@ -125,12 +126,11 @@ class Introduction:
         self._thread.join()
 
     def _run(self) -> None:
-        with contextlib.suppress(OSError):  # no descriptor: then they are heard of later
-            self._introduce()
-
-    def _introduce(self) -> None:
         prefix = _FAST_DDS + os.urandom(PREFIX_BYTES - len(_FAST_DDS))
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        with (
+            contextlib.suppress(OSError),  # no descriptor: then they are heard of later
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
+        ):
             sock.bind((_LOOPBACK, 0))
             sock.settimeout(_LOOK_S)
             ours = _own_ports(_BASE_PORT + _DOMAIN_GAIN * self._domain_id)
@@ -156,8 +156,3 @@ def _own_ports(domain_port: int) -> list[int]:
         lines = [line.split() for line in table][1:]
     ours = [line[1] for line in lines if f"socket:[{line[9]}]" in sockets]
     return [port for address in ours if (port := int(address.partition(":")[2], 16)) in discovery]
-
-
-def _interfaces() -> Iterator[int]:
-    with contextlib.suppress(OSError):
-        yield from (index for index, _ in socket.if_nameindex())

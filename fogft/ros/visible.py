@@ -43,9 +43,7 @@ class VisibleNode:
         RosError: ROS refuses the node.
     """
 
-    def __init__(
-        self, name: str, context: Any, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
-    ) -> None:
+    def __init__(self, name: str, context: Any, judge: Callable[[Mapping[str, Any]], str]) -> None:
         self._judge = judge
         self._closing = False
         self._queue: SimpleQueue[Callable[[], None]] = SimpleQueue()
@@ -88,7 +86,7 @@ class VisibleNode:
         """End the executor's wait. Only something to do ends it; its guard condition does not."""
         if not self._awake:
             self._awake = True
-            self._executor.create_task(_nothing)
+            self._executor.create_task(lambda: None)
 
     def close(self) -> None:
         """Close the node; call it before the context ends. Repeatable."""
@@ -169,10 +167,6 @@ class VisibleNode:
         return SetParametersResult(successful=not reason, reason=reason)
 
 
-def _nothing() -> None:
-    """Do nothing, on the executor."""
-
-
 def _new_node(name: str, context: Any) -> Any:
     import rclpy
 
@@ -216,7 +210,8 @@ class RosLog(logging.Handler):
         self._waiting: deque[logging.LogRecord] = deque()
         self._dropped = 0
         ours = logging.getLogger(OURS)
-        logger.set_level(_severity(ours.getEffectiveLevel()))
+        level = ours.getEffectiveLevel() // 10 * 10  # the numbers of both are the same
+        logger.set_level(max(logging.DEBUG, min(logging.CRITICAL, level)))
         self._level: int = int(logger.get_effective_level())
         ours.addHandler(self)
 
@@ -263,8 +258,3 @@ class RosLog(logging.Handler):
         """Stop taking records. Repeatable."""
         logging.getLogger(OURS).removeHandler(self)
         super().close()
-
-
-def _severity(level: int) -> int:
-    """Return rclpy's severity for a level; the numbers are the same."""
-    return max(logging.DEBUG, min(logging.CRITICAL, level // 10 * 10))

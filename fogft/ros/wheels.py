@@ -22,16 +22,13 @@ _NUMPY = re.compile(r"/opt/python/[^;\"]+/numpy/(?:_core|core)/include")
 _NEEDED = "share/rosidl_default_generators/cmake"
 
 
-def lay_prefix(into: Path, wheels: Path = Path(sys.prefix)) -> Path:
-    """Create a prefix to build against; return it.
-
-    Args:
-        into: A folder that does not exist yet, or an older one of this kind, which is replaced.
-        wheels: Where the wheels are installed.
+def lay_prefix(into: Path) -> Path:
+    """Create a prefix to build against, or replace an older one; return it.
 
     Raises:
         RosError: The wheels for building are missing, or the folder cannot be written.
     """
+    wheels = Path(sys.prefix)
     if not (wheels / _NEEDED).is_dir():
         raise RosError(
             "the installed ROS 2 wheels cannot build interface packages",

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 from fogft.errors import RosError
@@ -33,11 +34,6 @@ _LOOK_EVERY_S = 0.2
 _GUID_BYTES = 16
 
 
-def _client(handle: Any) -> bytes:
-    """Return who asked, of the header of a request in DDS."""
-    return bytes(handle[:_GUID_BYTES])
-
-
 class Pacer:
     """Sends the responses of one service, at each client's pace. Any thread.
 
@@ -45,7 +41,7 @@ class Pacer:
         send: Sends a response; may raise RosError.
         probes: Asks the clients' nodes.
         service: Its name, for them.
-        client_of: Returns who asked, of a request's handle.
+        client_of: Returns who asked, of a request's handle: of its header in DDS, if not given.
     """
 
     def __init__(
@@ -55,7 +51,7 @@ class Pacer:
         service: str,
         *,
         clock: Callable[[], float] = time.monotonic,
-        client_of: Callable[[Any], bytes] = _client,
+        client_of: Callable[[Any], bytes] = itemgetter(slice(_GUID_BYTES)),
     ) -> None:
         self._client_of = client_of
         self._send = send
