@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from fogft.ros.visible import VisibleNode
 
 Told = Callable[[], Mapping[str, Sequence[Definition]]]
-
-
 Judge = Callable[[Mapping[str, Any]], str]
 
 
@@ -93,7 +91,6 @@ def join(
     """Create a node.
 
     Args:
-        domain_id: The ROS domain; None for what the environment says.
         told: Returns the definitions of types as each replica tells them.
         noticed: Called, from any thread, when a type may be known that was not.
         environ: Where the variables of ROS and Zenoh are, for Zenoh.

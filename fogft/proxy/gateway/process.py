@@ -48,11 +48,7 @@ _REPORT_EVERY_S = 0.5
 
 
 def run(config_path: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
-    """Run until a signal ends it.
-
-    Args:
-        listen: ``host:port`` instead of the file's.
-        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
+    """Run until a signal ends it; each option replaces a key of the file.
 
     Raises:
         PoolBusy: This gateway runs already.

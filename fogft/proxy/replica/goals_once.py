@@ -75,11 +75,6 @@ class _ActionServer:
     def at_work(self, now: float) -> int:
         return sum(known.holds(now) for known in self.open.values())
 
-    def count(self, large: ByteLimit) -> None:
-        """Add the goals that have no answer, and their copies."""
-        for goal in self.open.values():
-            large.add(goal.size * max(len(goal.waiting), 1))
-
 
 class GoalsOnce:
     """Forwards new goals; remembers the last `accepted_kept` of each action."""
@@ -145,7 +140,8 @@ class GoalsOnce:
             return Refusal.NOT_READY
         large = ByteLimit(_BYTES_LIMIT)
         for other in self._servers.values():
-            other.count(large)
+            for open in other.open.values():
+                large.add(open.size * max(len(open.waiting), 1))
         if not large.has_room(len(incoming.payload)):
             return Refusal.OVERLOADED
         known = server.open.get(goal)

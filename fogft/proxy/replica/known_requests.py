@@ -26,8 +26,7 @@ class KnownRequests:
         held_bytes: Of the requests of open jobs.
 
     Attributes:
-        held: How many jobs are open.
-        large: The bound of their bytes.
+        held, large: How many jobs are open, and the bound of their bytes.
     """
 
     def __init__(self, kept_bytes: int, kept_ids: int, held_bytes: int) -> None:

@@ -57,13 +57,8 @@ def run(
 ) -> None:
     """Run until a signal ends it, or until the manager's lease is over.
 
-    Args:
-        listen: ``host:port`` instead of the file's.
-        domain_id: ROS domain instead of the file's.
-        workdir: Folder in which `run` starts, instead of the file's.
-        notice_file: File that appears when the machine is about to be preempted.
-        advertise: ``host:port`` at which this replica is reached, where it cannot know that.
-        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
+    Each option replaces a key of the file; `notice_file` appears when the machine is about to be
+    preempted.
 
     Raises:
         FogftError: The configuration, the credentials or ROS cannot be used.

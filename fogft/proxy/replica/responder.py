@@ -112,13 +112,9 @@ class Responder:
         }
 
     def hanging(self, *, stuck: bool = False) -> dict[str, float]:
-        """Return the services that have finished nothing for unusually long, and for how long.
+        """Return for how many seconds services have finished nothing, where that is unusual.
 
-        Args:
-            stuck: Only those that are to be started anew for it.
-
-        Returns:
-            For how many seconds, by service.
+        `stuck`: only those that are to be started anew for it.
         """
         now = self._clock()
         with self._lock:

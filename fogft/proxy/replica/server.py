@@ -59,12 +59,11 @@ class ServerProxy:
 
     Args:
         services: What it answers; none for whatever the command offers.
-        listener: Its end of the wire; `serve` is called here.
         make_node: Joins ROS; called again after each death of the command.
         spare: A second process of the command, to take over when the first dies.
         make_state: Says how the state of a stateful service travels.
         define: Returns the definition of a service type here, for the robot to compare.
-        topics: What passes besides services; then nodes publish and subscribe, too.
+        topics: What passes besides services; needs nodes that publish and subscribe.
         answered: As for `Responder`.
     """
 

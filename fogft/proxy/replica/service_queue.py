@@ -117,9 +117,7 @@ class ServiceQueue:
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
         """Return the load when `ended` have just ended; None until the pace is known.
 
-        Args:
-            spent_s: How long the request was here that is answered with it.
-            ended: How many of those at work have just ended.
+        `spent_s`: how long the request was here that is answered with it.
         """
         if not self.limit.service_s:
             return None

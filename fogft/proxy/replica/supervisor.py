@@ -70,14 +70,9 @@ class Supervisor:
         return self._child is not None
 
     def poll(self, *, at_work: bool = False) -> bool:
-        """Check whether the command exited, and restart it when due.
+        """Restart the command when due; return whether it has died since the last call.
 
-        Args:
-            at_work: Whether it had requests: then one of these has ended it, and it is not its
-                own fault.
-
-        Returns:
-            Whether it has died since the last call.
+        `at_work`: whether it had requests. One of these has ended it then: that is no fault of its.
         """
         died = False
         if self._child is not None:

@@ -33,7 +33,6 @@ from fogft.topics.goals import Goals
 
 log = logging.getLogger(__name__)
 
-
 _CANCELS_KEPT = 4096
 _CANCEL_FOR_S = 60.0  # a replica may be away for a moment
 _CANCEL_TIMEOUT_S = 10.0
@@ -53,8 +52,7 @@ class _ToCancel:
 class _Action:
     """What the three services of one action share, under a lock that is taken last.
 
-    Attributes:
-        began: Called, without the lock, with a goal and a replica that has taken it.
+    `began` is called, without the lock, with a goal and a replica that has taken it.
     """
 
     def __init__(self, clock: Callable[[], float], wake: Callable[[], None]) -> None:

@@ -48,9 +48,7 @@ class ClientProxy:
     """Sends each request to the replicas that its policy chooses; returns the first success.
 
     Args:
-        pool_uid: The pool's uid, part of every key.
         node: The robot's side of ROS; none in a gateway, where requests come from the wire.
-        make_dispatcher: Makes the dispatcher of a service, given how to respond.
         define: Returns the definition of a service type here; None to compare none.
         merge: Makes one status of an action of what its replicas say.
     """

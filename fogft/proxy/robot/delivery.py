@@ -30,12 +30,9 @@ Respond = Callable[[Any, bytes], None]
 
 
 class Delivery:
-    """The delivery of one service's outcomes.
+    """The delivery of one service's outcomes; arguments as for `Dispatcher`.
 
-    Args:
-        respond: Sends a response to the caller of a handle. Any thread.
-        empty_response: The serialised default response, for ``on_timeout: empty``.
-        forget: Tells these replicas that a request is no longer wanted.
+    `forget` tells these replicas that a request is no longer wanted.
     """
 
     def __init__(

@@ -42,11 +42,7 @@ _COUNTS = (
 
 
 class Diagnosis:
-    """Turns reports into diagnostic statuses.
-
-    Args:
-        robot: The robot's; it is the hardware that the pool's and the services' statuses name.
-    """
+    """Turns reports into statuses; those of the pool and its services name the robot."""
 
     def __init__(self, pool: str, robot: str) -> None:
         self._pool = pool
@@ -205,10 +201,8 @@ _DIAGNOSE_EVERY_S = 1.0
 class SeenFromRos:
     """The diagnostics and parameters of a pool and its services in ROS.
 
-    Args:
-        make_visible: Makes the visible node, given who judges parameters; returns None where
-            there is none, and then nothing is shown or set.
-        check_field: Says why a type's response has no boolean field of that name.
+    `make_visible` makes the visible node, given who judges parameters; without one nothing is shown
+    or set.
     """
 
     def __init__(

@@ -56,7 +56,6 @@ class Dispatcher:
     """The requests of one service, from the caller's request to the caller's response.
 
     Args:
-        respond: Sends a response to a caller. Any thread.
         decide: What answers mean; the first success unless given.
         fault_of: Returns what is wrong with the bytes of a response; empty for nothing. One that
             is malformed is a failure of its replica, and another answer is awaited.
@@ -326,10 +325,7 @@ class Dispatcher:
     # -- policy, links and time -----------------------------------------------------------
 
     def adopt(self, spec: ServiceSpec, fallback: RosClient | None = None) -> None:
-        """Switch to another policy.
-
-        Args:
-            fallback: The client of its fallback service, if it has one.
+        """Switch to another policy, with the client of its fallback service if it has one.
 
         Raises:
             RosError: The response has no such `ok_field`; nothing was changed.

@@ -27,9 +27,6 @@ from fogft.proxy.robot.sending import key_of
 
 log = logging.getLogger(__name__)
 
-Keys = Callable[[int], Mapping[str, str]]
-
-
 _ORDER = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 
 
@@ -133,11 +130,7 @@ Define = Callable[[str], Definition]
 
 
 class TypeCheck:
-    """Compares replicas' type definitions with those on this machine.
-
-    Args:
-        define: Returns a type's definition here; None where types are not known here.
-    """
+    """Compares replicas' type definitions with those on this machine, if these are known."""
 
     def __init__(self, define: Define | None) -> None:
         self._define = define
@@ -186,13 +179,11 @@ class TypeCheck:
 
 
 class Links:
-    """The links of a client proxy.
+    """The links of a client proxy; `keys` returns those of all services and topics at a slot."""
 
-    Args:
-        keys: Returns the keys of all services and topics at a slot.
-    """
-
-    def __init__(self, dialer: Dialer, events: LinkEvents, keys: Keys) -> None:
+    def __init__(
+        self, dialer: Dialer, events: LinkEvents, keys: Callable[[int], Mapping[str, str]]
+    ) -> None:
         self._dialer = dialer
         self._events = events
         self._keys = keys

@@ -26,11 +26,9 @@ HANGS_AFTER_S = 120.0  # it may wait for its cloud
 
 
 class ManagerRestart:
-    """Watches the manager, ends one that hangs and restarts it.
+    """Watches the manager of a pool's folder, ends one that hangs and restarts it.
 
-    Args:
-        folder: The pool's. Without a manager's file in it nothing is ever started.
-        environ: The environment for it: what our own was before ROS was prepared in it.
+    Its environment is to be what our own was before ROS was prepared in it.
     """
 
     def __init__(

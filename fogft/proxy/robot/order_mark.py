@@ -25,10 +25,7 @@ _VERSION = re.compile(r"[0-9a-f]{16}")
 
 
 class OrderMark:
-    """The mark of one stateful service on one robot.
-
-    Args:
-        path: Where it lies; made if it is not there, with its folder.
+    """The mark of one stateful service on one robot; its file is made if there is none.
 
     Raises:
         StateError: It cannot be used, or belongs to another pool.

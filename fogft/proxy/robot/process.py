@@ -69,7 +69,7 @@ def run(
     """Run until a signal ends it.
 
     Args:
-        metrics: ``host:port`` to answer Prometheus at, instead of the file's.
+        metrics: Replaces the file's.
         standby: Where one runs already, wait until it ends, and take its place at once.
         spare: The same, and where one stands by already, wait to stand by.
 
@@ -152,7 +152,6 @@ def make_dispatcher(
     """Create a service's dispatcher, with what it needs of its ROS type.
 
     Args:
-        respond: Sends a response to the caller of a handle.
         speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
         id_of: Gives a request its id, by service and handle; a random one unless given.
 
@@ -278,10 +277,9 @@ class _Running:
             disk.write_json(status, {**told, "participant": ""}, durable=False)
 
     def loop(self, stop: threading.Event) -> bool:
-        """Serve until told to stop, until the pool's folder is gone, or another is to go on.
+        """Serve until told to stop, or until the pool's folder is gone.
 
-        Returns:
-            Whether another process is to go on, because this one was stopped for long.
+        Returns True where another process is to go on, because this one was stopped for long.
         """
         proxy, config, folder = self.proxy, self.config, self.config_path.parent
         memory, watchdog = memory_tuning.Trimmer(), Watchdog()

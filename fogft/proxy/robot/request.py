@@ -32,11 +32,7 @@ class RequestTrace(NamedTuple):
 
 
 class Request:
-    """A caller's request. `arrived` is on the dispatcher's clock, seconds.
-
-    Attributes:
-        trace: Who was asked; None where it is not traced.
-    """
+    """A caller's request, and its trace if it has one. `arrived` is on the dispatcher's clock."""
 
     __slots__ = ("arrived", "handle", "payload", "trace")
 
@@ -48,11 +44,7 @@ class Request:
 
 
 class Ledger:
-    """One service's requests and counters. Used under the lock.
-
-    Attributes:
-        lock: Held for moments, never while something is sent or delivered.
-    """
+    """One service's requests and counters. Used under `lock`, which is held for moments only."""
 
     def __init__(
         self, spec: ServiceSpec, requests: PendingRequests[Request], clock: Callable[[], float]

@@ -73,11 +73,9 @@ class Sender:
         leaving: Collection[ReplicaId] = (),
         hanging: Collection[ReplicaId] = (),
     ) -> None:
-        """Set the links that may be asked now, `hanging` ones included; offer open requests.
+        """Set the links that may be asked now, and offer them open requests.
 
-        Args:
-            links: Those whose replica is ready; where replicas are brought to readiness, all.
-            hanging: Those that say that the service answers nothing of what it has.
+        Those `hanging` are among them: they say that the service answers nothing of what it has.
         """
         routed = {key_of(link): link for link in links}
         replication, now = self._replication, self._ledger.clock()
@@ -101,11 +99,7 @@ class Sender:
         self.replicate()
 
     def offer_more(self, now: float) -> float:
-        """Ask the policy about each request that may need a further replica.
-
-        Returns:
-            When it wants to be asked again.
-        """
+        """Ask the policy who needs a further replica; return when it is to be asked again."""
         newest_first = self._ledger.spec.freshness is Freshness.LATEST
         with self._ledger.lock:
             links, requests = self.links, self._ledger.requests

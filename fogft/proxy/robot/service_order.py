@@ -30,8 +30,7 @@ _ATTEMPT_S = 60.0
 class ServiceOrder(Decide):
     """Numbers requests, and decides what to send to which replica and which answers count.
 
-    Args:
-        held: Whether another proxy orders still: requests wait until `take_over`.
+    While `held`, another proxy orders still: requests wait until `take_over`.
     """
 
     replicates = sends_requests = True

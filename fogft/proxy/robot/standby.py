@@ -67,10 +67,8 @@ def wait(
 ) -> EarlyJoin | None:
     """Prepare as much as possible, then wait for the lock; return the prepared ROS node.
 
-    Returns early, without the lock, when `stop` is set or the pool's folder is gone.
-
-    Args:
-        spare: Where one stands by already, wait for its place first.
+    Returns early, without the lock, when `stop` is set or the pool's folder is gone. A `spare`
+    waits for the standby's place first.
 
     Raises:
         PoolBusy: Another one is next in line already.
@@ -154,12 +152,8 @@ def _take(
 def request_ids(key: Path, identity: Callable[[Any], Any]) -> Callable[[str, Any], bytes]:
     """Return what gives requests their ids: both proxies of a robot give a request the same.
 
-    Others cannot guess it: the robot's private key is part of it. A request without an id of ROS's
-    own gets a random one.
-
-    Args:
-        key: The file of the robot's private key.
-        identity: Returns what both proxies know a request by, of its handle.
+    Others cannot guess it: the robot's private `key` is part of it. `identity` returns what both
+    know a request by, of its handle; without an id of ROS's own it gets a random one.
     """
     try:
         secret = hashlib.sha256(key.read_bytes()).digest()
@@ -183,10 +177,8 @@ def hand_over(
 ) -> bool:
     """Hand over to the standby; return, when done, whether there was one.
 
-    Args:
-        config: This proxy's. Replicas that dial in have one door, so with it nothing is shared.
-        callers: Counts who may call each service that we offer.
-        release: Gives up the lock, and all else that the standby needs for itself.
+    `callers` counts who may call each service that we offer; `release` gives up the lock, and all
+    else that the standby needs for itself. Replicas that dial in have one door: nothing is shared.
     """
     taken, order = _files(config.lock)
     lock = disk.Lock(order)

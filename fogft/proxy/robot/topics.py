@@ -264,11 +264,7 @@ class RobotTopic:
 
 
 class TopicsOnRobot:
-    """The topics of one client proxy.
-
-    Args:
-        merge: Makes one status of an action of what its replicas say.
-    """
+    """The topics of one client proxy."""
 
     def __init__(
         self,
