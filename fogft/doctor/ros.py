@@ -132,7 +132,7 @@ def profile(_: Situation) -> Iterator[Finding]:
 
 def judge_segment(segment_bytes: int, variable: str, ours: str) -> Finding:
     """Judge the shared memory that a node maps; `ours` is the shipped profile, if fogft sets it."""
-    if environment.profile_in_force(segment_bytes):
+    if segment_bytes >= environment.PROFILE_SEGMENT_BYTES:
         if ours:
             return warn(
                 "Fast DDS profile",

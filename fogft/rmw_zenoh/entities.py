@@ -46,9 +46,6 @@ class Server:
 
     It is offered under each hash that clients may have of its type: in `rmw_zenoh` the hash is
     part of the key.
-
-    Args:
-        probes: Asks the clients' nodes whether they take what they got.
     """
 
     def __init__(
@@ -162,8 +159,7 @@ class _Waiting(NamedTuple):
 class Client:
     """A client of a service (`fogft.ros.port.RosClient`).
 
-    Args:
-        servers: Returns the type hash of each server that is there now.
+    `servers` returns the type hash of each server that is there now.
     """
 
     def __init__(

@@ -36,13 +36,9 @@ class Token:
     """A liveliness token of a node, or of a service's server or client.
 
     Attributes:
-        node_id: Number of the node in its session.
-        id: Number of the entity in its session.
+        node_id, id: Numbers of the node and of the entity in its session.
         kind: `NODE`, `SERVER` or `CLIENT`.
-        namespace: The node's namespace, with its slash.
-        service: The service's name, with its slash; empty for a node.
-        type: ``package/srv/Name``; empty for a node.
-        hash: The type's hash; empty for a node.
+        service, type, hash: Empty for a node; the type as ``package/srv/Name``.
         quality: Quality of service, as `rmw_zenoh` writes it.
     """
 
@@ -89,11 +85,6 @@ def read_token(key: str) -> Token | None:
     return Token(
         domain, session, node_id, id, kind, node, namespace, service, type_name, *parts[11:]
     )
-
-
-def tokens_of(domain: int) -> str:
-    """Return the key expression of all tokens in a domain."""
-    return f"{ROOT}/{domain}/**"
 
 
 def service_key(domain: int, name: str, type_name: str, hash: str) -> str:

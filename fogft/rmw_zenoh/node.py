@@ -1,8 +1,7 @@
 """A ROS node that speaks `rmw_zenoh` with no ROS installed (`fogft.ros.port.RosNode`).
 
 Services pass through as bytes. What a type is nobody here knows; that two ends have the same
-one is told by its hash, which is part of every key: a server's stands in its token, a client's
-in its own.
+one is told by its hash, which is part of every key and token.
 
 Its session is configured as theirs are: a peer that finds the others by the router of its machine,
 and then talks to them directly, so that it outlives the router. ``ZENOH_SESSION_CONFIG_URI`` (a
@@ -10,8 +9,7 @@ file) takes the place of all settings, ``ZENOH_CONFIG_OVERRIDE`` (``key=value;ke
 as for every node.
 
 Owns: the session and its settings, the graph, what is offered and called. Not here: requests
-(`entities`), names (`rmw_zenoh.naming`), settings of links (`fogft.link.zenoh.settings`), which
-never meet such a session.
+(`entities`), names (`rmw_zenoh.naming`), settings of links (`fogft.link.zenoh.settings`).
 """
 
 from __future__ import annotations
@@ -97,9 +95,8 @@ class RmwZenohNode:
         node = Token(self._domain, self._id, "0", "0", NODE, self._name)
         self._declared = live.declare_token(str(node))
         seen = handlers.Callback(self._seen, indirect=False)
-        self._subscriber = live.declare_subscriber(
-            naming.tokens_of(self._domain), seen, history=True
-        )
+        tokens = f"{naming.ROOT}/{self._domain}/**"
+        self._subscriber = live.declare_subscriber(tokens, seen, history=True)
 
     def _seen(self, sample: Any) -> None:
         key = str(sample.key_expr)

@@ -25,7 +25,6 @@ class Comparison:
     """Compares responses of a service type.
 
     Args:
-        type_name: ``package/srv/Type``.
         tolerances: Path of a float field -> how far two values may be apart. A path leads
             through lists as through their elements. All else must be equal.
 
@@ -79,7 +78,6 @@ def _close(one: float, other: float, tolerance: float) -> bool:
 
 
 def _check_float(message_type: Any, type_name: str, path: str) -> None:
-    """Raise RosError where a path does not lead to a float."""
     *parents, last = path.split(".")
     for parent in parents:
         kind = nested(message_type.get_fields_and_field_types().get(parent, ""))

@@ -49,9 +49,7 @@ def identity(handle: bytes) -> bytes:
 def writer_of(client: bytes, domain_id: int) -> bytes:
     """Return the identifier of the writer of a client's requests; empty if it is not known.
 
-    Args:
-        client: The first 16 bytes of a request's handle.
-        domain_id: The ROS domain that it came in.
+    `client` is the first 16 bytes of the handle of a request that came in that ROS domain.
     """
     library = loaded_library()
     if library is None:

@@ -28,7 +28,7 @@ _PROFILE_VARIABLES = {
 }
 _CHOSEN_BY_USER = (*_PROFILE_VARIABLES.values(), "FASTDDS_BUILTIN_TRANSPORTS")
 # A segment as small as Fast DDS's own default means that no profile is in force.
-_SEGMENT_BYTES = 32_000_000
+PROFILE_SEGMENT_BYTES = 32_000_000
 _SEGMENT = re.compile(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]+\b")
 # Each participant takes 35 MB for its segment: room for the two ends of a call, twice.
 _ROOM_NEEDED_BYTES = 140_000_000
@@ -71,11 +71,6 @@ def largest_segment_bytes() -> int:
                 first, _, last = line.split(" ", 1)[0].partition("-")
                 largest = max(largest, int(last, 16) - int(first, 16))
     return largest
-
-
-def profile_in_force(segment_bytes: int) -> bool:
-    """Whether a mapped segment is as large as the shipped profile asks for."""
-    return segment_bytes >= _SEGMENT_BYTES
 
 
 def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
@@ -126,11 +121,7 @@ def _added_by_wheels(folder: Path) -> bool:
 
 
 def describe(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Describe the ROS 2 installation and settings, for people. Imports rclpy; never raises.
-
-    Keys: ``rclpy`` (version and place, or why it is missing), ``distribution``, ``source``,
-    ``rmw``, ``domain``, ``discovery``, ``profile``, ``shared_memory_free_mb``.
-    """
+    """Describe the ROS 2 installation and settings, for people. Imports rclpy; never raises."""
     found = {
         "domain": environ.get("ROS_DOMAIN_ID") or "0",
         "discovery": _discovery(environ),

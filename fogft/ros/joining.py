@@ -107,12 +107,8 @@ class Pauses:
 class EarlyJoin:
     """A participant that others discover before it offers anything.
 
-    The participant comes with a context's first node. Its node is hidden from ROS's tools and
-    offers nothing; it ends once there is another one.
-
-    Args:
-        name: Of the node; ROS's tools hide what begins with an underscore.
-        domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
+    The participant comes with a context's first node. Its node offers nothing, and ROS's tools hide
+    it if its name begins with an underscore; it ends once there is another one.
 
     Raises:
         RosError: ROS 2 is not usable here.

@@ -48,7 +48,6 @@ class SerialisedNode:
     """Serialised services and clients in one ROS domain (`fogft.ros.port.RosNode`).
 
     Args:
-        name: The node's name: letters, digits and underscores.
         domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
         early: This process's participant in that domain, if it has joined already.
 
@@ -177,13 +176,9 @@ class SerialisedNode:
     def make_visible(
         self, name: str, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
     ) -> VisibleNode:
-        """Create a second node, visible to ROS tools. It ends with this one.
+        """Create a second node, visible to ROS tools; `judge` as for it. It ends with this one.
 
-        Args:
-            judge: Takes parameters that somebody sets, and returns why not.
-
-        Raises:
-            RosError: ROS refuses it, or this node is closed.
+        Raises RosError: ROS refuses it, or this node is closed.
         """
         with self._create_lock:
             if self._stopping or self._ended.is_set():
@@ -218,10 +213,8 @@ class SerialisedNode:
         in the order of their making, and a node's own services come before its clients. Its name
         may be told three seconds later: where its process has but one such service, that is it.
 
-        Args:
-            service: What the client calls, an absolute name.
-            client: The first 16 bytes of a request's handle: the reader of its responses, or
-                under CycloneDDS what stands for the writer of its requests.
+        `client` is the first 16 bytes of a request's handle: the reader of its responses, or under
+        CycloneDDS what stands for the writer of its requests.
         """
         if self._middleware == cyclone.MIDDLEWARE:
             client = cyclone.writer_of(client, self._context.get_domain_id())
@@ -359,7 +352,9 @@ class SerialisedNode:
             rest_until = 0.0
             while not self._stopping:
                 began = time.monotonic()
-                if self._changes and (began >= rest_until or self._any_withdrawn()):
+                if self._changes and (  # somebody waits for what is withdrawn
+                    began >= rest_until or not all(added for _, added, _ in tuple(self._changes))
+                ):
                     wait_set, waiting = self._apply_changes()
                     now = time.monotonic()
                     rest_until = now + _REST * (now - began)
@@ -377,11 +372,6 @@ class SerialisedNode:
             log.exception("the take loop of ROS ended")
         finally:
             self._end_ros()
-
-    def _any_withdrawn(self) -> bool:
-        """Whether somebody waits for an entity to be destroyed."""
-        with self._create_lock:
-            return any(not added for _, added, _ in self._changes)
 
     def _apply_changes(self) -> tuple[Any, list[tuple[Any, tuple[str, int], Any]]]:
         """Return a new wait set and, for each entity, how to add it and where it then stands."""

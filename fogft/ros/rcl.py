@@ -1,11 +1,8 @@
 """The few functions of rcl and rmw that serialised services need, through ctypes.
 
-These are C interfaces that ROS 2 documents and keeps; rclpy stands on the same ones.
-One handle on ``librcl`` finds them all, whatever middleware is loaded, because the
-dynamic linker searches a library's dependencies too.
-
-Each function exists twice: one keeps the global interpreter lock, one gives it up while
-the call runs.
+These are C interfaces that ROS 2 documents and keeps. One handle on ``librcl`` finds them all,
+whatever middleware is loaded: the dynamic linker searches a library's dependencies too. Each
+function exists twice: one keeps the global interpreter lock, one gives it up while the call runs.
 
 Owns: names, argument types, return codes, C structures, error texts.
 Not here: when to call them (`serialised`).

@@ -84,7 +84,6 @@ def _can_listen(port: int) -> bool:
 
 
 def _domains_in_use() -> set[int]:
-    """Return the domains of which some process has bound a UDP port."""
     domains = set()
     for table in ("/proc/net/udp", "/proc/net/udp6"):
         with contextlib.suppress(OSError):

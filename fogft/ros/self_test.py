@@ -1,10 +1,8 @@
 """Test whether ROS 2 works here. Runs as its own process, to keep the caller light.
 
 ``python -m fogft.ros.self_test describe`` prints what ROS 2 there is. ``answer NAME`` and
-``ask NAME`` are the two ends of one service call between two processes, in the
-environment as it stands: what a pool's robot side does. ``segment`` makes a node and prints how
-large a shared-memory segment it maps. They need nothing but rclpy: every node offers its parameters
-as services.
+``ask NAME`` are the two ends of one service call between two processes: every node offers its
+parameters as services. ``segment`` prints how large a shared-memory segment a node maps.
 
 Each prints one JSON object on stdout. Exit status 0 when it worked.
 """
@@ -27,7 +25,6 @@ _LIMIT_S = 5.0
 
 @contextlib.contextmanager
 def _node(name: str) -> Iterator[tuple[Any, Any]]:
-    """Give a node and its executor, and take them down."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
 

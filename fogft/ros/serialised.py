@@ -8,11 +8,10 @@ and send functions, with a C message made by the type's own functions. rmw turns
 message into bytes and back. Why so: docs/design/serialised-services.md.
 
 Interpreter lock: held below `LARGE_BYTES`, where a call takes a few microseconds;
-released above, and while ROS may wait for room. Takes cannot know their size beforehand
-and go by the last one.
+released above, and while ROS may wait for room. Takes go by the size of the last one.
 
-Owns: C messages and buffers, which live as long as their end.
-Not here: threads and locks (`node`), loading types (`types`), C signatures (`rcl`).
+Owns: C messages and buffers. Not here: threads and locks (`node`), types (`types`), C signatures
+(`rcl`).
 """
 
 from __future__ import annotations
@@ -122,7 +121,6 @@ class _End:
             raise RosError(f"rclpy's handle of `{name}` is not rcl's")
 
     def close(self) -> None:
-        """Free the C messages."""
         self._taken.close()
         self._sent.close()
 

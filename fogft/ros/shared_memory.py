@@ -69,22 +69,21 @@ def _one_at_a_time() -> Iterator[bool]:
     except OSError:  # no shared memory here
         yield False
         return
+    deadline = time.monotonic() + _TURN_LIMIT_S
     try:
-        yield _lock(descriptor, time.monotonic() + _TURN_LIMIT_S)
+        while not (ours := _lock(descriptor)) and time.monotonic() < deadline:
+            time.sleep(0.02)
+        yield ours
     finally:
         os.close(descriptor)
 
 
-def _lock(descriptor: int, deadline: float) -> bool:
-    while True:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.02)
-        else:
-            return True
+def _lock(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 def abandoned() -> list[Path]:
@@ -260,10 +259,6 @@ def _locked(name: str) -> bool:
     except OSError:
         return True
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    else:
-        return False
+        return not _lock(descriptor)
     finally:
         os.close(descriptor)  # frees the lock

@@ -95,12 +95,9 @@ def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.enviro
 def declare_gone(
     prefix: bytes, domain_id: int | None, environ: Mapping[str, str] = os.environ
 ) -> bool:
-    """Send a killed participant's disposal message; return whether it was sent.
+    """Send a killed participant's disposal message, by its id's prefix; return whether it was sent.
 
-    Args:
-        prefix: The first 12 bytes of its id.
-        domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
-        environ: Where ROS's variables are.
+    A `domain_id` of None stands for ``ROS_DOMAIN_ID``, else 0.
     """
     if not is_known(prefix):
         return False

@@ -94,7 +94,6 @@ class _Field:
         return message
 
     def get(self, message: Any) -> bytes:
-        """Return what the field holds."""
         value = getattr(self._parent(message), self._name)
         if self.is_text:
             return str(value).encode()
@@ -103,7 +102,6 @@ class _Field:
         return bytes(value.tobytes())
 
     def set(self, message: Any, state: bytes) -> None:
-        """Let the field hold a state."""
         value: Any
         if self.is_text:
             value = state.decode()

@@ -33,10 +33,7 @@ _MESSAGE = re.compile(
 
 
 def load_service_type(name: str) -> Any:
-    """Return the Python class of a service type with its type support loaded.
-
-    Args:
-        name: ``package/srv/Type``.
+    """Return the Python class of ``package/srv/Type`` with its type support loaded.
 
     Raises:
         RosError: There is no such type here, or it cannot be loaded; with a hint.
@@ -52,10 +49,7 @@ def load_service_type(name: str) -> Any:
 
 
 def load_message_type(name: str) -> Any:
-    """Return the Python class of a message type with its type support loaded.
-
-    Args:
-        name: ``package/msg/Type``, or ``package/action/Type_FeedbackMessage``.
+    """Return the Python class of ``package/msg/Type``, or of an action's feedback message.
 
     Raises:
         RosError: There is no such type here, or it cannot be loaded; with a hint.

@@ -15,13 +15,9 @@ _OF_DYNAMIC = {"rmw_fastrtps_dynamic_cpp": "rmw_fastrtps_cpp"}
 
 
 def strangers(ours: str, identifiers: Iterable[bytes]) -> list[str]:
-    """Return the middleware of each endpoint that is incompatible with ours.
+    """Return the middleware of each endpoint (by its GID) that is incompatible with ours.
 
-    Of a middleware that is not known here nothing is said.
-
-    Args:
-        ours: Our middleware, such as ``rmw_fastrtps_cpp``.
-        identifiers: Those of the endpoints (GID), as discovery tells them.
+    Of a middleware that is not known here nothing is said. Ours is such as ``rmw_fastrtps_cpp``.
     """
     ours = _OF_DYNAMIC.get(ours, ours)
     if ours not in _MIDDLEWARE.values():

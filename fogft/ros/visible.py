@@ -1,14 +1,11 @@
 """A proxy's node for people: `/diagnostics`, parameters, and its log on `/rosout`.
 
 An ordinary rclpy node on an executor and a thread of its own, in the context of the node that
-takes requests. Other threads only put work into its queue, so nothing here ever stands in a
-request's way, and whatever goes wrong here is logged and ends there.
+takes requests. Other threads only put work and log records into its queues, so nothing here ever
+stands in a request's way, and whatever goes wrong here is logged and ends there.
 
-Our log is passed on to `/rosout`, through the node's rclpy logger. Any thread may log, also one
-that must not block, so a record is only put into a bounded queue. Standard error has every record.
-
-Owns: that node and its thread, that queue, and the node's level, which ours follow. Not here: what
-is said (`fogft.proxy.robot.diagnostics`).
+Owns: that node, its thread and its level, which that of our log follows.
+Not here: what is said (`fogft.proxy.robot.diagnostics`).
 """
 
 from __future__ import annotations
@@ -34,8 +31,7 @@ class VisibleNode:
     """The node that ROS 2 command-line tools and dashboards see.
 
     Args:
-        name: The node's name.
-        context: That of the proxy's own node: `SerialisedNode.context`.
+        context: That of the proxy's own node.
         judge: Takes parameters that somebody sets, and returns why not; empty where they hold
             from now on. Called by this node's thread.
 
@@ -196,11 +192,9 @@ RECORDS_LIMIT = 1000
 
 
 class RosLog(logging.Handler):
-    """A log handler that forwards records to a node's logger.
+    """A log handler that forwards records to a node's logger, and so to `/rosout`.
 
-    Args:
-        logger: The node's. Its level becomes ours; whoever changes it later changes ours.
-        wake: Has `pass_on` called soon. Any thread.
+    Whoever changes that logger's level changes ours. `wake` has `pass_on` called soon.
     """
 
     def __init__(self, logger: Any, wake: Callable[[], None]) -> None:

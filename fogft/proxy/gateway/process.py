@@ -71,8 +71,6 @@ def run(config_path: Path, *, listen: str | None = None, metrics: str | None = N
 
 
 class _Gateway:
-    """The parts of a gateway, and its loop."""
-
     def __init__(self, config: ClientProxyConfig) -> None:
         from fogft.link.zenoh.handshakes import HandshakeLog
 
@@ -155,7 +153,6 @@ class _Gateway:
     # -- the loop -------------------------------------------------------------------------
 
     def run(self, stop: threading.Event) -> None:
-        """Pass requests on until told to stop."""
         self._forwarder.start()
         self._listen()
         self._scrape.at(self._config.metrics)
@@ -176,12 +173,9 @@ class _Gateway:
         membership = self._following.look()
         if membership is not None:
             self._proxy.follow(membership)
-            self._revoke(membership.revoked)
-
-    def _revoke(self, revoked: frozenset[str]) -> None:
-        self._revoked |= revoked
-        if self._listener is not None:
-            self._listener.revoke(self._revoked)
+            self._revoked |= membership.revoked
+            if self._listener is not None:
+                self._listener.revoke(self._revoked)
 
     def _renew(self) -> None:
         """Go on under a new certificate: links one by one, the listener at once."""
@@ -215,7 +209,6 @@ class _Gateway:
         try_step(functools.partial(self._status.write, report), self._config.status)
 
     def close(self) -> None:
-        """Refuse what is under way, and leave."""
         self._scrape.close()
         self._forwarder.close()
         if self._listener is not None:

@@ -69,7 +69,6 @@ class _ActionServer:
 
     @property
     def queue(self) -> list[bytes]:
-        """Goals that it was not given yet."""
         return [goal for goal, known in self.open.items() if known.begun_at is None]
 
     def at_work(self, now: float) -> int:

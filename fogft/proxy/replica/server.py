@@ -361,9 +361,6 @@ class ServerProxy:
             return self.ready
         return self.ready - {name for name, one in self._ordered.items() if not one.ready}
 
-    def _passing(self) -> frozenset[str]:
-        return self._topics.ready() if self._topics and self.command.alive else frozenset()
-
     def _work(self) -> dict[str, float]:
         refused = self._listener.refusals()
         told = {
@@ -373,11 +370,12 @@ class ServerProxy:
 
     def _probe(self, probe: Probe) -> ProbeAnswer:
         counts = self._listener.counters()
+        topics = self._topics.ready() if self._topics and self.command.alive else frozenset()
         return ProbeAnswer(
             slot=self._id.slot,
             generation=self._id.generation,
             incarnation=self._incarnation,
-            ready=self._answering() | self._passing(),
+            ready=self._answering() | topics,
             draining=self.draining,
             at_risk=self._at_risk,
             restarts=self._restarts,

@@ -55,7 +55,6 @@ class _Outgoing:
         self._held: list[_Pull] = []
 
     def heard(self, message: bytes) -> None:
-        """Take a message from ROS, and answer who waits for one."""
         with self._lock:
             self._ring.put(message)
             held, self._held = self._held, []
@@ -63,7 +62,6 @@ class _Outgoing:
             self._answer(pull.incoming, pull.after)
 
     def pulled(self, incoming: Incoming) -> None:
-        """Answer a pull, or hold it."""
         session, after = frames.decode_pull(incoming.payload)
         excess = None
         with self._lock:

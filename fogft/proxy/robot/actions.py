@@ -111,7 +111,6 @@ class _CancelPart(Decide):
     def refused(
         self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
     ) -> None:
-        """A replica has not heard it."""
         self.declined(id, replica, self._action.clock())
 
     def hears_out(self, request: bytes) -> bool:
@@ -162,7 +161,6 @@ class _GoalPart(Decide):
         self._name = name
 
     def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
-        """Note a goal, and who is given it."""
         with self._action.lock:
             self._action.goals.made(pending.item.payload, request, able, pending.deadline)
 
@@ -185,7 +183,6 @@ class _GoalPart(Decide):
     def refused(
         self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
     ) -> None:
-        """A replica did not look at a goal, or cannot read it."""
         if refusal is Refusal.MALFORMED:
             self._took(id, replica, accepts=False)
         else:
@@ -252,7 +249,6 @@ class _ResultPart(Decide):
         self._action = action
 
     def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
-        """Note that a goal is under way until its result comes."""
         with self._action.lock:
             self._action.goals.awaited(goals.goal_of(pending.item.payload))
 
@@ -279,13 +275,11 @@ class _ResultPart(Decide):
     def refused(
         self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
     ) -> None:
-        """Note who may have lost the goal."""
         if pending is not None and Effect.GOALS_LOST in refusal.effect:
             with self._action.lock:
                 self._action.goals.lost(goals.goal_of(pending.item.payload), replica)
 
     def closed(self, request: bytes, pending: Pending[Any]) -> None:
-        """The goal has its result, or will have none."""
         with self._action.lock:
             self._action.goals.ended(goals.goal_of(pending.item.payload))
 
@@ -313,9 +307,7 @@ class Actions:
         if spec.part is Part.CANCEL:
             return make(decide=_CancelPart(action))
         result = make(decide=_ResultPart(action))
-        action.began = lambda goal, replica: result.began_anew(replica, partial(_is_about, goal))
+        action.began = lambda goal, replica: result.began_anew(
+            replica, lambda request: goals.goal_of(request) == goal
+        )
         return result
-
-
-def _is_about(goal: bytes, request: bytes) -> bool:
-    return goals.goal_of(request) == goal

@@ -260,7 +260,6 @@ class _Running:
         self.lock.release()
 
     def callers(self) -> dict[str, int]:
-        """Count who may call each service that is offered, as far as discovery knows."""
         return {name: self.joined.callers(name) for name in self.proxy.offered}
 
     def release(self) -> None:

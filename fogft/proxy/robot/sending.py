@@ -152,7 +152,6 @@ class Sender:
                     self._count(is_copy)
 
     def _count(self, taken: int) -> None:
-        """Count attempts that links have taken: a counter that only goes up."""
         with self._ledger.lock:
             self._ledger.outcomes.count["sent"] += taken
 

@@ -38,9 +38,7 @@ class Pacer:
     """Sends the responses of one service, at each client's pace. Any thread.
 
     Args:
-        send: Sends a response; may raise RosError.
         probes: Asks the clients' nodes.
-        service: Its name, for them.
         client_of: Returns who asked, of a request's handle: of its header in DDS, if not given.
     """
 
@@ -172,7 +170,6 @@ class Pacer:
         return due, probed, _LOOK_EVERY_S if self._held else None
 
     def _ask(self, id: bytes) -> None:
-        """Find out whether a client's node answers probes."""
         answers = self._probes.answers(self._service, id)
         now = self._clock()
         with self._wake:
