@@ -1,12 +1,8 @@
 """A ROS node that speaks `rmw_zenoh` with no ROS installed (`fogft.ros.port.RosNode`).
 
-Services pass through as bytes. What a type is nobody here knows; that two ends have the same
-one is told by its hash, which is part of every key and token.
-
-Its session is configured as theirs are: a peer that finds the others by the router of its machine,
-and then talks to them directly, so that it outlives the router. ``ZENOH_SESSION_CONFIG_URI`` (a
-file) takes the place of all settings, ``ZENOH_CONFIG_OVERRIDE`` (``key=value;key=value``) of some,
-as for every node.
+Its session is configured as theirs are: a peer that finds the others by the router of its machine.
+``ZENOH_SESSION_CONFIG_URI`` (a file) takes the place of all settings, ``ZENOH_CONFIG_OVERRIDE``
+(``key=value;key=value``) of some. Design: docs/design/serialised-services.md.
 
 Owns: the session and its settings, the graph, what is offered and called. Not here: requests
 (`entities`), names (`rmw_zenoh.naming`), settings of links (`fogft.link.zenoh.settings`).

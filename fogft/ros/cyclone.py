@@ -1,8 +1,7 @@
 """Which request CycloneDDS received, and who sent it.
 
-Elsewhere a request's header names its client by an identifier that discovery knows. Here it holds
-two numbers: the client's own, and one by which this process alone knows the writer of its
-requests. Only CycloneDDS can tell whose it is.
+A request's header holds two numbers there: the client's own, and one by which this process alone
+knows the writer of its requests. Only CycloneDDS can tell whose it is.
 
 Owns: what that header means. Not here: which node a writer belongs to (`node`).
 """

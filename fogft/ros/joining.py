@@ -1,9 +1,7 @@
 """Join a ROS domain: a context, optionally with a DDS participant before any visible node.
 
-A participant that is known already has its services found within milliseconds. Until a new one and
-those that run know of each other it takes half a second (`fogft.ros.spdp`).
-
-Owns: contexts. Not here: the node of a proxy (`node`).
+A participant that is known already has its services found within milliseconds, a new one in half a
+second. Owns: contexts. Not here: the node of a proxy (`node`).
 """
 
 from __future__ import annotations

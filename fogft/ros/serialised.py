@@ -1,14 +1,10 @@
 """Take and send serialised requests and responses without Python messages.
 
 `take` belongs to the take loop and raises RosError for what could not be read, which is gone;
-sending needs the caller's lock.
+sending needs the caller's lock. Design: docs/design/serialised-services.md.
 
-Theory of operation: rclpy makes the service or client; its address goes to rcl's own take
-and send functions, with a C message made by the type's own functions. rmw turns that
-message into bytes and back. Why so: docs/design/serialised-services.md.
-
-Interpreter lock: held below `LARGE_BYTES`, where a call takes a few microseconds;
-released above, and while ROS may wait for room. Takes go by the size of the last one.
+Interpreter lock: held below `LARGE_BYTES`, released above, and while ROS may wait for room.
+Takes go by the size of the last one.
 
 Owns: C messages and buffers. Not here: threads and locks (`node`), types (`types`), C signatures
 (`rcl`).

@@ -1,13 +1,9 @@
 """DDS participant discovery (SPDP) messages that fogft sends itself: RTPS 2.3, 8.5.3, 9.4.5.3.
 
-Others go on believing in a killed process for 20 seconds, DDS's lease: `service_is_ready` stays
-true, and a client with `KEEP_ALL` keeps its requests for it. A process that ends well takes its
-leave with one message, which whoever knows its id can send as well.
-
-A new process announces itself, and those that run answer. Fast DDS often loses these answers, for
-it listens only after it has announced itself, and hears the others up to three seconds later. So
-another participant is announced for an instant, when Fast DDS does listen; what it is answered is
-passed on. ROS does not see it: it has no node.
+Others believe in a killed process for 20 seconds, DDS's lease, unless it takes its leave with one
+message, which whoever knows its id can send as well. A new process often misses what those that run
+answer to its first announcement: Fast DDS listens only afterwards. So another participant, which
+ROS does not see, is announced for an instant, and what it is answered is passed on.
 
 Owns: these messages, and where they go. Not here: who was killed (`fogft.proxy.robot.process`).
 """

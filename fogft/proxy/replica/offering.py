@@ -1,8 +1,7 @@
 """The services that a replica offers: those in its configuration, or those of `run`.
 
-Where the configuration lists none, the ROS graph of the replica is looked at, and every service
-that an application offers there is taken up, under the name that ROS gives it: namespaces and
-remappings have done their work by then.
+Where the configuration lists none, every service that an application offers in the replica's ROS
+graph is taken up, under the name that ROS gives it.
 
 Owns: which services there are, since when, and the definitions of their types.
 Not here: whether they answer (`server`), which the robot proxies (`fogft.pool.folder.discovered`).

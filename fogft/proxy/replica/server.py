@@ -1,14 +1,11 @@
 """The server proxy: passes requests from the link to the replica's local services.
 
-It says "ready" for a service only while the user's command lives and discovery finds the service,
-and answers probes at once whatever the services do.
-
-When the command dies, the proxy leaves ROS and joins it anew: discovery would go on listing the
-dead service until its lease ends (20 s with Fast DDS). When a service goes and the command lives,
-what was passed on to that service is refused, to be sent again.
+It says "ready" for a service only while the user's command lives and discovery finds the service.
+When the command dies, it leaves ROS and joins it anew: discovery would go on listing the dead
+service. When a service goes and the command lives, what was passed on to it is refused.
 
 Owns: the replica's state as probes tell it. Not here: requests (`responder`), the command
-(`supervisor`), files and signals (`process`).
+(`supervisor`), files and signals (`process`). Design: docs/design/server-proxy.md.
 """
 
 from __future__ import annotations

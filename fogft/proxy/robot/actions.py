@@ -1,8 +1,7 @@
 """An action on the robot: three services whose requests go to all replicas.
 
-The goal that a client makes goes to every replica, and to those that come while it is under
-way: a goal outlives the replicas that it was given to. The first that succeeds is the result;
-the others are then told to cancel. What a client cancels is cancelled everywhere.
+A goal goes to every replica, and to those that come while it is under way. The first that succeeds
+is the result; the others are told to cancel. What a client cancels is cancelled everywhere.
 
 Owns: what decides for the three services, and what replicas must have of them.
 Not here: a request's life (`dispatcher`), what a goal is (`fogft.topics.goals`), feedback and

@@ -1,9 +1,7 @@
 """Delivers a request's outcome to its caller: a response, the fallback's, an empty one or none.
 
-Where a caller is (in ROS, or a robot at a gateway) is the matter of the function that responds.
-When the fallback is asked is `requests.fallback`'s to say; here it is called.
-
-Owns: calls of the fallback service. Not here: which answer is returned (`dispatcher`).
+Owns: calls of the fallback service. Not here: where a caller is (the function that responds), which
+answer is returned (`dispatcher`), when the fallback is asked (`requests.fallback`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
 """A client proxy's `/diagnostics` and parameters in ROS.
 
-What ``/diagnostics`` says of the pool, of each service, topic and replica is made of the proxy's
-report. Requests that got no answer are worth a warning for a while, so the counters of half a
-minute are remembered.
-
 Owns: levels, sentences, and the values below them; when they are told. Not here: publishing
 (`fogft.ros.visible`), the policies that parameters set (`fogft.poolfile.policy_parameters`).
 """

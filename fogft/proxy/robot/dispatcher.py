@@ -1,16 +1,12 @@
 """One proxied service on the robot: send a request to replicas, return the answer.
 
-All requests live one life: registered, sent, answered, delivered; or the deadline comes, or the
-caller takes it back. What differs between services is put in:
-
-* *choose* (`requests.choose`): which replicas are asked first, which next, and when;
-* *decide* (`requests.decide`): what an answer means, and what else replicas must have;
-* *deliver* (`delivery`): how the end reaches the caller.
+What differs between services is put in: whom to ask (`requests.choose`), what an answer means
+(`requests.decide`), how the end reaches the caller (`delivery`).
 
 `submit` is called by the thread that takes ROS requests and never blocks. Answers come from the
 links' threads, which may not send: that is left to the next `tick`, which `wake` brings about.
 
-Owns: that life, and which policy a service has.
+Owns: a request's life, and which policy a service has.
 Not here: sending (`sending`), links (`fogft.link`), ROS. Design: docs/design/dispatcher.md.
 """
 

@@ -1,8 +1,7 @@
 """The membership a client proxy follows: from the manager's file, from records, or both.
 
-The manager of this machine writes a file; further robots learn the same from records. The
-later one counts. Where replicas are is corrected by what they say of themselves, and those
-that dial in are reached through the door.
+The later one counts. Where replicas are is corrected by what they say of themselves, and those that
+dial in are reached through the door.
 
 Owns: the record client and the door of a client proxy.
 Not here: links (`links`), files and signals (`process`).

@@ -1,10 +1,8 @@
 """The links of a client proxy, one per member, and its report of each replica.
 
-Seen through a gateway a replica is put as if it were linked directly, so that the manager judges
-it as it judges all others: a gateway that is silent is a link that is silent. Seen through
-several gateways, the best sight of a replica counts.
-
-A replica whose types differ from ours is not asked: its bytes would be read as another message.
+Seen through a gateway a replica is put as if it were linked directly, so that the manager judges it
+as it judges all others; of several sights the best counts. A replica whose types differ from ours
+is not asked: its bytes would be read as another message.
 
 Owns: which links exist. Not here: which of them a service uses (`client`), links themselves
 (`fogft.link`). Under the client proxy's lock.

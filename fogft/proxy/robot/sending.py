@@ -1,9 +1,9 @@
 """Offer one service's requests to links, and cancel requests at links.
 
-Whom to ask, and when, is the policy's to say (`requests.choose`); here it is carried out. This is
-the one place where a request leaves for a replica.
+This is the one place where a request leaves for a replica.
 
-Owns: which links may be asked. Not here: links (`fogft.link`), answers (`dispatcher`).
+Owns: which links may be asked. Not here: whom to ask, and when (`requests.choose`), links
+(`fogft.link`), answers (`dispatcher`).
 """
 
 from __future__ import annotations

@@ -1,18 +1,10 @@
-"""The standby client proxy, and hand-over to it.
+"""The standby client proxy, and hand-over to it. Design: docs/design/manager.md.
 
 The standby has loaded everything and its DDS participant is known, but it offers nothing and no
-node of it is seen. It waits for the lock: the kernel gives it in the instant in which the holder
-ends, whatever ends it. Behind it a spare waits for its place, which has loaded the code and has no
-thread of ROS's or Zenoh's yet: so it can leave a copy of itself (a fork) as the next spare, and
-proxies that are killed one after another cost no start.
+node of it is seen. It waits for the lock, which the kernel gives it when the holder ends. Behind it
+a spare waits for its place, which has no thread of ROS's or Zenoh's yet, so that it can fork.
 
-A holder that is told to end lets the standby take over while it still serves. For a second
-both serve: each request goes to both, under one id, so that a replica runs it once and the caller
-gets one answer. Then the first takes no more, and finishes what it has taken. A stateful service is
-ordered by one only: the other holds what it hears until the first, which keeps a lock meanwhile,
-has written down which of it was taken there. If it is killed before, what was held is given up.
-
-Owns: the place in line, and that order. Not here: a client proxy's work (`process`).
+Owns: the place in line, and the order of a hand-over. Not here: a client proxy's work (`process`).
 """
 
 from __future__ import annotations

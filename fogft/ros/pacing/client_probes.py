@@ -1,8 +1,7 @@
 """Probes of clients' nodes, to learn whether their executors take responses.
 
-Nothing in DDS tells what a reader has taken. But a ROS node answers services of its own, those of
-its parameters, and by the same executor that takes its clients' responses, one in each turn: an
-answer means that there was a turn.
+A ROS node answers the services of its parameters by the same executor that takes its clients'
+responses, one in each turn: an answer means that there was a turn.
 
 Owns: whose node a client is, and the probes on the way. Not here: what they show (`pace`).
 """

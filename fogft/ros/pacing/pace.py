@@ -1,13 +1,9 @@
 """When a response may be sent, so that no client's queue overflows. Pure: time is an argument.
 
-All clients of a service share one topic for its responses, and each has a queue of its own:
-of ten, by default, from which the eleventh pushes the first, whoever it is for. So what counts
-for a client is how many responses, of anybody's, were sent since the oldest of its own that it
-may not have taken.
-
-What shows that a client takes: its executor's answer to a probe (each is a turn, and in each turn
-a client takes one response), or the next request of one that had none open. Where its node answers
-no probes, any request that takes the place of another, and time.
+All clients of a service share one topic for its responses, and each has a queue of its own: of ten,
+by default, from which the eleventh pushes the first, whoever it is for. So what counts for a client
+is how many responses, of anybody's, were sent since the oldest of its own that it may not have
+taken. What shows that it takes: docs/design/serialised-services.md.
 
 Owns: that account. Not here: sending, probing, waiting (`pacer`).
 """

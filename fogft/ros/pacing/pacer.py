@@ -1,11 +1,8 @@
 """Send responses no faster than their clients take them.
 
-An ordinary ROS client keeps the last ten responses that it has not taken yet and silently
-loses more. A service answers one request after another, but a proxy answers in bursts: all
-that a failover held up, at once. So what a client's queue has no room for waits here.
-
-A client that discovery has not found yet gets its first response again until it has; the others
-wait behind it.
+A client keeps the last ten responses that it has not taken yet and silently loses more; what its
+queue has no room for waits here. One that discovery has not found yet gets its first response again
+until it has; the others wait behind it.
 
 Owns: the responses that wait, and the thread that sends them. Not here: when one may be sent
 (`pace`), sending it (`entities`), asking a client's node (`client_probes`).
