@@ -27,7 +27,6 @@ from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.metrics.spans import Spans, wanted
 from fogft.model import names
-from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import short
 from fogft.model.spec import Part, ServiceSpec
@@ -137,51 +136,6 @@ def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
     return dialer
 
 
-def make_dispatcher(
-    spec: ServiceSpec,
-    respond: Callable[[Any, bytes], None],
-    wake: Wake,
-    *,
-    marks: Path,
-    pool_uid: str,
-    actions: Actions,
-    speaks: Speaks = Speaks.RCLPY,
-    id_of: Callable[[str, Any], bytes] | None = None,
-    held: Callable[[], bool] = lambda: False,
-) -> Dispatcher:
-    """Create a service's dispatcher, with what it needs of its ROS type.
-
-    Args:
-        speaks: How the proxy speaks ROS. Over Zenoh a type need not be known.
-        id_of: Gives a request its id, by service and handle; a random one unless given.
-
-    Raises:
-        RosError: The type is needed and cannot be loaded.
-    """
-    fault_of = middleware.fault_of(spec.type, RESPONSE)
-    shared: dict[str, Any] = {"fault_of": fault_of, **({"id_of": id_of} if id_of else {})}
-    if spec.part is not Part.NONE:
-        return actions.make(spec, respond, wake, **shared)
-    from fogft.ros import messages
-    from fogft.ros.comparison import Comparison
-
-    # The policy may become `empty` later.
-    empty = middleware.empty_response(speaks, spec.type, needed=spec.needs_type)
-    make = functools.partial(Dispatcher, spec, respond, empty_response=empty, wake=wake, **shared)
-    if spec.state is not None:
-        mark = marks / f"{names.connection_id(pool_uid, 0, spec.name, spec.type)}"
-        order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake, held=held())
-        return make(decide=order, max_pending_bytes=_STATEFUL_BYTES)
-    ok_of = functools.partial(messages.bool_field, spec.type)
-    if spec.quorum > 1:
-        comparison = Comparison(spec.type, spec.tolerance)
-        flagged = functools.partial(_replica_disagrees, spec.name)
-        return make(
-            decide=Quorum(spec.quorum, comparison.read, comparison.agree, flagged), ok_of=ok_of
-        )
-    return make(ok_of=ok_of)
-
-
 def _replica_disagrees(service: str, replica: int, count: int) -> None:
     log.error("replica_disagrees service=%s replica=%s count=%d", service, short(replica), count)
 
@@ -215,16 +169,9 @@ class _Running:
             told=lambda: made[0].links.told() if made else {},
             noticed=lambda: made[0].look_again() if made else None,
         )
-        make = functools.partial(
-            make_dispatcher,
-            marks=config.status.with_suffix(".marks"),
-            pool_uid=config.pool_uid,
-            actions=Actions(),
-            speaks=config.rmw,
-            id_of=in_line.request_ids(config.credentials.key, joined.identity),
-            held=lambda: self.held,
-        )
-        self.dialer, merge = make_dialer(config), merged_status
+        self.actions = Actions()
+        self.id_of = in_line.request_ids(config.credentials.key, joined.identity)
+        self.dialer, make, merge = make_dialer(config), self._make_dispatcher, merged_status
         proxy = self.proxy = ClientProxy(
             config.pool_uid, joined.node, self.dialer, make, define=joined.define, merge=merge
         )
@@ -242,6 +189,35 @@ class _Running:
             "proxy_started pool=%s robot=%s pid=%d standby=%s start_s=%.2f",
             config.pool, config.robot, os.getpid(), early is not None, time.monotonic() - began,
         )  # fmt: skip
+
+    def _make_dispatcher(
+        self, spec: ServiceSpec, respond: Callable[[Any, bytes], None], wake: Wake
+    ) -> Dispatcher:
+        """Create a service's dispatcher. Raises RosError: its type is needed and not usable."""
+        from fogft.ros import messages
+        from fogft.ros.comparison import Comparison
+
+        pool_uid = self.config.pool_uid
+        fault_of = middleware.fault_of(spec.type, RESPONSE)
+        shared: dict[str, Any] = {"wake": wake, "fault_of": fault_of, "id_of": self.id_of}
+        if spec.part is not Part.NONE:
+            return self.actions.make(spec, respond, **shared)
+        # The policy may become `empty` later.
+        empty = middleware.empty_response(self.config.rmw, spec.type, needed=spec.needs_type)
+        make = functools.partial(Dispatcher, spec, respond, empty_response=empty, **shared)
+        if spec.state is not None:
+            marks = self.config.status.with_suffix(".marks")
+            mark = marks / names.connection_id(pool_uid, 0, spec.name, spec.type)
+            order = ServiceOrder(spec.name, OrderMark(mark, pool_uid), wake=wake, held=self.held)
+            return make(decide=order, max_pending_bytes=_STATEFUL_BYTES)
+        ok_of = functools.partial(messages.bool_field, spec.type)
+        if spec.quorum > 1:
+            comparison = Comparison(spec.type, spec.tolerance)
+            flagged = functools.partial(_replica_disagrees, spec.name)
+            return make(
+                decide=Quorum(spec.quorum, comparison.read, comparison.agree, flagged), ok_of=ok_of
+            )
+        return make(ok_of=ok_of)
 
     def _make_visible(self, judge: Callable[[Mapping[str, Any]], str]) -> VisibleNode | None:
         try:
