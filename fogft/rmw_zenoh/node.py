@@ -121,8 +121,7 @@ class RmwZenohNode:
     ) -> Server:
         """Offer a service. A first request may come before this returns.
 
-        Raises:
-            RosError: The type's hash is not known yet, or the node is closed.
+        Raises RosError: The type's hash is not known yet, or the node is closed.
         """
         known = self._hash(name, type_name)
         if not known:
@@ -232,8 +231,7 @@ SETTINGS: dict[str, Any] = {
 def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
     """Return the Zenoh configuration of an environment.
 
-    Raises:
-        RosError: A variable names no configuration, or is none.
+    Raises RosError: A variable names no configuration, or is none.
     """
     path = environ.get(FILE)
     try:

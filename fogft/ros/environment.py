@@ -79,8 +79,7 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
     It does not where /dev/shm is small, as containers have it by default (64 MB): Fast DDS
     would report errors and fall back to UDP.
 
-    Raises:
-        RosError: The installation is incomplete.
+    Raises RosError: The installation is incomplete.
     """
     if any(environ.get(name) for name in _CHOSEN_BY_USER):
         return False

@@ -108,8 +108,7 @@ class EarlyJoin:
     The participant comes with a context's first node. Its node offers nothing, and ROS's tools hide
     it if its name begins with an underscore; it ends once there is another one.
 
-    Raises:
-        RosError: ROS 2 is not usable here.
+    Raises RosError: ROS 2 is not usable here.
     """
 
     def __init__(self, name: str, domain_id: int | None) -> None:

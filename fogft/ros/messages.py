@@ -56,8 +56,7 @@ def bool_field(name: str, field: str) -> Callable[[bytes], bool]:
     The function raises Unreadable for bytes that are no such response. Where only numbers
     stand before the field, it looks at one byte; else it deserialises the response.
 
-    Raises:
-        RosError: The type cannot be loaded, or its response has no such boolean field.
+    Raises RosError: The type cannot be loaded, or its response has no such boolean field.
     """
     response_type = load_service_type(name).Response
     fields: dict[str, str] = response_type.get_fields_and_field_types()

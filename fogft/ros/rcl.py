@@ -95,8 +95,7 @@ def _declared(library: CDLL) -> CDLL:
 def load() -> tuple[CDLL, CDLL]:
     """Load the functions: a set that holds the GIL, and a set that releases it.
 
-    Raises:
-        RosError: The library or one of its functions is missing.
+    Raises RosError: The library or one of its functions is missing.
     """
     try:
         import rclpy.impl.implementation_singleton  # noqa: F401  loads librcl itself

@@ -46,8 +46,7 @@ class CMessage:
     def read(self, payload: bytes) -> None:
         """Fill the message from serialised bytes.
 
-        Raises:
-            Unreadable: They are no such message; what the message holds now is undefined.
+        Raises Unreadable: They are no such message; what the message holds now is undefined.
         """
         size = len(payload)
         fault = self._shape.fault(payload)
@@ -186,8 +185,7 @@ def self_test() -> None:
 
     Compared after deserialising: the padding between fields is whatever lay in memory.
 
-    Raises:
-        RosError: This path is not usable with the ROS 2 that is here.
+    Raises RosError: This path is not usable with the ROS 2 that is here.
     """
     from rclpy.serialization import deserialize_message, serialize_message
 

@@ -25,8 +25,7 @@ _TEXT = re.compile(r"string(?:<\d+>)?")
 class StateBytes:
     """Reads and writes the state in a service's snapshot and restore messages.
 
-    Raises:
-        RosError: A type cannot be loaded, or has no such field.
+    Raises RosError: A type cannot be loaded, or has no such field.
     """
 
     def __init__(self, spec: StateSpec) -> None:

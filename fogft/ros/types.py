@@ -35,8 +35,7 @@ _MESSAGE = re.compile(
 def load_service_type(name: str) -> Any:
     """Return the Python class of ``package/srv/Type`` with its type support loaded.
 
-    Raises:
-        RosError: There is no such type here, or it cannot be loaded; with a hint.
+    Raises RosError: There is no such type here, or it cannot be loaded; with a hint.
     """
     if not _NAME.fullmatch(name):
         raise RosError(
@@ -51,8 +50,7 @@ def load_service_type(name: str) -> Any:
 def load_message_type(name: str) -> Any:
     """Return the Python class of ``package/msg/Type``, or of an action's feedback message.
 
-    Raises:
-        RosError: There is no such type here, or it cannot be loaded; with a hint.
+    Raises RosError: There is no such type here, or it cannot be loaded; with a hint.
     """
     if not _MESSAGE.fullmatch(name):
         example = "write `package/msg/Type`, as in `sensor_msgs/msg/Image`"

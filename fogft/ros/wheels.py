@@ -25,8 +25,7 @@ _NEEDED = "share/rosidl_default_generators/cmake"
 def lay_prefix(into: Path) -> Path:
     """Create a prefix to build against, or replace an older one; return it.
 
-    Raises:
-        RosError: The wheels for building are missing, or the folder cannot be written.
+    Raises RosError: The wheels for building are missing, or the folder cannot be written.
     """
     wheels = Path(sys.prefix)
     if not (wheels / _NEEDED).is_dir():

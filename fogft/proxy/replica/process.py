@@ -60,8 +60,7 @@ def run(
     Each option replaces a key of the file; `notice_file` appears when the machine is about to be
     preempted.
 
-    Raises:
-        FogftError: The configuration, the credentials or ROS cannot be used.
+    Raises FogftError: The configuration, the credentials or ROS cannot be used.
     """
     begin_start()
     config = read_server(

@@ -234,8 +234,7 @@ class ClientProxy:
     def run_once(self, timeout_s: float = _IDLE_TICK_S) -> bool:
         """Wait briefly for a change, then route, advertise and tick; return whether it changed.
 
-        Raises:
-            RosError: The node's thread has ended: nothing would be taken any more.
+        Raises RosError: The node's thread has ended: nothing would be taken any more.
         """
         if self._node is not None and not self._node.alive:
             raise RosError("ROS has stopped; see the log for the reason", "start the proxy again")

@@ -135,8 +135,7 @@ class Dispatcher:
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Do the same for a request with an id; return whether taken.
 
-        Raises:
-            ValueError: A request with this id is under way.
+        Raises ValueError: A request with this id is under way.
         """
         now, requests, outcomes = self._clock(), self._requests, self.outcomes
         with self._lock:
@@ -323,8 +322,7 @@ class Dispatcher:
     def adopt(self, spec: ServiceSpec, fallback: RosClient | None = None) -> None:
         """Switch to another policy, with the client of its fallback service if it has one.
 
-        Raises:
-            RosError: The response has no such `ok_field`; nothing was changed.
+        Raises RosError: The response has no such `ok_field`; nothing was changed.
         """
         accepts = self._decide.accepts
         if spec.ok_field != self.spec.ok_field and self._ok_of is not None:

@@ -57,8 +57,7 @@ class Following:
     def apply(self, config: ClientProxyConfig) -> None:
         """Apply a changed configuration.
 
-        Raises:
-            WireError: The new door's port cannot be had; there is none then.
+        Raises WireError: The new door's port cannot be had; there is none then.
         """
         old, self._config = self._config, config
         if (old.dial_in, old.dial_in_listen) != (config.dial_in, config.dial_in_listen):

@@ -51,8 +51,7 @@ class ManagerRestart:
     def look(self) -> None:
         """Restart the manager if it has been missing for a while, with growing pauses.
 
-        Raises:
-            StateError: It cannot be started, or its file is damaged.
+        Raises StateError: It cannot be started, or its file is damaged.
         """
         now = self._clock()
         if now < self._look_at:

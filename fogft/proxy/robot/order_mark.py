@@ -27,8 +27,7 @@ _VERSION = re.compile(r"[0-9a-f]{16}")
 class OrderMark:
     """The mark of one stateful service on one robot; its file is made if there is none.
 
-    Raises:
-        StateError: It cannot be used, or belongs to another pool.
+    Raises StateError: It cannot be used, or belongs to another pool.
     """
 
     def __init__(self, path: Path, pool_uid: str) -> None:

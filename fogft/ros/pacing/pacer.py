@@ -79,8 +79,7 @@ class Pacer:
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send a response now, or as soon as its client has room.
 
-        Raises:
-            RosError: It was sent now, and ROS refused it.
+        Raises RosError: It was sent now, and ROS refused it.
         """
         now = self._clock()
         id = self._client_of(handle)
