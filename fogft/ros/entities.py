@@ -10,6 +10,7 @@ Not here: the loop (`node`), bytes (`serialised`).
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 from collections.abc import Callable
@@ -156,19 +157,15 @@ class Client:
 
     def available(self) -> bool:
         """Whether discovery has found a server."""
-        try:
+        with contextlib.suppress(Exception):  # rclpy's InvalidHandle: withdrawn meanwhile
             return bool(self._client.service_is_ready())
-        except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
-            return False
+        return False
 
     def servers(self) -> int:
         """Count the servers that discovery lists, dead ones included until their lease ends."""
-        if self._end is None:
-            return 0
-        try:
-            return self._count(self._client.srv_name)
-        except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
-            return 0
+        with contextlib.suppress(Exception):  # rclpy's InvalidHandle: withdrawn meanwhile
+            return self._count(self._client.srv_name) if self._end is not None else 0
+        return 0
 
     def mismatch(self) -> str:
         """Return why none of the servers can be called; else empty."""

@@ -81,11 +81,7 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
 
     Raises RosError: The installation is incomplete.
     """
-    if any(environ.get(name) for name in _CHOSEN_BY_USER):
-        return False
-    if any(Path(name).is_file() for name in _LOCAL_PROFILES):
-        return False
-    if _shared_memory_free_bytes() < _ROOM_NEEDED_BYTES:
+    if _chosen(environ) or _shared_memory_free_bytes() < _ROOM_NEEDED_BYTES:
         return False
     environ[profile_variable(environ)] = str(profile_path())
     return True
@@ -124,7 +120,7 @@ def describe(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
     found = {
         "domain": environ.get("ROS_DOMAIN_ID") or "0",
         "discovery": _discovery(environ),
-        "profile": _profile(environ),
+        "profile": _chosen(environ) or "none: Fast DDS's default transports, slow above 0.5 MB",
         "shared_memory_free_mb": str(_shared_memory_free_bytes() // 1_000_000),
     }
     try:
@@ -153,14 +149,11 @@ def _discovery(environ: Mapping[str, str]) -> str:
     return f"{reach}, peers {peers}" if peers else reach
 
 
-def _profile(environ: Mapping[str, str]) -> str:
+def _chosen(environ: Mapping[str, str]) -> str:
     for name in _CHOSEN_BY_USER:
         if environ.get(name):
             return f"{name}={environ[name]}"
-    for name in _LOCAL_PROFILES:
-        if Path(name).is_file():
-            return str(Path(name).resolve())
-    return "none: Fast DDS's default transports, slow above 0.5 MB"
+    return next((str(Path(n).resolve()) for n in _LOCAL_PROFILES if Path(n).is_file()), "")
 
 
 def _shared_memory_free_bytes() -> int:

@@ -13,26 +13,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-_M_TRIM_THRESHOLD = -1
-_M_MMAP_THRESHOLD = -3
-_M_ARENA_MAX = -8
-_MMAP_THRESHOLD_BYTES = 64 * 1024 * 1024
-_TRIM_THRESHOLD_BYTES = 512 * 1024 * 1024
-_ARENAS = 2  # each thread would have its own, and each keep what its own burst took
+_OPTIONS = (
+    (-3, 64 << 20),  # M_MMAP_THRESHOLD, bytes
+    (-1, 512 << 20),  # M_TRIM_THRESHOLD, bytes
+    (-8, 2),  # M_ARENA_MAX: each thread would have its own, and each keep what its own burst took
+)
 
 
 def tune() -> bool:
     """Tune this process's malloc; return whether it took effect (glibc only)."""
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):
-        return False
-    mallopt.argtypes = (ctypes.c_int, ctypes.c_int)
-    mallopt.restype = ctypes.c_int
-    mapped = mallopt(_M_MMAP_THRESHOLD, _MMAP_THRESHOLD_BYTES)
-    trimmed = mallopt(_M_TRIM_THRESHOLD, _TRIM_THRESHOLD_BYTES)
-    arenas = mallopt(_M_ARENA_MAX, _ARENAS)
-    return bool(mapped and trimmed and arenas)
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    return mallopt is not None and min(mallopt(*option) for option in _OPTIONS) > 0
 
 
 def own_bytes() -> int:
@@ -46,11 +37,9 @@ def own_bytes() -> int:
 
 def give_back() -> None:
     """Return free memory to the system; takes some milliseconds. Only with glibc."""
-    try:
-        trim = ctypes.CDLL(None).malloc_trim
-    except (OSError, AttributeError):
-        return
-    trim(0)
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)
 
 
 class Trimmer:

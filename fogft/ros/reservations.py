@@ -55,11 +55,10 @@ def reserve_port() -> Reservation | None:
     """Reserve a TCP port on which nobody listens; None if there is none left."""
     for port in random.sample(PORTS, len(PORTS)):
         reservation = _reserve("port", port)
-        if reservation is None:
-            continue
-        if _can_listen(port):
-            return reservation
-        reservation.release()
+        if reservation is not None:
+            if _can_listen(port):
+                return reservation
+            reservation.release()
     return None
 
 

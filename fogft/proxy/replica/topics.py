@@ -16,7 +16,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from fogft.errors import FrameError, RosError, Unreadable
 from fogft.link.port import Incoming
@@ -37,9 +37,10 @@ _HELD_LIMIT = 64  # pulls of one topic; beyond it one of whom has most is answer
 _BATCH_BYTES = 8 << 20
 
 
-class _Pull:
-    def __init__(self, incoming: Incoming, after: int, until: float) -> None:
-        self.incoming, self.after, self.until = incoming, after, until
+class _Pull(NamedTuple):
+    incoming: Incoming
+    after: int
+    until: float
 
 
 class _Outgoing:
@@ -57,25 +58,23 @@ class _Outgoing:
             self._ring.put(message)
             held, self._held = self._held, []
         for pull in held:
-            self._answer(pull.incoming, pull.after)
+            self._answer(pull)
 
     def pulled(self, incoming: Incoming) -> None:
         session, after = frames.decode_pull(incoming.payload)
-        excess = None
+        hold_s = min(HOLD_S, incoming.remaining_s / 2)
+        pull = _Pull(incoming, after, self._clock() + hold_s)
+        due: _Pull | None = pull
         with self._lock:
             if session != self._session:
                 after = self._ring.begin()
                 incoming.reply(frames.encode_batch(self._session, after, ()))
                 return
             if self._ring.last <= after:
-                hold_s = min(HOLD_S, incoming.remaining_s / 2)
-                self._held.append(_Pull(incoming, after, self._clock() + hold_s))
-                excess = self._excess()
-                incoming = None  # type: ignore[assignment]
-        if incoming is not None:
-            self._answer(incoming, after)
-        if excess is not None:
-            self._answer(excess.incoming, excess.after)
+                self._held.append(pull)
+                due = self._excess()
+        if due is not None:
+            self._answer(due)
 
     def _excess(self) -> _Pull | None:
         """Return a pull that is held no longer: the oldest of the robot that has most."""
@@ -92,13 +91,13 @@ class _Outgoing:
             over = [pull for pull in self._held if pull.until <= now]
             self._held = [pull for pull in self._held if pull.until > now]
         for pull in over:
-            self._answer(pull.incoming, pull.after)
+            self._answer(pull)
 
-    def _answer(self, incoming: Incoming, after: int) -> None:
+    def _answer(self, pull: _Pull) -> None:
         with self._lock:
-            found = self._ring.after(after, _BATCH_BYTES)[: frames.BATCH_LIMIT]
-        last = found[-1][0] if found else after
-        incoming.reply(frames.encode_batch(self._session, last, found))
+            found = self._ring.after(pull.after, _BATCH_BYTES)[: frames.BATCH_LIMIT]
+        last = found[-1][0] if found else pull.after
+        pull.incoming.reply(frames.encode_batch(self._session, last, found))
 
 
 class TopicsOnReplica:

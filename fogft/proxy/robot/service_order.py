@@ -205,7 +205,9 @@ class ServiceOrder(Decide):
             if not self._number(request, payload):
                 break
             del self._waiting[request]
-        self._look_for_trouble()
+        if (trouble := self.trouble) not in ("", self._told):
+            self._told = trouble
+            log.error("state_unavailable service=%s reason=%r", self._name, trouble)
         epoch, limit_s = self._term.epoch, max(_ATTEMPT_S, 4 * timeout_s)
         return [
             Send(
@@ -230,12 +232,6 @@ class ServiceOrder(Decide):
             log.info("version_changed service=%s version=%s", self._name, begin.version)
             self._term = self._begin_term(begin=begin)
             self._reach(now)
-
-    def _look_for_trouble(self) -> None:
-        trouble = self.trouble
-        if trouble and trouble != self._told:
-            self._told = trouble
-            log.error("state_unavailable service=%s reason=%r", self._name, trouble)
 
     # -- what people see ------------------------------------------------------------------
 

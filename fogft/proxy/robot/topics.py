@@ -98,12 +98,8 @@ class RobotTopic:
 
     def report(self) -> dict[str, Any]:
         """Return its counters and rate, and why it does not get through."""
-        rate_hz = round(self._rate_hz, 2)
-        return {
-            **self.count,
-            "rate_hz": rate_hz,
-            **({"trouble": self.trouble} if self.trouble else {}),
-        }
+        trouble = {"trouble": self.trouble} if self.trouble else {}
+        return {**self.count, "rate_hz": round(self._rate_hz, 2), **trouble}
 
     # -- the robot's own messages ---------------------------------------------------------
 
