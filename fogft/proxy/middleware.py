@@ -139,13 +139,12 @@ def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | N
         from fogft.ros import messages
 
         return messages.default_response(type_name)
-    except ImportError as error:
-        if needed or speaks is Speaks.RCLPY:
-            raise RosError(
-                f"`{type_name}` cannot be loaded here: {error}",
-                "install `fogft[ros]` and the package of that type, or source a workspace with it",
-            ) from error
-    except RosError:
-        if needed or speaks is Speaks.RCLPY:
+    except (ImportError, RosError) as error:
+        if not needed and speaks is not Speaks.RCLPY:
+            return None
+        if isinstance(error, RosError):
             raise
-    return None
+        raise RosError(
+            f"`{type_name}` cannot be loaded here: {error}",
+            "install `fogft[ros]` and the package of that type, or source a workspace with it",
+        ) from error

@@ -73,7 +73,6 @@ class RmwZenohNode:
         self._domain = _domain(environ) if domain_id is None else domain_id
         self._numbers = itertools.count(1)
         self._made: list[Server | Client] = []
-        self._probes = NodeProbes(self)
         self._lock = threading.Lock()
         self._open = True
         config = settings_from(environ)
@@ -86,7 +85,8 @@ class RmwZenohNode:
     def _start(self) -> None:
         self._id = str(self._session.zid())
         graph = self.graph = Graph(self._id)
-        self.same_node_serves, self.offered = graph.same_node_serves, graph.offered
+        self.offered = graph.offered
+        self._probes = NodeProbes(self.client, graph.same_node_serves)
         live = self._session.liveliness()
         node = Token(self._domain, self._id, "0", "0", NODE, self._name)
         self._declared = live.declare_token(str(node))

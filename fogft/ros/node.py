@@ -64,7 +64,7 @@ class SerialisedNode:
         self._stopping = False
         self._ended = threading.Event()
         self._visible: VisibleNode | None = None
-        self._probes = NodeProbes(self)
+        self._probes = NodeProbes(self.client, self.same_node_serves)
         self._timers = Timers()
         try:
             self._start_ros(name, domain_id, early)

@@ -24,8 +24,7 @@ class StateServices:
     """Offers ``SERVICE/get_state`` and ``SERVICE/set_state`` for a state given as bytes.
 
     Args:
-        node: The rclpy node that offers the service.
-        service: The service's name.
+        node: The rclpy node that offers the service of that name.
         snapshot: Returns the whole state. Equal states should give equal bytes.
         restore: Takes a whole state in place of the present one. What it raises is told to
             the proxy, which tries again.
@@ -63,13 +62,9 @@ class StateServices:
 
 
 class AttributeState(StateServices):
-    """`StateServices` for attributes of an object, as JSON.
+    """`StateServices` for attributes of an object (its owner), as JSON.
 
-    Args:
-        node: The rclpy node that offers the service.
-        service: The service's name.
-        owner: Whose attributes they are.
-        names: The attributes: numbers, text, and lists and dictionaries of them.
+    They may be numbers, text, and lists and dictionaries of them.
     """
 
     def __init__(self, node: Any, service: str, owner: Any, *names: str) -> None:

@@ -50,9 +50,13 @@ class Graph:
         return self.ends[name]
 
 
+def probes_of(graph: Graph) -> NodeProbes:
+    return NodeProbes(graph.client, graph.same_node_serves)
+
+
 def test_a_node_with_parameters_answers_probes():
     graph = Graph()
-    probes = NodeProbes(graph)
+    probes = probes_of(graph)
     assert probes.answers("/detect", CLIENT) is True
     answers = []
     for _ in range(3):
@@ -70,7 +74,7 @@ def test_a_node_with_parameters_answers_probes():
 
 def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
     graph = Graph()
-    probes = NodeProbes(graph)
+    probes = probes_of(graph)
     assert probes.answers("/detect", b"?" * 16) is None
     graph.client = lambda name, type_name: _missing()
     assert probes.answers("/detect", CLIENT) is None
@@ -85,14 +89,14 @@ def _missing() -> End:
 def test_a_node_without_parameters_answers_none():
     graph = Graph()
     graph.nodes = {CLIENT: ""}
-    assert NodeProbes(graph).answers("/detect", CLIENT) is False
+    assert probes_of(graph).answers("/detect", CLIENT) is False
     assert not graph.ends
 
 
 @pytest.mark.parametrize("known", [True, False])
 def test_a_probe_that_cannot_be_sent_is_not_answered(known: bool):
     graph = Graph()
-    probes = NodeProbes(graph)
+    probes = probes_of(graph)
     if known:
         assert probes.answers("/detect", CLIENT)
         graph.ends["/left/arm/get_parameter_types"].closed = True
@@ -103,7 +107,7 @@ def test_a_probe_that_cannot_be_sent_is_not_answered(known: bool):
 
 def test_of_many_nodes_the_first_are_let_go():
     graph = Graph()
-    probes = NodeProbes(graph)
+    probes = probes_of(graph)
     for n in range(KEPT + 10):
         client = n.to_bytes(16, "big")
         graph.nodes[client] = f"/n{n}"

@@ -183,7 +183,7 @@ class ServerProxy:
         for service in self._offering.look(self._node, complete=complete):
             name, type_name = service.name, service.type
             log.info("service_found replica=%s service=%s type=%s", self._id, name, type_name)
-            self._make_client(service)
+            self._make_client(self._node, service)
             self._listener.add(self._keys((service,)))
 
     def _crashed(self) -> None:
@@ -309,7 +309,7 @@ class ServerProxy:
             self._topics.use(cast("SerialisedNode", node))
         services = self._offering.services
         for service in services:
-            self._make_client(service)
+            self._make_client(node, service)
         cancels = {s.name: node.client(s.cancel, CANCEL_TYPE) for s in services if s.cancel}
         self.responder.use(self._clients, cancels)
         self._goals.use(self._clients)
@@ -321,12 +321,10 @@ class ServerProxy:
                 clients = Clients(self._clients[service.name], snapshot, restore)
                 self._ordered[service.name].use(clients)
 
-    def _make_client(self, service: ServiceSpec) -> None:
+    def _make_client(self, node: RosNode, service: ServiceSpec) -> None:
         """Make a service's client. Without its type the replica goes on, and says why."""
-        if self._node is None:
-            return
         try:
-            self._clients[service.name] = self._node.client(service.name, service.type)
+            self._clients[service.name] = node.client(service.name, service.type)
         except RosError as error:
             self._note(service.name, error.message)
         else:

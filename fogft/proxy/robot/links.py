@@ -227,8 +227,7 @@ class Links:
 
     def draining(self, link: Link) -> bool:
         """Whether a replica is draining, by its own report or the manager's."""
-        member = self._members.get(link.peer.id)
-        return link.draining or (member is not None and member.draining)
+        return link.draining or self._members[link.peer.id].draining
 
     def versions(self) -> dict[ReplicaId, str]:
         """Return the version of each member."""
@@ -273,14 +272,13 @@ class Links:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
         replicas, gateways, behind = [], [], []
         for id, link in sorted(self._links.items()):
-            member = self._members.get(id)
-            draining = self.draining(link)
+            member = self._members[id]
             report = link_report(
                 *(link, dispatchers, differences(link)),
-                draining=draining,
+                draining=self.draining(link),
                 misread=misreads(key_of(link)),
             )
-            if member is None or not member.gateway:
+            if not member.gateway:
                 replicas.append(report)
                 continue
             gateways.append({"name": member.gateway, "endpoint": member.endpoint, **report})

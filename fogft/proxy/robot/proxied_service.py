@@ -68,7 +68,10 @@ class ProxiedService:
         if self._wanted and self.server is None:
             self._offer(node)
         elif not self._wanted and self.server is not None:
-            self._withdraw()
+            server, self.server = self.server, None
+            server.close()
+            log.warning("service_withdrawn service=%s reason='no replica can answer'",
+                        self.spec.name)  # fmt: skip
         elif self.server is not None and now > self._looked_at + _LOOK_EVERY_S:
             self._looked_at = now
             self._note("service_disturbed", self.server.mismatch())
@@ -99,13 +102,6 @@ class ProxiedService:
         if trouble not in ("", self.trouble):
             log.error("%s service=%s reason=%r", event, self.spec.name, trouble)
         self.trouble = trouble
-
-    def _withdraw(self) -> None:
-        server, self.server = self.server, None
-        if server is not None:
-            server.close()
-            log.warning("service_withdrawn service=%s reason='no replica can answer'",
-                        self.spec.name)  # fmt: skip
 
     def close(self) -> None:
         """Withdraw it from ROS, and close its dispatcher."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections.abc import Callable
-from typing import Protocol
 
 from fogft.errors import RosError
 from fogft.ros.port import RosClient
@@ -21,31 +20,28 @@ _OF_NO_PARAMETER = b"\x00\x01\x00\x00" + bytes(4)  # a list of names, which is e
 KEPT = 64
 
 
-class Graph(Protocol):
-    """The interface of a ROS node that probes use."""
-
-    def client(self, name: str, type_name: str) -> RosClient:
-        """Create a client of a service."""
-
-    def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
-        """Return the full name of the service `what` of the node that a client belongs to.
-
-        None while it is not discovered, empty where there is none.
-        """
-
-
 class NodeProbes:
-    """Probes of the nodes in one ROS domain, for the clients of all services. Any thread."""
+    """Probes of the nodes in one ROS domain, for the clients of all services. Any thread.
 
-    def __init__(self, graph: Graph) -> None:
-        self._graph = graph
+    Args:
+        make_client: As `RosNode.client`.
+        same_node_serves: Returns the full name of the service of a last name, of the node that a
+            client of a service belongs to: None while it is not discovered, empty without one.
+    """
+
+    def __init__(
+        self,
+        make_client: Callable[[str, str], RosClient],
+        same_node_serves: Callable[[str, str, bytes], str | None],
+    ) -> None:
+        self._make_client, self._same_node_serves = make_client, same_node_serves
         self._by_name: dict[str, RosClient] = {}
         self._by_client: dict[bytes, RosClient] = {}
         self._lock = threading.Lock()
 
     def answers(self, service: str, client: bytes) -> bool | None:
         """Whether the node of a service's client answers probes; None while it is not known."""
-        asked = self._graph.same_node_serves(_SERVICE, service, client)
+        asked = self._same_node_serves(_SERVICE, service, client)
         if not asked:
             return None if asked is None else False
         with self._lock:
@@ -54,7 +50,7 @@ class NodeProbes:
                 if len(self._by_name) >= KEPT:
                     self._by_name.pop(next(iter(self._by_name))).close()
                 try:
-                    end = self._by_name[asked] = self._graph.client(asked, _TYPE)
+                    end = self._by_name[asked] = self._make_client(asked, _TYPE)
                 except RosError:
                     return False
             if not end.available():
