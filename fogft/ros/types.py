@@ -96,21 +96,20 @@ def _find(name: str, what: str) -> Any:
             action, _, part = type_name.rpartition("_")
             return getattr(getattr(module, action).Impl, _PARTS[part])
         return getattr(module, type_name)
-    except ModuleNotFoundError as error:
-        if error.name not in (package, f"{package}.{kind}"):
-            raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
-        raise RosError(
-            f"there is no package `{package}` with {what} here, so `{name}` cannot be loaded",
-            "install the package, or source its workspace; ROS 2's own are in "
-            f"`fogft[ros]`.{_did_you_mean(name)}",
-        ) from error
     except AttributeError as error:
         raise RosError(
             f"package `{package}` has no {_KINDS[kind]} type `{type_name}`",
             f"is the sourced workspace's build up to date?{_did_you_mean(name)}",
         ) from error
     except Exception as error:  # generated code: anything may go wrong in it
-        raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing not in (package, f"{package}.{kind}"):
+            raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
+        raise RosError(
+            f"there is no package `{package}` with {what} here, so `{name}` cannot be loaded",
+            "install the package, or source its workspace; ROS 2's own are in "
+            f"`fogft[ros]`.{_did_you_mean(name)}",
+        ) from error
 
 
 _KINDS = {"srv": "service", "msg": "message", "action": "action"}

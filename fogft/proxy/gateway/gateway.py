@@ -184,8 +184,6 @@ class Forwarder:
         for incoming in waiting:
             incoming.reply(payload, more=more)
 
-    # -- time -----------------------------------------------------------------------------
-
     def tick(self, ready: frozenset[str]) -> None:
         """Drop requests past their deadline or without a `ready` replica. Call at 50 Hz."""
         now = self._clock()

@@ -115,8 +115,6 @@ class _Gateway:
         self._forwarder.use(spec.name, dispatcher)
         return dispatcher
 
-    # -- the listener ---------------------------------------------------------------------
-
     def _listen(self) -> None:
         from fogft.link.zenoh.replica.listener import ZenohListener
 
@@ -149,8 +147,6 @@ class _Gateway:
             behind=behind,
             types=self._proxy.links.types() if probe.describe else {},
         )
-
-    # -- the loop -------------------------------------------------------------------------
 
     def run(self, stop: threading.Event) -> None:
         self._forwarder.start()

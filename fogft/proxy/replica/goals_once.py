@@ -214,8 +214,6 @@ class GoalsOnce:
         ]
         return [server.open.pop(goal) for goal in lost]
 
-    # -- time and ends --------------------------------------------------------------------
-
     def tick(self) -> None:
         """Refuse copies past their deadline. Call at about 10 Hz."""
         now = self._clock()

@@ -119,8 +119,6 @@ class _CancelPart(Decide):
     def report(self) -> dict[str, Any]:
         return {"to_cancel": len(self._action.to_cancel)}
 
-    # -- what replicas must have ----------------------------------------------------------
-
     def reach(self, replicas: Reachable, now: float) -> None:
         self._replicas = frozenset(replicas.versions)
 
@@ -200,8 +198,6 @@ class _GoalPart(Decide):
 
     def report(self) -> dict[str, Any]:
         return {"goals": self._action.goals.kept}
-
-    # -- what replicas must have ----------------------------------------------------------
 
     def reach(self, replicas: Reachable, now: float) -> None:
         """Note who can be given goals; who comes may have missed that some were ended."""

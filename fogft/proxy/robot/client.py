@@ -84,8 +84,6 @@ class ClientProxy:
         self._sooner: SimpleQueue[None] = SimpleQueue()
         self._changed = False
 
-    # -- configuration --------------------------------------------------------------------
-
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
         """Proxy exactly these services. Requests under way continue."""
         with self._lock:

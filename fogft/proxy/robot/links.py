@@ -223,8 +223,6 @@ class Links:
         log.info("link_dropped replica=%s", id.short)
         return self._links.pop(id)
 
-    # -- what they tell -------------------------------------------------------------------
-
     def draining(self, link: Link) -> bool:
         """Whether a replica is draining, by its own report or the manager's."""
         return link.draining or self._members[link.peer.id].draining

@@ -233,8 +233,6 @@ class ServiceOrder(Decide):
             self._term = self._begin_term(begin=begin)
             self._reach(now)
 
-    # -- what people see ------------------------------------------------------------------
-
     def report(self) -> dict[str, Any]:
         """Return the state of the order, as `proxy-status.json` has it."""
         term = self._term
