@@ -14,16 +14,14 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fogft.counters import Counters
 from fogft.errors import RosError
 from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import OnBurst
-
-if TYPE_CHECKING:
-    from fogft.ros.serialised import ClientEnd, ServiceEnd
+from fogft.ros.serialised import ClientEnd, ServiceEnd
 
 log = logging.getLogger(__name__)
 

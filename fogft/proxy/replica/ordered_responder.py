@@ -13,7 +13,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
@@ -22,9 +22,7 @@ from fogft.ordering import orders
 from fogft.ordering.orders import Op, OrderError
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
 from fogft.ros.port import RosClient
-
-if TYPE_CHECKING:
-    from fogft.ros.state_bytes import StateBytes
+from fogft.ros.state_bytes import StateBytes
 
 log = logging.getLogger(__name__)
 

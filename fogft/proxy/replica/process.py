@@ -36,6 +36,7 @@ from fogft.records.record import RecordKind
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
 from fogft.ros.reservations import Reservation, own_domain, reserve_domain
+from fogft.ros.state_bytes import StateBytes
 
 log = logging.getLogger(__name__)
 
@@ -139,7 +140,6 @@ def _make(
 ) -> ServerProxy:
     from fogft.link.zenoh.handshakes import HandshakeLog
     from fogft.link.zenoh.replica.listener import ZenohListener
-    from fogft.ros.state_bytes import StateBytes
 
     environ = run_environment(config)
     joined: list[middleware.Joined] = []  # the newest last: the node is made anew after a crash

@@ -39,11 +39,11 @@ from fogft.proxy.replica.topics import TopicsOnReplica
 from fogft.records.record import Record
 from fogft.ros.joining import Pauses
 from fogft.ros.port import RosClient, RosNode
+from fogft.ros.state_bytes import StateBytes
 
 if TYPE_CHECKING:
     from fogft.link.zenoh.replica.listener import ZenohListener
     from fogft.ros.node import SerialisedNode
-    from fogft.ros.state_bytes import StateBytes
 
 log = logging.getLogger(__name__)
 
