@@ -213,8 +213,8 @@ class Client:
         token = self._tell(hash)
         self._session.get(
             naming.service_key(token.domain, token.service, token.type, hash),
-            handlers.Callback(partial(self._replied, ticket), partial(self._ended, ticket),
-                              indirect=False),
+            handlers.Callback(partial(self._replied, ticket),
+                              partial(self._waiting.pop, ticket, None), indirect=False),
             payload=payload,
             attachment=naming.request_attachment(ticket, time.time_ns(), token.gid),
             encoding=zenoh.Encoding.APPLICATION_CDR,
@@ -248,9 +248,6 @@ class Client:
             waiting.on_response(reply.ok.payload.to_bytes())
         except Exception:
             log.exception("%s: a response was lost", self._name)
-
-    def _ended(self, ticket: int) -> None:
-        self._waiting.pop(ticket, None)
 
     def forget(self, ticket: int) -> None:
         """Drop a pending request; unknown tickets are ignored."""

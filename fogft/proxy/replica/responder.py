@@ -51,6 +51,7 @@ class Responder:
         answered: Told of each request that the service has answered, and when.
 
     Attributes:
+        known: What is remembered of requests.
         ran, ran_s: Requests passed on, and the time until their responses together.
         joined: Copies of requests that were known.
         saved, interrupted: Requests dropped unbegun, or told to stop, that nobody wanted any more.
@@ -80,7 +81,7 @@ class Responder:
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
         self._cancel_clients: Mapping[str, RosClient] = {}
-        self._known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
+        self.known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
         self._queues: dict[str, ServiceQueue] = {}
         self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
         self.ran_s = self.wasted_s = 0.0
@@ -93,12 +94,12 @@ class Responder:
     @property
     def in_flight(self) -> int:
         """The number of unanswered requests."""
-        return self._known.held
+        return self.known.held
 
     def report(self) -> dict[str, float]:
         """Return the counters of requests, in the form of a probe's answer."""
         return {
-            "held": self._known.held,
+            "held": self.known.held,
             "ran": self.ran,
             "ran_s": round(self.ran_s, 3),
             "saved": self.saved,
@@ -141,7 +142,7 @@ class Responder:
         now = self._clock()
         displaced = begun = None
         with self._lock:
-            known = self._known.get(incoming.request_id)
+            known = self.known.get(incoming.request_id)
             if known is not None:
                 self.joined += 1
                 if known.waiting is not None and not known.unwanted:
@@ -171,7 +172,7 @@ class Responder:
         """Take a request; return it where it is to be passed on at once."""
         job = Job(now, incoming)
         queue = self._queues[job.service]
-        self._known.add(job)
+        self.known.add(job)
         if queue.takes(job):
             queue.begin(job, now)
             return job
@@ -199,9 +200,9 @@ class Responder:
             return Refusal.BUSY, None
         deadline = now + remaining_s
         hopeless = queue.hopeless(incoming.robot, deadline, remaining_s)
-        if hopeless or not self._known.large.has_room(len(incoming.payload)):
+        if hopeless or not self.known.large.has_room(len(incoming.payload)):
             return Refusal.OVERLOADED, None
-        if self._known.held < self.held_limit:
+        if self.known.held < self.held_limit:
             return None, None
         displaced = queue.evict(incoming.robot, deadline)
         return (Refusal.OVERLOADED if displaced is None else None), displaced
@@ -211,7 +212,7 @@ class Responder:
         dropped, at_work = [], []
         with self._lock:
             for id in ids:
-                job = self._known.get(id)
+                job = self.known.get(id)
                 if job is None or job.waiting is None or job.unwanted:
                     continue
                 job.unwanted = True
@@ -273,22 +274,17 @@ class Responder:
             return True
         return False
 
-    @property
-    def remembered(self) -> int:
-        """The number of remembered request ids and deadlines, answered ones included."""
-        return len(self._known)
-
     def _finished(self, job: Job, payload: bytes) -> None:
         now = self._clock()
         queue = self._queues[job.service]
         with self._lock:
             waiting, job.waiting = job.waiting or [], None
             if waiting:
-                self._known.release(job)
+                self.known.release(job)
                 if self._passing is not None and self._passing(job.service, payload):
-                    self._known.forget(job)
+                    self.known.forget(job)
                 elif not job.unwanted:
-                    self._known.keep(job, payload)
+                    self.known.keep(job, payload)
             more = queue.answers_together
             load = queue.load(now - job.arrived, ended=1)
         try:
@@ -316,11 +312,11 @@ class Responder:
     def _end(self, id: bytes, reason: Refusal) -> None:
         """End a job without an answer: a copy that comes later may be run anew."""
         with self._lock:
-            job = self._known.get(id)
+            job = self.known.get(id)
             if job is None or job.waiting is None:
                 return
-            self._known.release(job)
-            self._known.forget(job)
+            self.known.release(job)
+            self.known.forget(job)
             waiting, job.waiting = job.waiting, None
             queue = self._queues[job.service]
             queue.remove(job)
@@ -337,7 +333,7 @@ class Responder:
     def crashed(self, service: str | None = None) -> None:
         """Note that a service, or the whole command, died: refuse its requests."""
         with self._lock:
-            dead = self._known.unanswered(service)
+            dead = self.known.unanswered(service)
             blamed = [job for job in dead if job.passed_on]
             spared = [job for job in dead if not job.passed_on]  # it was not ready for these
             lost = []
@@ -356,7 +352,7 @@ class Responder:
         """Drop requests past their deadline. Call at about 10 Hz."""
         now = self._clock()
         with self._lock:
-            late = self._known.expired(now)
+            late = self.known.expired(now)
             abandoned = [job for queue in self._queues.values() for job in queue.abandoned(now)]
             for name, queue in self._queues.items():
                 if queue.held_until <= now:

@@ -212,10 +212,10 @@ def test_deadlines_of_what_was_forgotten_do_not_pile_up():
     for n in range(5000):
         scene.ask(n.to_bytes(16, "big"), remaining_s=3600.0)
         scene.answer(5000 + n)
-    assert scene.responder.remembered < 1200
+    assert len(scene.responder.known) < 1200
     scene.clock.now += 3601.0
     scene.responder.tick()
-    assert scene.responder.remembered == 0
+    assert len(scene.responder.known) == 0
 
 
 def test_a_copy_of_finished_work_gets_the_kept_answer():
@@ -427,7 +427,7 @@ def test_finished_ids_are_forgotten_at_their_deadline():
         scene.answer(n)
     scene.clock.now += 1.0
     scene.responder.tick()
-    assert scene.responder.remembered == 0
+    assert len(scene.responder.known) == 0
 
 
 def test_the_number_of_ids_is_bounded():
@@ -435,7 +435,7 @@ def test_the_number_of_ids_is_bounded():
     for n in range(100):
         scene.ask(n.to_bytes(16, "big"))
         scene.answer(n)
-    assert scene.responder.remembered <= 10 + 100
+    assert len(scene.responder.known) <= 10 + 100
 
 
 def test_what_waits_and_is_no_longer_wanted_is_dropped_and_counted():
