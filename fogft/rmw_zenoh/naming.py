@@ -33,26 +33,19 @@ _ATTACHMENT_BYTES = (32, 33)  # without, and with, a byte that says how long the
 
 @dataclass(frozen=True)
 class Token:
-    """A liveliness token of a node, or of a service's server or client.
-
-    Attributes:
-        node_id, id: Numbers of the node and of the entity in its session.
-        kind: `NODE`, `SERVER` or `CLIENT`.
-        service, type, hash: Empty for a node; the type as ``package/srv/Name``.
-        quality: Quality of service, as `rmw_zenoh` writes it.
-    """
+    """A liveliness token of a node, or of a service's server or client."""
 
     domain: int
     session: str
-    node_id: str
-    id: str
-    kind: str
+    node_id: str  # number of the node in its session
+    id: str  # number of the entity in its session
+    kind: str  # `NODE`, `SERVER` or `CLIENT`
     node: str
     namespace: str = "/"
-    service: str = ""
-    type: str = ""
+    service: str = ""  # this and what follows: empty for a node
+    type: str = ""  # ``package/srv/Name``
     hash: str = ""
-    quality: str = KEEP_ALL
+    quality: str = KEEP_ALL  # as `rmw_zenoh` writes it
 
     def __str__(self) -> str:
         parts = [ROOT, str(self.domain), self.session, self.node_id, self.id, self.kind]

@@ -32,11 +32,7 @@ _COPIES_LIMIT = 8  # of one request that wait for its answer: links that were op
 
 
 class Forwarder:
-    """Forwards requests, and each answer to all that await it; at most `of_one` per robot.
-
-    Attributes:
-        joined: Copies of requests that were known.
-    """
+    """Forwards requests, and each answer to all that await it."""
 
     held_limit = 2048  # requests under way at once; more are refused as overloaded
     of_one_limit = 512  # the same for one robot: nobody takes all the room
@@ -53,7 +49,7 @@ class Forwarder:
         self._by_robot: Counter[str] = Counter()
         self._queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
-        self.joined = 0
+        self.joined = 0  # copies of requests that were known
         self.refused: Counter[Refusal] = Counter()
 
     def start(self) -> None:

@@ -24,9 +24,6 @@ class KnownRequests:
         kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
         kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
         held_bytes: Of the requests of open jobs.
-
-    Attributes:
-        held, large: How many jobs are open, and the bound of their bytes.
     """
 
     def __init__(self, kept_bytes: int, kept_ids: int, held_bytes: int) -> None:
@@ -37,7 +34,7 @@ class KnownRequests:
         self._deadlines: list[tuple[float, bytes]] = []  # a heap
         self._kept: OrderedDict[bytes, Job] = OrderedDict()
         self._kept_bytes = 0
-        self.held = 0
+        self.held = 0  # how many jobs are open
         self.large = ByteLimit(held_bytes)
 
     def __len__(self) -> int:

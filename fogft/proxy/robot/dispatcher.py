@@ -60,10 +60,6 @@ class Dispatcher:
         empty_response: The serialised default response, for ``on_timeout: empty``.
         max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
         id_of: Gives a caller's request its id, by service and handle.
-
-    Attributes:
-        leaving: Whether callers' requests are left to another proxy, which gets them too.
-        taken: The callers' requests that were taken, once another proxy may get them too.
     """
 
     def __init__(
@@ -82,8 +78,8 @@ class Dispatcher:
         id_of: Callable[[str, Any], bytes] = lambda service, handle: os.urandom(REQUEST_ID_BYTES),
     ) -> None:
         self._id_of = id_of
-        self.leaving = False
-        self.taken: list[bytes] | None = None
+        self.leaving = False  # callers' requests are left to another proxy, which gets them too
+        self.taken: list[bytes] | None = None  # those taken, once another proxy may get them too
         self._fault_of = fault_of
         self._malformed: Counter[int] = Counter()
         self._ok_of = ok_of

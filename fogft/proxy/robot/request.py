@@ -20,15 +20,10 @@ _TRACE_KEPT = 20_000  # lines until they are written, once a second
 
 
 class RequestTrace(NamedTuple):
-    """The replicas asked for a traced request. Times on the dispatcher's clock, in seconds.
+    """The replicas asked for a traced request. Times on the dispatcher's clock, in seconds."""
 
-    Attributes:
-        asked: Each replica that took it, with the moment when it was asked first.
-        refused: Each replica that refused it, with its last reason.
-    """
-
-    asked: dict[int, float]
-    refused: dict[int, Refusal]
+    asked: dict[int, float]  # each replica that took it, and when it was asked first
+    refused: dict[int, Refusal]  # each replica that refused it, and its last reason
 
 
 class Request:

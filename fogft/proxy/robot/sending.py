@@ -21,12 +21,7 @@ from fogft.requests.load import Handling
 
 
 class Sender:
-    """Sends one service's requests.
-
-    Attributes:
-        links: Those that may be asked, by replica.
-        able: The replicas that the policy may choose.
-    """
+    """Sends one service's requests."""
 
     def __init__(self, ledger: Ledger) -> None:
         self._ledger = ledger
@@ -35,8 +30,8 @@ class Sender:
         self._sending = threading.Lock()  # what replicas must have leaves in its order
         self._in_burst = False
         self._hanging: set[int] = set()
-        self.links: dict[int, Link] = {}
-        self.able: tuple[int, ...] = ()
+        self.links: dict[int, Link] = {}  # those that may be asked, by replica
+        self.able: tuple[int, ...] = ()  # the replicas that the policy may choose
 
     def burst(self, begins: bool) -> None:
         """Batch what is sent until the burst ends into few messages."""

@@ -47,24 +47,16 @@ class Probing(Enum):
 
 
 class ClientPace:
-    """One client.
-
-    Attributes:
-        waiting: Responses that may not be sent yet: handle, bytes, since when.
-        untaken: Numbers of its responses that it may not have taken, oldest first.
-        probed_at: When the oldest probe was sent that is not answered; None for none.
-        finding_until: Until when discovery is given to find it; None where it has.
-        find_again_at: When to try again.
-        ask_again_at: When to look again whether its node answers probes.
-    """
+    """One client."""
 
     def __init__(self, now: float, sent: int) -> None:
-        self.waiting: deque[tuple[Any, bytes, float]] = deque()
-        self.untaken: deque[int] = deque()
+        self.waiting: deque[tuple[Any, bytes, float]] = deque()  # handle, response, since when
+        self.untaken: deque[int] = deque()  # numbers of its responses, oldest first
         self.probing = Probing.UNASKED
-        self.probed_at: float | None = None
-        self.finding_until: float | None = None
-        self.find_again_at = self.ask_again_at = now
+        self.probed_at: float | None = None  # the oldest probe that is not answered
+        self.finding_until: float | None = None  # None where discovery has found it
+        self.find_again_at = now
+        self.ask_again_at = now  # whether its node answers probes
         self.asked_at = now
         self._probes: deque[int] = deque()  # the last response before each that is not answered
         self._probe_again_at = now
