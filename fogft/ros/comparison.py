@@ -42,17 +42,18 @@ class Comparison:
         """Return the message. Raises Unreadable."""
         return from_bytes(payload, self._response)
 
-    def agree(self, one: Any, other: Any) -> bool:
-        """Whether two messages are the same, within the tolerances. NaN agrees with NaN."""
-        return self._same(one, other, "")
+    def agree(self, one: Any, other: Any, path: str = "") -> bool:
+        """Whether two messages, or parts at a path, are the same within the tolerances.
 
-    def _same(self, one: Any, other: Any, path: str) -> bool:
+        NaN agrees with NaN.
+        """
         if isinstance(one, float):
-            return _close(one, other, self._tolerances.get(path, 0.0))
+            close = abs(one - other) <= self._tolerances.get(path, 0.0)
+            return one == other or close or (math.isnan(one) and math.isnan(other))
         if hasattr(one, "get_fields_and_field_types"):
             prefix = f"{path}." if path else ""
             return all(
-                self._same(getattr(one, name), getattr(other, name), prefix + name)
+                self.agree(getattr(one, name), getattr(other, name), prefix + name)
                 for name in one.get_fields_and_field_types()
             )
         if isinstance(one, (str, bytes, bool, int)):
@@ -66,15 +67,11 @@ class Comparison:
             kind = getattr(one, "typecode", None) or one.dtype.kind
             if kind not in "fd":
                 return False
-        return all(self._same(_plain(a), _plain(b), path) for a, b in zip(one, other, strict=True))
+        return all(self.agree(_plain(a), _plain(b), path) for a, b in zip(one, other, strict=True))
 
 
 def _plain(value: Any) -> Any:
     return value.item() if hasattr(value, "item") else value
-
-
-def _close(one: float, other: float, tolerance: float) -> bool:
-    return one == other or abs(one - other) <= tolerance or (math.isnan(one) and math.isnan(other))
 
 
 def _check_float(message_type: Any, type_name: str, path: str) -> None:

@@ -82,7 +82,11 @@ class _Gateway:
         self._forwarder = Forwarder()
         dialer = make_dialer(config)
         self._proxy = ClientProxy(config.pool_uid, None, dialer, self._make_dispatcher)
-        self._services = tuple(_passed_on(service) for service in config.services)
+        # What its caller gets is the robot's to say.
+        self._services = tuple(
+            replace(service, on_timeout=OnTimeout.SILENT, fallback=None)
+            for service in config.services
+        )
         self._proxy.serve(self._services)
         self._following = Following(config)
         self._revoked: frozenset[str] = frozenset()
@@ -211,11 +215,6 @@ class _Gateway:
             self._listener.close()
         self._following.close()
         self._proxy.close()
-
-
-def _passed_on(service: ServiceSpec) -> ServiceSpec:
-    """Return a service's policy as a gateway follows it: what its caller gets is the robot's."""
-    return replace(service, on_timeout=OnTimeout.SILENT, fallback=None)
 
 
 def _ok_of(type_name: str) -> Callable[[str], Callable[[bytes], bool]]:

@@ -154,7 +154,14 @@ class Responder:
                 answer = None
                 reason, displaced = self._reason_to_refuse(incoming, now)
                 if reason is None:
-                    begun = self._accept(incoming, now)
+                    job = Job(now, incoming)
+                    queue = self._queues[job.service]
+                    self.known.add(job)
+                    if queue.takes(job):
+                        queue.begin(job, now)
+                        begun = job
+                    else:
+                        queue.put(job)
         if displaced is not None:
             self._end(displaced.id, Refusal.OVERLOADED)
         if begun is not None:
@@ -163,21 +170,10 @@ class Responder:
         elif answer is not None:
             incoming.reply(answer)
         elif reason is not None:
-            queue = self._queues.get(incoming.service)
-            incoming.refuse(reason, load=None if queue is None else queue.load(0.0))
+            asked = self._queues.get(incoming.service)
+            incoming.refuse(reason, load=None if asked is None else asked.load(0.0))
         else:
             self._pass_on(incoming.service)
-
-    def _accept(self, incoming: Incoming, now: float) -> Job | None:
-        """Take a request; return it where it is to be passed on at once."""
-        job = Job(now, incoming)
-        queue = self._queues[job.service]
-        self.known.add(job)
-        if queue.takes(job):
-            queue.begin(job, now)
-            return job
-        queue.put(job)
-        return None
 
     def _queue(self, service: str) -> ServiceQueue:
         queue = self._queues.get(service)
@@ -294,20 +290,16 @@ class Responder:
                 else:
                     incoming.reply(payload, load=load, more=more)
         finally:
-            self._over(job, queue, now, wasted=not waiting or job.unwanted)
+            with self._lock:  # after the replies: these cannot wait
+                queue.finished(job, now)
+                self.ran_s += now - job.begun
+                if not waiting or job.unwanted:
+                    self.wasted += 1
+                    self.wasted_s += now - job.begun
+            if queue:
+                self._pass_on(job.service)
             if self._answered is not None:
                 self._answered(job, now)
-
-    def _over(self, job: Job, queue: ServiceQueue, now: float, *, wasted: bool) -> None:
-        """Give the room of finished work to what waits. After its replies: these cannot wait."""
-        with self._lock:
-            queue.finished(job, now)
-            self.ran_s += now - job.begun
-            if wasted:
-                self.wasted += 1
-                self.wasted_s += now - job.begun
-        if queue:
-            self._pass_on(job.service)
 
     def _end(self, id: bytes, reason: Refusal) -> None:
         """End a job without an answer: a copy that comes later may be run anew."""
