@@ -14,16 +14,22 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 from fogft.model.refusal import Refusal
 
 Accepts = Callable[[bytes], bool]
-T = TypeVar("T")
+
+
+class Trace(NamedTuple):
+    """The replicas asked for a traced request. Moments are monotonic seconds."""
+
+    asked: dict[int, float]  # each replica that took it, and when it was asked first
+    refused: dict[int, Refusal]  # each replica that refused it, and its last reason
 
 
 @dataclass
-class Pending(Generic[T]):
+class Pending:
     """A request that awaits its answer. Moments are monotonic seconds.
 
     `deaths` counts how often a service died while it worked on this: those that died together over
@@ -31,7 +37,9 @@ class Pending(Generic[T]):
     """
 
     deadline: float
-    item: T  # what the caller keeps with it (payload, handle)
+    payload: bytes
+    handle: Any  # of its caller
+    arrived: float
     open: dict[int, float] = field(default_factory=dict)  # who works on it, and since when
     barred: set[int] = field(default_factory=set)  # replicas that must not be asked again
     failures: dict[int, int] = field(default_factory=dict)  # those that count, by replica
@@ -42,6 +50,7 @@ class Pending(Generic[T]):
     alone_at: set[int] = field(default_factory=set)  # who got it with nothing beside it since
     alone_until: float = 0.0  # then another one is asked: half of the time left is over
     died_at: set[int] = field(default_factory=set)  # replicas where services died over it
+    trace: Trace | None = None
 
 
 class Means(Enum):
@@ -91,7 +100,7 @@ class Decide:
     def __init__(self, accepts: Accepts | None = None) -> None:
         self.accepts = accepts
 
-    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+    def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         """Note a new request, and the replicas that can answer it."""
 
     def read(self, payload: bytes) -> Any:
@@ -99,17 +108,17 @@ class Decide:
         return self.accepts is None or self.accepts(payload)
 
     def judge(
-        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
         """Return what an answer means."""
         return Means.SUCCESS if reading else Means.REJECTION
 
     def refused(
-        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending | None
     ) -> None:
         """Note that an attempt was refused or lost."""
 
-    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+    def closed(self, request: bytes, pending: Pending) -> None:
         """Note that a request has ended in any way."""
 
     def hears_out(self, request: bytes) -> bool:

@@ -8,15 +8,12 @@ Law: a request is handed to the fallback at most once, and ends exactly once.
 
 from __future__ import annotations
 
-from typing import Generic, TypeVar
-
 from fogft.model.choices import FallbackSpec
+from fogft.requests.decide import Pending
 from fogft.requests.load import NEVER
 
-T = TypeVar("T")
 
-
-class FallbackTimer(Generic[T]):
+class FallbackTimer:
     """The requests of one service that the fallback may have to answer."""
 
     def __init__(self, spec: FallbackSpec) -> None:
@@ -24,7 +21,7 @@ class FallbackTimer(Generic[T]):
         self._arrived: dict[bytes, float] = {}  # not handed over yet, oldest first
         self._handed: set[bytes] = set()
         self.failed = self._handed.discard  # it could not be asked: once more at the deadline
-        self._awaited: dict[bytes, tuple[float, T]] = {}  # past the deadline: until when
+        self._awaited: dict[bytes, tuple[float, Pending]] = {}  # past the deadline: until when
 
     def __len__(self) -> int:
         """Count the requests past their deadline whose fallback is awaited."""
@@ -57,7 +54,7 @@ class FallbackTimer(Generic[T]):
         self._arrived.pop(request, None)
         self._handed.discard(request)
 
-    def expired(self, request: bytes, item: T, now: float) -> bool:
+    def expired(self, request: bytes, item: Pending, now: float) -> bool:
         """Note the deadline: only the fallback counts now; return whether it is still needed."""
         must_ask = request not in self._handed
         self._arrived.pop(request, None)
@@ -65,13 +62,13 @@ class FallbackTimer(Generic[T]):
         self._awaited[request] = (now + self.spec.limit_s, item)
         return must_ask
 
-    def answered(self, request: bytes) -> T | None:
+    def answered(self, request: bytes) -> Pending | None:
         """Note the fallback's answer; return the item of a request past its deadline, once."""
         self._handed.discard(request)
         found = self._awaited.pop(request, None)
         return None if found is None else found[1]
 
-    def given_up(self, now: float) -> list[tuple[bytes, T]]:
+    def given_up(self, now: float) -> list[tuple[bytes, Pending]]:
         """Remove and return the requests whose fallback was too slow as well."""
         over = [(r, item) for r, (until, item) in self._awaited.items() if until <= now]
         for request, _ in over:

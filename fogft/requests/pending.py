@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any
 
 from fogft.model.refusal import Effect, Refusal
 from fogft.requests.alarms import Alarms
@@ -26,12 +26,6 @@ from fogft.requests.choose import Choose
 from fogft.requests.decide import Decide, Judgement, Means, Pending
 from fogft.requests.fallback import FallbackTimer
 from fogft.requests.load import NEVER, Load
-
-
-class Item(Protocol):
-    """The interface of an item kept with a request."""
-
-    payload: bytes
 
 
 class Verdict(Enum):
@@ -44,8 +38,7 @@ class Verdict(Enum):
     POISON = "poison"  # services died over it: it is not to be sent again
 
 
-T = TypeVar("T", bound=Item)
-Judged = tuple[Judgement, Pending[T] | None, Iterable[int], Verdict]
+Judged = tuple[Judgement, Pending | None, Iterable[int], Verdict]
 
 ATTEMPTS = 3  # that one replica may fail of one request, before it is barred from it
 RETRY_FIRST_S = 0.02
@@ -58,7 +51,7 @@ _LOOK_AGAIN_S = 0.02  # at a request for which nobody says when
 _NO_WAIT = (0.0, RETRY_FIRST_S / 2)
 
 
-class PendingRequests(Generic[T]):
+class PendingRequests:
     """The unanswered requests of one service.
 
     With `counts_deaths` a request may be blamed for the death of a service that has it.
@@ -68,9 +61,9 @@ class PendingRequests(Generic[T]):
         self.held_bytes = 0  # of all payloads together
         self.choose = choose
         self.decide = decide
-        self.fallback: FallbackTimer[Pending[T]] | None = None
+        self.fallback: FallbackTimer | None = None
         self.soonest_deadline = NEVER  # of the requests, or sooner
-        self._pending: dict[bytes, Pending[T]] = {}
+        self._pending: dict[bytes, Pending] = {}
         # Those that some replica may have to be asked for, as far as is known, and from when on.
         self._short: dict[bytes, float] = {}
         self._counts_deaths = counts_deaths
@@ -83,7 +76,7 @@ class PendingRequests(Generic[T]):
     def __contains__(self, request: bytes) -> bool:
         return request in self._pending
 
-    def get(self, request: bytes | None) -> Pending[T] | None:
+    def get(self, request: bytes | None) -> Pending | None:
         """Return an unanswered request."""
         return None if request is None else self._pending.get(request)
 
@@ -95,7 +88,14 @@ class PendingRequests(Generic[T]):
     # -- a request begins, and is sent to replicas ----------------------------------------
 
     def begin(
-        self, request: bytes, item: T, able: Sequence[int], *, deadline: float, now: float
+        self,
+        request: bytes,
+        payload: bytes,
+        able: Sequence[int],
+        *,
+        deadline: float,
+        now: float,
+        handle: Any = None,
     ) -> Sequence[int]:
         """Add a request; return the replicas it goes to at once. Raises ValueError: it is there."""
         if request in self._pending:
@@ -104,11 +104,12 @@ class PendingRequests(Generic[T]):
         if len(chosen) == len(able) > 1 and now < self._cautious_until:
             *chosen, spared = chosen
             self.choose.declined(request, spared, full=False)
-        pending = self._pending[request] = Pending(deadline, item, dict.fromkeys(chosen, now))
+        started = dict.fromkeys(chosen, now)
+        pending = self._pending[request] = Pending(deadline, payload, handle, now, started)
         self.soonest_deadline = min(self.soonest_deadline, deadline)
         if not chosen or len(chosen) < len(able):
             self._short[request] = 0.0
-        self.held_bytes += len(item.payload)
+        self.held_bytes += len(payload)
         self.decide.began(request, pending, able)
         return chosen
 
@@ -167,7 +168,7 @@ class PendingRequests(Generic[T]):
         chosen = self.choose.more(request, pending.open, candidates, now)[:room]
         return chosen, self.choose.look_at if self.choose.look_at < NEVER else now
 
-    def attempt(self, request: bytes, replica: int, now: float) -> Pending[T] | None:
+    def attempt(self, request: bytes, replica: int, now: float) -> Pending | None:
         """Add a further attempt; None if it is no longer wanted."""
         pending = self._pending.get(request)
         if pending is None or replica in pending.open or replica in pending.barred:
@@ -200,10 +201,10 @@ class PendingRequests(Generic[T]):
         for replica in replicas:
             self.choose.forget(replica)
 
-    def welcome(self, replica: int, about: Callable[[T], bool]) -> None:
+    def welcome(self, replica: int, about: Callable[[bytes], bool]) -> None:
         """Note that a replica restarted the subject of some requests: its answers are void."""
         for request, pending in self._pending.items():
-            if about(pending.item):
+            if about(pending.payload):
                 pending.barred.discard(replica)
                 pending.failures.pop(replica, None)
                 pending.waits.pop(replica, None)
@@ -221,7 +222,7 @@ class PendingRequests(Generic[T]):
         reading: Any,
         load: Load | None,
         now: float,
-    ) -> Judged[T]:
+    ) -> Judged:
         """Take an answer about `request`; None for no request.
 
         Returns:
@@ -284,7 +285,7 @@ class PendingRequests(Generic[T]):
     def _failed(
         self,
         request: bytes,
-        pending: Pending[T] | None,
+        pending: Pending | None,
         replica: int,
         now: float,
         *,
@@ -304,7 +305,7 @@ class PendingRequests(Generic[T]):
             pending.barred.add(replica)
         return self._ended(request, pending, replica)
 
-    def _ended(self, request: bytes, pending: Pending[T], replica: int) -> Verdict:
+    def _ended(self, request: bytes, pending: Pending, replica: int) -> Verdict:
         del pending.open[replica]
         self._short[request] = 0.0
         return Verdict.WAIT if pending.open else Verdict.IDLE
@@ -316,7 +317,7 @@ class PendingRequests(Generic[T]):
         found = ((request, self._pending[request]) for request in self._short)
         return [r for r, pending in found if pending.rejection is not None and not pending.open]
 
-    def settle(self, request: bytes, able: Iterable[int]) -> Pending[T] | None:
+    def settle(self, request: bytes, able: Iterable[int]) -> Pending | None:
         """Remove a request that is answered by its rejection, as no other replica can be asked."""
         pending = self._pending.get(request)
         if pending is None or pending.open or pending.rejection is None:
@@ -326,7 +327,7 @@ class PendingRequests(Generic[T]):
         self._close(request, pending)
         return pending
 
-    def stop(self, request: bytes, now: float) -> Pending[T] | None:
+    def stop(self, request: bytes, now: float) -> Pending | None:
         """Remove a request that its caller cancelled."""
         pending = self._pending.get(request)
         if pending is not None:
@@ -334,7 +335,7 @@ class PendingRequests(Generic[T]):
             self._close(request, pending)
         return pending
 
-    def expire(self, now: float) -> list[tuple[bytes, Pending[T]]]:
+    def expire(self, now: float) -> list[tuple[bytes, Pending]]:
         """Remove and return every request past its deadline, oldest first."""
         if now < self.soonest_deadline:
             return []
@@ -346,7 +347,7 @@ class PendingRequests(Generic[T]):
         self.soonest_deadline = min(left, default=NEVER)
         return expired
 
-    def give_up(self, request: bytes, now: float) -> Pending[T] | None:
+    def give_up(self, request: bytes, now: float) -> Pending | None:
         """Remove a request that no replica may get any more; the fallback still may."""
         pending = self._pending.get(request)
         if pending is not None:
@@ -357,7 +358,7 @@ class PendingRequests(Generic[T]):
 
     def fallback_answered(
         self, request: bytes, now: float, *, ok: bool
-    ) -> tuple[Pending[T] | None, bool]:
+    ) -> tuple[Pending | None, bool]:
         """Take the fallback's answer; return the request it ends, and whether that was overdue."""
         assert self.fallback is not None
         overdue = self.fallback.answered(request)
@@ -368,13 +369,13 @@ class PendingRequests(Generic[T]):
             return None, False
         return self.stop(request, now), False
 
-    def _close(self, request: bytes, pending: Pending[T]) -> None:
+    def _close(self, request: bytes, pending: Pending) -> None:
         self._take_out(request, pending)
         if self.fallback is not None:
             self.fallback.ended(request)
 
-    def _take_out(self, request: bytes, pending: Pending[T]) -> None:
+    def _take_out(self, request: bytes, pending: Pending) -> None:
         del self._pending[request]
         self._short.pop(request, None)
-        self.held_bytes -= len(pending.item.payload)
+        self.held_bytes -= len(pending.payload)
         self.decide.closed(request, pending)

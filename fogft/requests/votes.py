@@ -51,7 +51,7 @@ class Quorum(Decide):
         return self._read(payload)
 
     def judge(
-        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
         """Take a vote; it is a success if it completes a quorum."""
         if pending is None and id not in self._final:
@@ -90,7 +90,7 @@ class Quorum(Decide):
                 self.flagged.add(replica)
                 self._newly_flagged(replica, self.disagreed[replica])
 
-    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+    def closed(self, request: bytes, pending: Pending) -> None:
         """Forget the votes on a request without a quorum."""
         self._open.pop(request, None)
 

@@ -36,7 +36,7 @@ CARRY = {
 }
 # Who keeps it, or judges it, and gives it to nobody.
 KEEP = {
-    *("proxy.robot.request", "requests.pending", "requests.decide"),
+    *("requests.pending", "requests.decide"),
     *("link.window", "link.socket_progress", "link.compression"),
     *("proxy.replica.service_queue", "proxy.replica.known_requests"),
 }
@@ -63,8 +63,7 @@ class Watch:
             return QUESTION in value or ANSWER in value
         if isinstance(value, (tuple, list)):
             return any(map(self._holds, value[:4]))
-        item = getattr(value, "item", value) if type(value).__name__ == "Pending" else value
-        held = getattr(item, "payload", None) if type(item).__module__ != "builtins" else None
+        held = getattr(value, "payload", None) if type(value).__module__ != "builtins" else None
         return isinstance(held, bytes) and self._holds(held)
 
 

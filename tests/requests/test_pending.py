@@ -6,7 +6,6 @@ Every step keeps the table, the policy and the decision together.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import pytest
@@ -34,11 +33,6 @@ B = b"b" * 16
 OK, NO = b"ok", b"no"
 
 
-@dataclass
-class Item:
-    payload: bytes
-
-
 class Spy(Decide):
     """Notes what it is told; only `OK` is a success."""
 
@@ -54,14 +48,14 @@ class Spy(Decide):
         self.ended.append(request)
 
 
-def made(able: Sequence[int] = (1, 2)) -> tuple[PendingRequests[Item], Spy]:
+def made(able: Sequence[int] = (1, 2)) -> tuple[PendingRequests, Spy]:
     spy = Spy()
-    requests: PendingRequests[Item] = PendingRequests(All(), spy)
-    requests.begin(A, Item(b"question"), able, deadline=10.0, now=0.0)
+    requests = PendingRequests(All(), spy)
+    requests.begin(A, b"question", able, deadline=10.0, now=0.0)
     return requests, spy
 
 
-def answer(requests: PendingRequests[Item], replica: int, payload: bytes, now: float = 1.0):
+def answer(requests: PendingRequests, replica: int, payload: bytes, now: float = 1.0):
     reading = requests.decide.read(payload)
     return requests.answered(A, A, replica, payload, reading, None, now)
 
@@ -117,10 +111,10 @@ def test_the_fallback_ends_a_request_once():
     assert answer(requests, 1, OK)[1] is None
 
 
-def wolf(requests: PendingRequests[Item], number: int, now: float) -> int:
+def wolf(requests: PendingRequests, number: int, now: float) -> int:
     """Have replica 0 say that its service died over a request, and 1 answer it; return deaths."""
     id = bytes([number]) * 16
-    requests.begin(id, Item(b"x"), (0, 1), deadline=9999.0, now=now)
+    requests.begin(id, b"x", (0, 1), deadline=9999.0, now=now)
     for replica in (0, 1):
         requests.attempt(id, replica, now)
     requests.refused(id, 0, Refusal.CRASHED, now)
@@ -131,10 +125,10 @@ def wolf(requests: PendingRequests[Item], number: int, now: float) -> int:
 
 def test_who_cries_wolf_is_not_believed():
     """A replica whose service dies over all that others answer has nothing run alone, for long."""
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
     deaths = [wolf(requests, n, n * ALARM_S) for n in range(FALSE_ALARMS + 2)]
     assert deaths == [1] * FALSE_ALARMS + [0, 0]
-    requests.begin(A, Item(b"x"), (0, 1), deadline=99.0, now=0.0)
+    requests.begin(A, b"x", (0, 1), deadline=99.0, now=0.0)
     requests.attempt(A, 1, 0.0)
     requests.refused(A, 1, Refusal.CRASHED, 1.0)
     assert requests.get(A).deaths == 1, "the other one is"
@@ -143,16 +137,16 @@ def test_who_cries_wolf_is_not_believed():
 
 def test_one_death_over_many_requests_is_one_alarm():
     """All that a service had ends with it: that others answer most of it makes nobody a liar."""
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
     assert [wolf(requests, n, 0.0) for n in range(100)] == [1] * 100
 
 
 def test_a_replica_whose_service_was_really_killed_is_believed_the_next_time():
     """A request that kills, found out each time, among innocent ones that others answer."""
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
     for n in range(3 * FALSE_ALARMS):
         now = 2 * n * ALARM_S
-        requests.begin(A, Item(b"x"), (0, 1), deadline=9999.0, now=now)
+        requests.begin(A, b"x", (0, 1), deadline=9999.0, now=now)
         requests.attempt(A, 0, now)
         requests.refused(A, 0, Refusal.CRASHED, now)
         assert wolf(requests, n, now) == 1
@@ -161,8 +155,8 @@ def test_a_replica_whose_service_was_really_killed_is_believed_the_next_time():
 
 def test_a_suspect_whose_replica_says_nothing_is_asked_of_another_in_time():
     """It may be innocent, and its answer or its replica lost: half of the time left is enough."""
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
-    requests.begin(A, Item(b"x"), (0, 1, 2), deadline=80.0, now=0.0)
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests.begin(A, b"x", (0, 1, 2), deadline=80.0, now=0.0)
     for replica in (0, 1, 2):
         requests.refused(A, replica, Refusal.CRASHED, 0.0)
     at, asked_at = 1.0, list[float]()
@@ -177,8 +171,8 @@ def test_a_suspect_whose_replica_says_nothing_is_asked_of_another_in_time():
 
 
 def test_copies_that_others_work_on_are_none_more_for_a_death():
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy(), counts_deaths=True)
-    requests.begin(A, Item(b"x"), (0, 1), deadline=80.0, now=0.0)
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests.begin(A, b"x", (0, 1), deadline=80.0, now=0.0)
     requests.refused(A, 0, Refusal.CRASHED, 0.0)
     assert asked(requests, 0, 1, 2, now=39.0) == []
     assert len(asked(requests, 0, 1, 2, now=40.0)) == 1
@@ -187,12 +181,12 @@ def test_copies_that_others_work_on_are_none_more_for_a_death():
 # -- first response ---------------------------------------------------------------------------
 
 
-def won(requests: PendingRequests[Item], request: bytes, replica: int, now: float) -> bool:
+def won(requests: PendingRequests, request: bytes, replica: int, now: float) -> bool:
     """Have a replica answer well; return whether its answer is the caller's."""
     return requests.answered(request, request, replica, OK, True, None, now)[1] is not None
 
 
-def asked(requests: PendingRequests[Item], *able: int, now: float = 0.0) -> list[int]:
+def asked(requests: PendingRequests, *able: int, now: float = 0.0) -> list[int]:
     """Return which of these replicas request A goes to now, beside those that have it."""
     return [replica for id, replica in requests.more(able, now, newest_first=False) if id == A]
 
@@ -218,7 +212,7 @@ def test_an_answer_to_an_unknown_request_is_late():
 def test_the_same_id_cannot_be_under_way_twice():
     requests, _ = made()
     with pytest.raises(ValueError, match="under way already"):
-        requests.begin(A, Item(b"again"), (1,), deadline=1.0, now=0.0)
+        requests.begin(A, b"again", (1,), deadline=1.0, now=0.0)
     assert (len(requests), requests.held_bytes) == (1, len(b"question"))
 
 
@@ -279,8 +273,8 @@ def test_a_replica_that_declined_may_be_asked_while_another_works_on_the_request
 
 def test_a_replica_that_failed_is_left_alone_longer_each_time():
     """Else a replica whose service is away is asked fifty times a second."""
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
-    requests.begin(A, Item(b""), (1,), deadline=1000.0, now=0.0)
+    requests = PendingRequests(All(), Spy())
+    requests.begin(A, b"", (1,), deadline=1000.0, now=0.0)
     now, waits = 0.0, []
     for _ in range(8):
         requests.refused(A, 1, Refusal.LOST, now)
@@ -311,8 +305,8 @@ class OneFirst(All):
 
 def test_a_request_that_not_all_were_asked_for_is_looked_at_again():
     """A policy that began with one replica wants to be asked about the next."""
-    requests: PendingRequests[Item] = PendingRequests(OneFirst(), Spy())
-    requests.begin(A, Item(b""), (0, 1), deadline=1.0, now=0.5)
+    requests = PendingRequests(OneFirst(), Spy())
+    requests.begin(A, b"", (0, 1), deadline=1.0, now=0.5)
     assert requests.get(A).open == {0: 0.5}
     assert asked(requests, 0, 1, now=0.5) == [1]
 
@@ -326,17 +320,17 @@ def test_every_request_is_put_before_another_policy():
 
 def test_a_shorter_deadline_does_not_wait_for_a_longer_one():
     """The time-out changes with the pool file while requests are under way."""
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
-    requests.begin(A, Item(b"old policy"), (), deadline=100.0, now=0.0)
-    requests.begin(B, Item(b"new policy"), (), deadline=5.0, now=0.0)
+    requests = PendingRequests(All(), Spy())
+    requests.begin(A, b"old policy", (), deadline=100.0, now=0.0)
+    requests.begin(B, b"new policy", (), deadline=5.0, now=0.0)
     assert [request for request, _ in requests.expire(5.0)] == [B]
 
 
 def test_expiry_is_in_order_and_complete():
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
+    requests = PendingRequests(All(), Spy())
     for n in range(5):
-        requests.begin(bytes([n]) * 16, Item(bytes([n])), (), deadline=float(n), now=-1.0)
-    assert [pending.item.payload[0] for _, pending in requests.expire(2.0)] == [0, 1, 2]
+        requests.begin(bytes([n]) * 16, bytes([n]), (), deadline=float(n), now=-1.0)
+    assert [pending.payload[0] for _, pending in requests.expire(2.0)] == [0, 1, 2]
     assert len(requests) == 2
 
 
@@ -348,9 +342,9 @@ def test_expiry_is_in_order_and_complete():
 )
 def test_no_request_is_answered_twice_or_after_its_deadline(answers):
     """Whatever order answers come in, each request has at most one winner, in time."""
-    requests: PendingRequests[Item] = PendingRequests(All(), Spy())
+    requests = PendingRequests(All(), Spy())
     for request in (A, B):
-        requests.begin(request, Item(b""), range(4), deadline=10.0, now=0.0)
+        requests.begin(request, b"", range(4), deadline=10.0, now=0.0)
     winners: list[tuple[bytes, float]] = []
     for request, replica, now, ok in answers:
         if not ok:
@@ -367,7 +361,7 @@ class Requests(RuleBasedStateMachine):
     @initialize()
     def begin(self):
         self.spy = Spy()
-        self.requests: PendingRequests[Item] = PendingRequests(All(), self.spy)
+        self.requests = PendingRequests(All(), self.spy)
         self.now = 0.0
         self.next = 0
         self.open: dict[bytes, float] = {}
@@ -378,7 +372,7 @@ class Requests(RuleBasedStateMachine):
         request = self.next.to_bytes(16, "big")
         self.next += 1
         able, deadline = sorted(replicas), self.now + 5
-        self.requests.begin(request, Item(b"x"), able, deadline=deadline, now=self.now)
+        self.requests.begin(request, b"x", able, deadline=deadline, now=self.now)
         self.open[request] = deadline
 
     @precondition(lambda self: self.next)

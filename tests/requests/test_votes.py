@@ -77,7 +77,7 @@ def test_without_agreement_nobody_is_blamed():
     for number in range(50):
         votes.vote(bytes([number]), 0, 1.0)
         votes.vote(bytes([number]), 1, 2.0)
-        votes.closed(bytes([number]), Pending(0.0, None))
+        votes.closed(bytes([number]), Pending(0.0, b"", None, 0.0))
     assert not votes.flagged
     assert not votes.disagreed
     assert not votes.vote(bytes([0]), 2, 1.0)  # no ballot of it is kept

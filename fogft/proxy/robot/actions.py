@@ -84,8 +84,8 @@ class _CancelPart(Decide):
         self._replicas: Collection[int] = ()
         self._sent: OrderedDict[bytes, tuple[bytes, float]] = OrderedDict()  # goal, until when
 
-    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
-        goal = goals.goal_of(pending.item.payload)
+    def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
+        goal = goals.goal_of(pending.payload)
         if any(goal):  # else it means all goals made by now, and must not come later again
             self._note(request, goal, self._action.clock() + _CANCEL_FOR_S)
 
@@ -95,12 +95,12 @@ class _CancelPart(Decide):
             self._sent.popitem(last=False)
 
     def judge(
-        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
         """Note what a replica has cancelled, of what it was told to: it may name others' goals."""
         if reading:
             asked, _ = self._sent.get(id, (b"", 0.0))
-            several = pending is not None and not goals.names_one(pending.item.payload)
+            several = pending is not None and not goals.names_one(pending.payload)
             with self._action.lock:
                 for goal in goals.cancelled(payload):
                     if several or goal == asked:
@@ -108,7 +108,7 @@ class _CancelPart(Decide):
         return super().judge(id, replica, payload, reading, pending)
 
     def refused(
-        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending | None
     ) -> None:
         self.declined(id, replica, self._action.clock())
 
@@ -157,12 +157,12 @@ class _GoalPart(Decide):
         self._action = action
         self._name = name
 
-    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+    def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         with self._action.lock:
-            self._action.goals.made(pending.item.payload, request, able, pending.deadline)
+            self._action.goals.made(pending.payload, request, able, pending.deadline)
 
     def judge(
-        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
         """Remember who has the goal: before its client can know, and ask for the result."""
         self._took(id, replica, accepts=reading)
@@ -178,16 +178,16 @@ class _GoalPart(Decide):
             action.began(goal, replica)
 
     def refused(
-        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending | None
     ) -> None:
         if refusal is Refusal.MALFORMED:
             self._took(id, replica, accepts=False)
         else:
             self.declined(id, replica, self._action.clock())
 
-    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+    def closed(self, request: bytes, pending: Pending) -> None:
         """Nobody was asked, or has answered: unless it was accepted, the goal is over, too."""
-        goal = goals.goal_of(pending.item.payload)
+        goal = goals.goal_of(pending.payload)
         with self._action.lock:
             if goal not in self._action.goals:
                 self._action.goals.ended(goal)
@@ -243,16 +243,16 @@ class _ResultPart(Decide):
         super().__init__(partial(goals.is_success, Part.RESULT))
         self._action = action
 
-    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+    def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         with self._action.lock:
-            self._action.goals.awaited(goals.goal_of(pending.item.payload))
+            self._action.goals.awaited(goals.goal_of(pending.payload))
 
     def judge(
-        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
         if pending is None:
             return super().judge(id, replica, payload, reading, pending)
-        action, goal = self._action, goals.goal_of(pending.item.payload)
+        action, goal = self._action, goals.goal_of(pending.payload)
         now, unknown = action.clock(), goals.is_unknown(payload)
         with action.lock:
             under_way = goal in action.goals
@@ -268,15 +268,15 @@ class _ResultPart(Decide):
         return Means.WEAKER_REJECTION if weaker else Means.REJECTION
 
     def refused(
-        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending | None
     ) -> None:
         if pending is not None and Effect.GOALS_LOST in refusal.effect:
             with self._action.lock:
-                self._action.goals.lost(goals.goal_of(pending.item.payload), replica)
+                self._action.goals.lost(goals.goal_of(pending.payload), replica)
 
-    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+    def closed(self, request: bytes, pending: Pending) -> None:
         with self._action.lock:
-            self._action.goals.ended(goals.goal_of(pending.item.payload))
+            self._action.goals.ended(goals.goal_of(pending.payload))
 
 
 class Actions:

@@ -16,7 +16,7 @@ from fogft.counters import worth_logging
 from fogft.errors import RosError
 from fogft.metrics.outcomes import Outcome
 from fogft.model.spec import OnTimeout, ServiceSpec
-from fogft.proxy.robot.request import Ledger, Request
+from fogft.proxy.robot.ledger import Ledger
 from fogft.requests.decide import Pending
 from fogft.requests.fallback import FallbackTimer
 from fogft.requests.load import NEVER
@@ -62,21 +62,21 @@ class Delivery:
 
     # -- without the lock -----------------------------------------------------------------
 
-    def give(self, pending: Pending[Request], payload: bytes) -> None:
+    def give(self, pending: Pending, payload: bytes) -> None:
         """Send a response to its caller. A failure affects no other request."""
         try:
-            self._respond(pending.item.handle, payload)
+            self._respond(pending.handle, payload)
         except RosError as error:
             self._warn("undelivered", "response_undelivered", error.message)
 
-    def poisoned(self, request: bytes, pending: Pending[Request]) -> None:
+    def poisoned(self, request: bytes, pending: Pending) -> None:
         """End a request that crashed several services, in the way set for its deadline."""
         self._ledger.outcomes.poisoned_at = time.time()
         empty = self._ledger.spec.on_timeout is OnTimeout.EMPTY
         outcome = Outcome.FALLBACK if self._falls_back else Outcome.POISON
         self._end(request, pending, outcome, self._empty_response if empty else None)
 
-    def expired(self, request: bytes, pending: Pending[Request]) -> None:
+    def expired(self, request: bytes, pending: Pending) -> None:
         """Handle a request's deadline."""
         spec, response = self._ledger.spec, pending.rejection
         if self._falls_back:
@@ -100,7 +100,7 @@ class Delivery:
         return falls_back and self._ledger.requests.fallback is not None
 
     def _end(
-        self, request: bytes, pending: Pending[Request], outcome: Outcome, response: bytes | None
+        self, request: bytes, pending: Pending, outcome: Outcome, response: bytes | None
     ) -> None:
         """End a request that no replica has answered, or leave it to the fallback."""
         if outcome is Outcome.FALLBACK:
@@ -132,7 +132,7 @@ class Delivery:
             self._without_fallback(request, pending)
         return look_at
 
-    def _await_fallback(self, request: bytes, pending: Pending[Request]) -> None:
+    def _await_fallback(self, request: bytes, pending: Pending) -> None:
         """The fallback has the rest of the say; it may have been asked before."""
         timer = self._ledger.requests.fallback
         assert timer is not None
@@ -144,12 +144,12 @@ class Delivery:
             if ours:
                 self._without_fallback(request, pending)
 
-    def _ask(self, request: bytes, pending: Pending[Request]) -> bool:
+    def _ask(self, request: bytes, pending: Pending) -> bool:
         """Call the fallback; return whether it could be called."""
         client = self._client
         try:
             if client is not None and client.available():
-                payload = pending.item.payload
+                payload = pending.payload
                 client.call(payload, lambda response: self._fallback_answered(request, response))
                 return True
             reason = "no node offers it"
@@ -181,7 +181,7 @@ class Delivery:
         if not overdue:
             self._forget(request, tuple(pending.open))
 
-    def _without_fallback(self, request: bytes, pending: Pending[Request]) -> None:
+    def _without_fallback(self, request: bytes, pending: Pending) -> None:
         """The fallback had nothing either: return the rejection if there is one."""
         response = pending.rejection
         with self._ledger.lock:

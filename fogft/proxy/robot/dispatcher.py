@@ -28,11 +28,11 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import HedgingMode, Part, ServiceSpec
 from fogft.proxy.robot.delivery import Delivery, Respond
-from fogft.proxy.robot.request import Ledger, Request
+from fogft.proxy.robot.ledger import Ledger
 from fogft.proxy.robot.sending import Sender, key_of
 from fogft.requests.auto import Auto
 from fogft.requests.choose import All, Choose, Failover
-from fogft.requests.decide import Accepts, Decide, Means
+from fogft.requests.decide import Accepts, Decide, Means, Trace
 from fogft.requests.load import NEVER
 from fogft.requests.pending import PendingRequests, Verdict
 from fogft.ros.port import RosClient
@@ -90,7 +90,7 @@ class Dispatcher:
         self._decide = Decide() if decide is None else decide
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)
-        self._requests: PendingRequests[Request] = PendingRequests(
+        self._requests = PendingRequests(
             policy(spec),
             self._decide,
             # What waits for a goal to end, or has its order, is no work of its own.
@@ -141,11 +141,12 @@ class Dispatcher:
                 self._turn_away(request, len(payload))
                 return False
             links, able = self._sender.links, self._sender.able
-            item = Request(payload, handle, now, traced=outcomes.trace is not None)
             deadline = now + timeout_s
-            chosen = requests.begin(request, item, able, deadline=deadline, now=now)
-            if item.trace is not None:
-                item.trace.asked.update(dict.fromkeys(chosen, now))
+            chosen = requests.begin(
+                request, payload, able, deadline=deadline, now=now, handle=handle
+            )
+            if outcomes.trace is not None and (pending := requests.get(request)) is not None:
+                pending.trace = Trace(dict.fromkeys(chosen, now), {})
             soon = min(requests.choose.look_at, deadline)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
@@ -220,7 +221,7 @@ class Dispatcher:
                 self._sender.forget(request, losers)
                 self._wake(now + _TICK_S)
             with self._lock:
-                outcomes.won(replica, now - pending.item.arrived, len(payload))
+                outcomes.won(replica, now - pending.arrived, len(payload))
                 if outcomes.trace is not None:
                     self._ledger.trace(request, pending, Outcome.ANSWERED, now, replica=id.short)
         elif means is Means.SUCCESS or means is Means.LATE:
@@ -275,8 +276,8 @@ class Dispatcher:
         with self._lock:
             self.outcomes.refusal(refusal, None if request is None else replica)
             pending = self._requests.get(request)
-            if pending is not None and pending.item.trace is not None:
-                pending.item.trace.refused[replica] = refusal
+            if pending is not None and pending.trace is not None:
+                pending.trace.refused[replica] = refusal
             if request is None:
                 return
             verdict = self._requests.refused(request, replica, refusal, now)
@@ -336,7 +337,7 @@ class Dispatcher:
     def began_anew(self, replica: int, about: Callable[[bytes], bool]) -> None:
         """Ask a replica again, because it restarted what some requests are `about`."""
         with self._lock:
-            self._requests.welcome(replica, lambda item: about(item.payload))
+            self._requests.welcome(replica, about)
         self._wake()
 
     def tick(self) -> float:

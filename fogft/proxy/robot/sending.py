@@ -15,7 +15,7 @@ from types import MappingProxyType
 from fogft.link.port import Link
 from fogft.model.choices import Freshness
 from fogft.model.replica import ReplicaId
-from fogft.proxy.robot.request import Ledger
+from fogft.proxy.robot.ledger import Ledger
 from fogft.requests.decide import Reachable
 from fogft.requests.load import Handling
 
@@ -116,13 +116,13 @@ class Sender:
             pending = requests.attempt(request, replica, now)
             if pending is None:
                 return True
-            if pending.item.trace is not None:
-                pending.item.trace.asked.setdefault(replica, now)
+            if pending.trace is not None:
+                pending.trace.asked.setdefault(replica, now)
             handling = Handling.ALONE if pending.deaths else Handling.NORMAL
             if handling is Handling.NORMAL and requests.choose.is_spare(request, replica):
                 handling = Handling.DROP_IF_BUSY
         name, remaining_s = self._ledger.spec.name, pending.deadline - now
-        if not link.offer(name, request, pending.item.payload, remaining_s, handling=handling):
+        if not link.offer(name, request, pending.payload, remaining_s, handling=handling):
             self._declined(request, replica, is_copy=True)
             return False
         self._count(1)
@@ -153,8 +153,8 @@ class Sender:
     def _declined(self, id: bytes, replica: int, *, is_copy: bool) -> None:
         with self._ledger.lock:
             pending = self._ledger.requests.get(id)
-            if pending is not None and pending.item.trace is not None:
-                asked = pending.item.trace.asked
+            if pending is not None and pending.trace is not None:
+                asked = pending.trace.asked
                 if asked.get(replica) == pending.open.get(replica):  # earlier attempts stay
                     asked.pop(replica, None)
             if is_copy:

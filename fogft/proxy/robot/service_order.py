@@ -99,9 +99,9 @@ class ServiceOrder(Decide):
 
     # -- what a caller wants --------------------------------------------------------------
 
-    def began(self, request: bytes, pending: Pending[Any], able: Collection[int]) -> None:
+    def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         """Number a request; it waits if no replica can take it."""
-        payload = pending.item.payload
+        payload = pending.payload
         if self._waiting or not self._number(request, payload):
             self._waiting[request] = payload
 
@@ -112,7 +112,7 @@ class ServiceOrder(Decide):
         self._numbers[request], self._requests[number] = number, request
         return True
 
-    def closed(self, request: bytes, pending: Pending[Any]) -> None:
+    def closed(self, request: bytes, pending: Pending) -> None:
         """Note that nobody waits for this answer any more. Numbered requests are still applied."""
         self._waiting.pop(request, None)
         number = self._numbers.pop(request, None)
@@ -137,7 +137,7 @@ class ServiceOrder(Decide):
         return self._requests.get(number, b"") if epoch == self._term.epoch else b""
 
     def judge(
-        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending[Any] | None
+        self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
         """Take a reply; if it answers a number, store that it is being returned."""
         current = self._current(id)
@@ -159,7 +159,7 @@ class ServiceOrder(Decide):
         return Means.LATE if op is Op.APPLY else Means.NOTHING
 
     def refused(
-        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending[Any] | None
+        self, id: bytes, replica: int, refusal: Refusal, detail: str, pending: Pending | None
     ) -> None:
         """Take a refusal, or the loss of an order."""
         current = self._current(id)
