@@ -239,7 +239,8 @@ def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
     except Exception as error:
         raise RosError(f"`{FILE}={path}` cannot be used: {error}") from error
     settings.to_zenoh({})  # the runtime's own wish, whoever configures the session
-    for key, value in _overrides(environ.get(OVERRIDE, "")):
+    for pair in filter(str.strip, environ.get(OVERRIDE, "").split(";")):
+        key, _, value = map(str.strip, pair.partition("="))
         try:
             made.insert_json5(key, value)
         except Exception as error:
@@ -248,8 +249,3 @@ def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
                 'write `key=value;key=value`, such as `connect/endpoints=["tcp/10.0.0.5:7447"]`',
             ) from error
     return made
-
-
-def _overrides(text: str) -> list[tuple[str, str]]:
-    pairs = [pair.partition("=") for pair in text.split(";") if pair.strip()]
-    return [(key.strip(), value.strip()) for key, _, value in pairs]

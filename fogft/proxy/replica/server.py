@@ -198,7 +198,10 @@ class ServerProxy:
         if ready != self.ready:
             log.info("services_ready replica=%s ready=%s", self._id, sorted(ready))
             self.ready = ready
-        for name in gone | self._replaced():
+        before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
+        # One more server than before has replaced one that died: that stays listed for long.
+        replaced = {n for n, count in self._servers.items() if 0 < before.get(n, 0) < count}
+        for name in gone | replaced:
             log.warning("service_lost replica=%s service=%s", self._id, name)
             if name in self._ordered and self.command.alive:
                 self.command.restart()  # what state it is in, nobody knows
@@ -235,14 +238,6 @@ class ServerProxy:
             return hanging
         plain = {s.name for s in self._offering.services if s.part is Part.NONE}
         return {name: seconds for name, seconds in hanging.items() if name in plain}
-
-    def _replaced(self) -> set[str]:
-        """Return the services that have one more server than before.
-
-        It took the place of one that died: discovery lists the dead one beside it for long.
-        """
-        before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
-        return {name for name, count in self._servers.items() if 0 < before.get(name, 0) < count}
 
     @property
     def complete(self) -> bool:

@@ -122,7 +122,11 @@ class Following:
         if not changed:
             return None
         known = self._known()
-        latest = _latest(self._from_file, known)
+        latest = self._from_file
+        for record in known.of(RecordKind.ADMISSION):
+            admitted = roster.admission(record)
+            if is_newer(admitted, latest):
+                latest = admitted
         if latest is None:
             return None
         slots = known.of(RecordKind.SLOT)
@@ -182,12 +186,3 @@ class Following:
             self._client.close()
         if self.door is not None:
             self.door.close()
-
-
-def _latest(from_file: Membership | None, known: Known) -> Membership | None:
-    latest = from_file
-    for record in known.of(RecordKind.ADMISSION):
-        admitted = roster.admission(record)
-        if is_newer(admitted, latest):
-            latest = admitted
-    return latest

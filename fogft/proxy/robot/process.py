@@ -136,10 +136,6 @@ def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
     return dialer
 
 
-def _replica_disagrees(service: str, replica: int, count: int) -> None:
-    log.error("replica_disagrees service=%s replica=%s count=%d", service, short(replica), count)
-
-
 class _Running:
     """A client proxy that runs, with all that its thread sees to."""
 
@@ -213,10 +209,11 @@ class _Running:
         ok_of = functools.partial(messages.bool_field, spec.type)
         if spec.quorum > 1:
             comparison = Comparison(spec.type, spec.tolerance)
-            flagged = functools.partial(_replica_disagrees, spec.name)
-            return make(
-                decide=Quorum(spec.quorum, comparison.read, comparison.agree, flagged), ok_of=ok_of
-            )
+            decide = Quorum(spec.quorum, comparison.read, comparison.agree, lambda replica, count: log.error(
+                "replica_disagrees service=%s replica=%s count=%d",
+                spec.name, short(replica), count,
+            ))  # fmt: skip
+            return make(decide=decide, ok_of=ok_of)
         return make(ok_of=ok_of)
 
     def _make_visible(self, judge: Callable[[Mapping[str, Any]], str]) -> VisibleNode | None:
