@@ -14,7 +14,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Any
 
 from fogft.errors import RosError
@@ -47,21 +47,18 @@ class VisibleNode:
         self._awake = False
         self._ours = False  # whether we are changing parameters ourselves
         try:
-            self._start(name, context)
+            from rclpy.executors import SingleThreadedExecutor
+
+            self._node: Any = _new_node(name, context)
+            self._executor: Any = SingleThreadedExecutor(context=context)
+            self._executor.add_node(self._node)
+            self._diagnostics: Any = _diagnostics_publisher(self._node)
+            self._node.add_on_set_parameters_callback(self._on_set)
+            self._log = RosLog(self._node.get_logger(), self._wake)
         except Exception as error:
             raise RosError(f"the ROS node `{name}` cannot be created: {error}") from error
         self._thread = threading.Thread(target=self._run, name=f"ros-{name}", daemon=True)
         self._thread.start()
-
-    def _start(self, name: str, context: Any) -> None:
-        from rclpy.executors import SingleThreadedExecutor
-
-        self._node: Any = _new_node(name, context)
-        self._executor: Any = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self._node)
-        self._diagnostics: Any = _diagnostics_publisher(self._node)
-        self._node.add_on_set_parameters_callback(self._on_set)
-        self._log = RosLog(self._node.get_logger(), self._wake)
 
     # -- any thread -----------------------------------------------------------------------
 
@@ -108,13 +105,9 @@ class VisibleNode:
             self._node.destroy_node()
 
     def _work(self) -> None:
-        while True:
+        while not self._queue.empty():
             try:
-                work = self._queue.get_nowait()
-            except Empty:
-                return
-            try:
-                work()
+                self._queue.get()()
             except Exception as error:
                 log.error("visible_node_failed reason=%r", str(error))
 
