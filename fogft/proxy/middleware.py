@@ -13,7 +13,7 @@ import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from fogft.errors import RosError
 from fogft.model.cdr import Shape
@@ -21,11 +21,9 @@ from fogft.model.choices import Speaks
 from fogft.model.type_definition import Definition
 from fogft.process import load_numpy
 from fogft.ros import environment, memory_tuning
+from fogft.ros.joining import EarlyJoin
 from fogft.ros.port import RosNode
-
-if TYPE_CHECKING:
-    from fogft.ros.joining import EarlyJoin
-    from fogft.ros.visible import VisibleNode
+from fogft.ros.visible import VisibleNode
 
 Told = Callable[[], Mapping[str, Sequence[Definition]]]
 Judge = Callable[[Mapping[str, Any]], str]
@@ -59,11 +57,7 @@ def prepare(speaks: Speaks) -> None:
 
 def join_early(speaks: Speaks, name: str, domain_id: int | None) -> EarlyJoin | None:
     """Join the ROS domain before anything is offered. Raises RosError."""
-    if speaks is not Speaks.RCLPY:
-        return None
-    from fogft.ros.joining import EarlyJoin
-
-    return EarlyJoin(f"_{name}_standby", domain_id)
+    return EarlyJoin(f"_{name}_standby", domain_id) if speaks is Speaks.RCLPY else None
 
 
 def load_types(type_names: Sequence[str]) -> None:

@@ -74,10 +74,9 @@ def test_a_node_with_parameters_answers_probes():
 
 def test_it_is_not_known_yet_whose_client_it_is_or_where_its_node_answers():
     graph = Graph()
-    probes = probes_of(graph)
-    assert probes.answers("/detect", b"?" * 16) is None
+    assert probes_of(graph).answers("/detect", b"?" * 16) is None
     graph.client = lambda name, type_name: _missing()
-    assert probes.answers("/detect", CLIENT) is None
+    assert probes_of(graph).answers("/detect", CLIENT) is None
 
 
 def _missing() -> End:

@@ -10,15 +10,13 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fogft.model.spec import ServiceSpec
 from fogft.model.topic import PREFIX
 from fogft.poolfile.policy_parameters import FieldCheck, Policies
 from fogft.ros.port import Level, Status
-
-if TYPE_CHECKING:
-    from fogft.ros.visible import VisibleNode
+from fogft.ros.visible import VisibleNode
 
 WINDOW_S = 30.0
 CREDENTIALS_SOON_S = 3600.0

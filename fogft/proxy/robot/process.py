@@ -45,12 +45,11 @@ from fogft.proxy.robot.order_mark import OrderMark
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning, spdp
-from fogft.ros.joining import Pauses
+from fogft.ros.joining import EarlyJoin, Pauses
+from fogft.ros.visible import VisibleNode
 
 if TYPE_CHECKING:
-    from fogft.ros.joining import EarlyJoin
     from fogft.ros.node import SerialisedNode
-    from fogft.ros.visible import VisibleNode
 
 log = logging.getLogger(__name__)
 

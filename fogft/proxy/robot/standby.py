@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fogft import disk
 from fogft.errors import PoolBusy, StateError
@@ -28,10 +28,7 @@ from fogft.process import Watchdog, notify
 from fogft.proxy import middleware
 from fogft.proxy.robot.client import ClientProxy
 from fogft.records.signing import Signer
-from fogft.ros.joining import Pauses
-
-if TYPE_CHECKING:
-    from fogft.ros.joining import EarlyJoin
+from fogft.ros.joining import EarlyJoin, Pauses
 
 log = logging.getLogger(__name__)
 
