@@ -49,13 +49,6 @@ class Responder:
         passing: Whether a service's answer holds for the moment only: a copy is run anew; None
             where none does.
         answered: Told of each request that the service has answered, and when.
-
-    Attributes:
-        known: What is remembered of requests.
-        ran, ran_s: Requests passed on, and the time until their responses together.
-        joined: Copies of requests that were known.
-        saved, interrupted: Requests dropped unbegun, or told to stop, that nobody wanted any more.
-        wasted, wasted_s: Requests that were run for nobody: too late, or unwanted.
     """
 
     held_limit = 512  # requests held at once; more are refused, from whom has most waiting
@@ -83,8 +76,10 @@ class Responder:
         self._cancel_clients: Mapping[str, RosClient] = {}
         self.known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
         self._queues: dict[str, ServiceQueue] = {}
-        self.ran = self.joined = self.saved = self.interrupted = self.wasted = 0
-        self.ran_s = self.wasted_s = 0.0
+        self.ran, self.ran_s = 0, 0.0  # requests passed on, and the time they took together
+        self.joined = 0  # copies of requests that were known
+        self.saved = self.interrupted = 0  # dropped unbegun, or told to stop: nobody wanted them
+        self.wasted, self.wasted_s = 0, 0.0  # run for nobody: too late, or unwanted
 
     @property
     def at_work(self) -> int:

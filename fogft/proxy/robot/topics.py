@@ -320,7 +320,6 @@ class TopicsOnRobot:
         return any(one.malformed[key] >= MALFORMED_LIMIT for one in self._topics.values())
 
     def __len__(self) -> int:
-        """Return how many pass."""
         return len(self._topics)
 
     def tick(self) -> None:
