@@ -49,9 +49,9 @@ class Token:
 
     def __str__(self) -> str:
         parts = [ROOT, str(self.domain), self.session, self.node_id, self.id, self.kind]
-        parts += ["%", _flat(self.namespace), self.node]
+        parts += ["%", self.namespace.replace("/", "%"), self.node]
         if self.kind != NODE:
-            parts += [_flat(self.service), dds_type(self.type), self.hash, self.quality]
+            parts += [self.service.replace("/", "%"), dds_type(self.type), self.hash, self.quality]
         return "/".join(parts)
 
     @property
@@ -66,7 +66,7 @@ def read_token(key: str) -> Token | None:
     if len(parts) < _NODE_PARTS or parts[0] != ROOT or not parts[1].isdecimal():
         return None
     domain, session, node_id, id, kind = int(parts[1]), *parts[2:6]
-    namespace, node = _deep(parts[7]), parts[8]
+    namespace, node = parts[7].replace("%", "/"), parts[8]
     if kind == NODE:
         return Token(domain, session, node_id, id, kind, node, namespace)
     if kind not in (SERVER, CLIENT) or len(parts) != _SERVICE_PARTS:
@@ -74,7 +74,7 @@ def read_token(key: str) -> Token | None:
     type_name = ros_type(parts[10])
     if not type_name:
         return None
-    service = _deep(parts[9])
+    service = parts[9].replace("%", "/")
     return Token(
         domain, session, node_id, id, kind, node, namespace, service, type_name, *parts[11:]
     )
@@ -128,14 +128,6 @@ def sent_by(of_request: bytes) -> tuple[bytes, int]:
 def may_be_same(one: str, other: str) -> bool:
     """Whether two hashes may be of one definition: equal, or not comparable."""
     return one == other or one.partition("_")[0] != other.partition("_")[0]
-
-
-def _flat(name: str) -> str:
-    return name.replace("/", "%")
-
-
-def _deep(part: str) -> str:
-    return part.replace("%", "/")
 
 
 class Graph:
