@@ -208,10 +208,12 @@ class _Running:
         ok_of = functools.partial(messages.bool_field, spec.type)
         if spec.quorum > 1:
             comparison = Comparison(spec.type, spec.tolerance)
-            decide = Quorum(spec.quorum, comparison.read, comparison.agree, lambda replica, count: log.error(
-                "replica_disagrees service=%s replica=%s count=%d",
-                spec.name, short(replica), count,
-            ))  # fmt: skip
+
+            def flagged(replica: int, count: int) -> None:
+                log.error("replica_disagrees service=%s replica=%s count=%d",
+                          spec.name, short(replica), count)  # fmt: skip
+
+            decide = Quorum(spec.quorum, comparison.read, comparison.agree, flagged)
             return make(decide=decide, ok_of=ok_of)
         return make(ok_of=ok_of)
 
