@@ -171,9 +171,7 @@ class LinkStatus:
 class Link(Protocol):
     """A robot's connection to one replica: own session, own sender thread, bounded window."""
 
-    @property
-    def peer(self) -> Peer:
-        """The replica at the other end."""
+    peer: Peer  # the replica at the other end
 
     @property
     def usable(self) -> bool:

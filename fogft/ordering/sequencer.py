@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.active_version import ActiveVersion
-from fogft.ordering.catching_up import CatchingUp
-from fogft.ordering.log import OrderedLog
+from fogft.ordering.catching_up import CatchingUp, OrderedLog
 from fogft.ordering.orders import START, Op, OrderError, Position, Promise
 from fogft.ordering.peer import Peer, Phase
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from fogft.ordering import catching_up, peer
-from fogft.ordering.log import OrderedLog
+from fogft.ordering.catching_up import OrderedLog
 
 
 @pytest.fixture(params=["wide", "narrow"])

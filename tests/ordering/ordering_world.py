@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fogft.ordering import orders
-from fogft.ordering.log import OrderedLog
+from fogft.ordering.catching_up import OrderedLog
 from fogft.ordering.orders import START
 from fogft.ordering.peer import Order
 from fogft.ordering.replica import OrderedReplica, Refuse

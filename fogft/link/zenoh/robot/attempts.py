@@ -49,9 +49,7 @@ _TELL = OpenAttempt("", b"", None, 0, 0.0, 0.0)
 class Outlet(Protocol):
     """The interface of a connection that attempts use."""
 
-    @property
-    def flow(self) -> FlowWatch:
-        """The kernel's counters of its socket."""
+    flow: FlowWatch  # the kernel's counters of its socket
 
     def publish(self, service: str, content: bytes, header: bytes) -> None:
         """Send a message to a service. May block while the peer does not read."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
@@ -55,14 +55,8 @@ class Silence:
 _TIMEOUT_S = 60.0  # on a thin uplink a probe waits behind what is large
 
 
-@dataclass(frozen=True)
-class Heard:
-    """A probe's answer as it came, and when (monotonic seconds)."""
-
-    connection: Connection
-    content: bytes
-    sent_at: float
-    at: float
+# Over which connection an answer came, its bytes, when its probe was sent, and when it came.
+Heard = tuple["Connection", bytes, float, float]
 
 
 class Probing:
@@ -95,7 +89,7 @@ class Probing:
         self._of_replica.began(now)
 
         def heard(content: bytes) -> None:
-            self._queue.put(Heard(connection, content, now, time.monotonic()))
+            self._queue.put((connection, content, now, time.monotonic()))
             self._came()
 
         connection.probe(self._key, probe_frames.encode_probe(probe), _TIMEOUT_S, heard)
@@ -107,16 +101,17 @@ class Probing:
                 heard = self._queue.get_nowait()
             except Empty:
                 return
-            if heard.connection is connection:
+            if heard[0] is connection:
                 yield heard
 
     def take(self, heard: Heard) -> ProbeAnswer:
         """Take an answer, which ends the silence. Raises WireError: it is not the peer's."""
-        answer = self._read(heard.content)
+        _, content, sent_at, at = heard
+        answer = self._read(content)
         self._of_connection.ended()
         self._of_replica.ended()
-        self.heard_at = heard.at
-        self.rtt_s = heard.at - heard.sent_at
+        self.heard_at = at
+        self.rtt_s = at - sent_at
         self.answer = answer
         return answer
 
