@@ -29,7 +29,7 @@ from fogft.model.replica import LinkState
 from fogft.model.spec import ServiceSpec
 from fogft.requests.load import Handling
 
-_ANSWERED_KEPT = 1024
+_KEPT = 2048
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 
 
@@ -73,8 +73,8 @@ class UplinksLink:
         self._lock = threading.Lock()
         self._attempts: dict[bytes, _Attempt] = {}
         self._again: list[bytes] = []  # on no uplink now
-        self._answered: OrderedDict[bytes, None] = OrderedDict()
-        self._forgotten: OrderedDict[bytes, int] = OrderedDict()  # and how many uplinks may tell
+        # How many uplinks may still tell of the end of a request that was forgotten, or answered.
+        self._may_tell: OrderedDict[bytes, int] = OrderedDict()
         self._current: int | None = None
         self._closed = False
         self._links: list[Link] = []
@@ -164,11 +164,14 @@ class UplinksLink:
             attempt = self._attempts.pop(request_id, None)
             on = tuple(attempt.on) if attempt is not None else ()
             if len(on) > 1:
-                self._forgotten[request_id] = len(on)
-                if len(self._forgotten) > _ANSWERED_KEPT:
-                    self._forgotten.popitem(last=False)
+                self._note(request_id, len(on))
         for index in on:
             self._links[index].forget(request_id)
+
+    def _note(self, request_id: bytes, may_tell: int) -> None:
+        self._may_tell[request_id] = may_tell
+        if len(self._may_tell) > _KEPT:
+            self._may_tell.popitem(last=False)
 
     def flush(self) -> None:
         """Resend requests that lost their uplink, and send cancellations."""
@@ -240,9 +243,7 @@ class UplinksLink:
                 return
             others = tuple(attempt.on)
             if answer.payload is not None and others:
-                self._answered[request_id] = None
-                if len(self._answered) > _ANSWERED_KEPT:
-                    self._answered.popitem(last=False)
+                self._note(request_id, 0)
         for index in others:
             self._links[index].forget(request_id)
         self._events.answered(self, answer)
@@ -251,12 +252,11 @@ class UplinksLink:
         """Report wasted work, once, unless another uplink may tell more."""
         id = answer.request_id
         with self._lock:
-            may_tell = self._forgotten.get(id, 1)
+            may_tell = self._may_tell.get(id, 1)
             waits = answer.refusal is Refusal.CANCELLED and may_tell > 1
-            if id in self._forgotten:
-                self._forgotten[id] = may_tell - 1 if waits else 0
-            told = id in self._answered or may_tell == 0
-        if not told and not waits:
+            if id in self._may_tell:
+                self._may_tell[id] = may_tell - 1 if waits else 0
+        if may_tell and not waits:
             self._events.late(self, answer)
 
     def changed(self, link: Link) -> None:

@@ -101,7 +101,7 @@ class CatchingUp:
 
     def __init__(self, epoch: int, counts: Callable[[int], bool], *, handed_over: bool) -> None:
         self.base: Position | None = None  # None until the term has begun
-        self.log: OrderedLog | None = None
+        self.log = OrderedLog(0)
         self.peers: dict[int, Peer] = {}
         self.donor: int | None = None  # it was asked for a checkpoint
         self._epoch = epoch
@@ -136,12 +136,12 @@ class CatchingUp:
     def begin_at(self, position: Position) -> None:
         """Begin the term from a state."""
         self.base = position
-        self.log = OrderedLog(position.index)
+        self.log.start = position.index
 
     def append(self, payload: bytes) -> int | None:
-        """Number a request and order it applied; None if the log is full."""
+        """Number a request and order it applied; None before the term, or if the log is full."""
         log = self.log
-        if log is None:
+        if self.base is None:
             return None
         if not log.has_room(len(payload)) and not self._make_room(log, len(payload)):
             return None
@@ -158,7 +158,6 @@ class CatchingUp:
     def feed(self, replica: int, peer: Peer) -> None:
         """Send a joined replica the requests that it lacks."""
         log = self.log
-        assert log is not None
         if not peer.joined or peer.lags:
             return
         if peer.rewind is not None:
@@ -200,7 +199,7 @@ class CatchingUp:
         Where both are long ago it waits for a new checkpoint, unless it has `waited`.
         """
         log, promise = self.log, peer.promise
-        if log is None or promise is None or peer.open:
+        if self.base is None or promise is None or peer.open:
             return
         at, kept = promise.position, log.checkpoint
         may_join = promise.sound and self._knows(replica, at) and log.covers(at.index)
@@ -230,27 +229,21 @@ class CatchingUp:
 
     def look_at_lag(self, peer: Peer, now: float) -> None:
         """Restore a joined replica that falls behind, if another can provide its state."""
-        log = self.log
-        if log is None:
-            return
         given = any(
-            self._keeps_up(other, log) and self._counts(replica)
-            for replica, other in self.peers.items()
+            self._keeps_up(other) and self._counts(replica) for replica, other in self.peers.items()
         )
-        peer.lags = given and (peer.lags or peer.lag.too_far(log.last - peer.acked, now))
+        peer.lags = given and (peer.lags or peer.lag.too_far(self.log.last - peer.acked, now))
         if peer.lags and not peer.open:
             peer.lags, peer.phase, peer.retry_at = False, Phase.UNCLAIMED, now
 
-    def _keeps_up(self, peer: Peer, log: OrderedLog) -> bool:
-        return peer.joined and log.last - peer.acked <= WINDOW
+    def _keeps_up(self, peer: Peer) -> bool:
+        return peer.joined and self.log.last - peer.acked <= WINDOW
 
     # -- the checkpoint -------------------------------------------------------------------
 
     def see_to_checkpoint(self, now: float) -> None:
         """Request a checkpoint if one is needed."""
         log = self.log
-        if log is None:
-            return
         waits = any(peer.phase is Phase.CLAIMED for peer in self.peers.values())
         # A log that begins with the service's first state needs none; nor does one just taken. A
         # later term's begins with a position that a fresh replica does not know, called or not.
@@ -259,7 +252,7 @@ class CatchingUp:
             # Of one that seldom answers first: it pauses for the snapshot.
             self.ask_for_checkpoint(
                 [
-                    (not self._keeps_up(peer, log), peer.won, replica)
+                    (not self._keeps_up(peer), peer.won, replica)
                     for replica, peer in self.peers.items()
                     if peer.joined and self._counts(replica)
                 ],
@@ -275,7 +268,6 @@ class CatchingUp:
 
     def take_checkpoint(self, index: int, state: bytes) -> None:
         """Store a checkpoint, and have replicas that wait for one join."""
-        if self.log is not None:
-            self.log.keep(Checkpoint(index, state))
-            self._checkpoint_at = 0.0
-            self.bring_all(waited=True)
+        self.log.keep(Checkpoint(index, state))
+        self._checkpoint_at = 0.0
+        self.bring_all(waited=True)

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.active_version import ActiveVersion
-from fogft.ordering.catching_up import CatchingUp, OrderedLog
+from fogft.ordering.catching_up import CatchingUp
 from fogft.ordering.orders import START, Op, OrderError, Position, Promise
 from fogft.ordering.peer import Peer, Phase
 
@@ -64,17 +64,13 @@ class Sequencer:
         self._unanswered: dict[int, None] = {}
         self._replicas = CatchingUp(epoch, self._counts, handed_over=begin is not None)
         self._peers = self._replicas.peers
+        self.log = self._replicas.log  # the numbered requests; empty until the term has begun
         self.take = self._replicas.take  # the orders to send, in this order; they are forgotten
         if begin is not None:
             self._replicas.begin_at(begin.at)
             self._replicas.take_checkpoint(begin.at.index, begin.state)
 
     # -- what the owner asks --------------------------------------------------------------
-
-    @property
-    def log(self) -> OrderedLog | None:
-        """The numbered requests; None until the term has begun."""
-        return self._replicas.log
 
     @property
     def ready(self) -> bool:
@@ -213,11 +209,10 @@ class Sequencer:
         return first
 
     def _take_checkpoint(self, index: int, state: bytes) -> None:
-        log = self.log
-        if log is None or self.deposed_by is not None:
+        if self.deposed_by is not None:
             return
         self._replicas.take_checkpoint(index, state)
-        if self._change_to is not None and index == log.last and not self._unanswered:
+        if self._change_to is not None and index == self.log.last and not self._unanswered:
             self.handover = Handover(self._change_to, Position(self.epoch, index), state)
 
     def _promised(self, replica: int, peer: Peer, promise: Promise) -> None:
@@ -248,10 +243,9 @@ class Sequencer:
             self._replicas.bring_all()
 
     def _has_joined(self, replica: int, peer: Peer, expected: int) -> None:
-        log = self.log
-        if peer.phase is not Phase.ASKED or log is None:
+        if peer.phase is not Phase.ASKED:
             return
-        if not log.covers(expected - 1):  # the log has moved on meanwhile
+        if not self.log.covers(expected - 1):  # the log has moved on meanwhile
             peer.phase = Phase.UNCLAIMED
             return
         peer.join(expected)
@@ -304,7 +298,7 @@ class Sequencer:
         if not self._fenced or silent:
             return
         obey = sum(one.promise is not None and one.phase is not Phase.UNCLAIMED for one in others)
-        if len(self._fenced) > obey or (len(self._fenced) == obey and self.log is None):
+        if len(self._fenced) > obey or (len(self._fenced) == obey and self._replicas.base is None):
             self.deposed_by = max(self._fenced.values())
             self._replicas.take()
 
@@ -344,12 +338,11 @@ class Sequencer:
 
     def _prepare_handover(self, now: float) -> None:
         """Ask for the state after the last number, once that has been answered."""
-        log = self.log
-        if self._change_to is None or log is None or self._unanswered:
+        if self._change_to is None or self._unanswered:
             return
         donors = [
             (r in self._leaving, p.won, r)
             for r, p in self._peers.items()
-            if p.joined and self._counts(r) and p.acked >= log.last and not p.open
+            if p.joined and self._counts(r) and p.acked >= self.log.last and not p.open
         ]
         self._replicas.ask_for_checkpoint(donors, now)

@@ -79,7 +79,6 @@ class _Word:
 class _Goal:
     id: bytes  # of its client's request
     request: bytes
-    accepted: bool = False
     cancelled: bool = False
     takers: set[int] = field(default_factory=set)  # replicas that ever took it
     words: dict[int, _Word] = field(default_factory=dict)  # by replica
@@ -143,7 +142,6 @@ class Goals:
             goal = self.over.get(id) if accepts else None
             return goal, True
         if accepts:
-            known.accepted = True
             known.takers.add(replica)
         word = known.words.get(replica)
         if word is not None and math.isfinite(word.since):  # it has taken it before
@@ -226,7 +224,7 @@ class Goals:
 
     def unwanted(self) -> list[bytes]:
         """Return the cancelled goals that still run."""
-        return [goal for goal, known in self._goals.items() if known.accepted and known.cancelled]
+        return [goal for goal, known in self._goals.items() if known.takers and known.cancelled]
 
     def clear(self) -> None:
         """Forget all goals."""
@@ -241,7 +239,7 @@ class Goals:
     def __contains__(self, goal: bytes) -> bool:
         """Whether a goal is under way: accepted, and without a result."""
         known = self._goals.get(goal)
-        return known is not None and known.accepted
+        return known is not None and bool(known.takers)
 
     def lacked(self, goal: bytes, replica: int, asked_at: float) -> Refusal | None:
         """Return why a replica that was asked for the result did not have the goal; None: it had.
