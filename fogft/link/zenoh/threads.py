@@ -43,9 +43,7 @@ WAIT_S = 2.0
 _leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
 
 
-def join_at_exit(thread: threading.Thread) -> None:
-    """Have the process wait for this thread at exit. The thread must be about to end."""
-    _leaving.add(thread)
+join_at_exit = _leaving.add  # have the process wait for a thread that is about to end
 
 
 def close_session(session: Any) -> None:

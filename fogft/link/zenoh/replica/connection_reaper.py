@@ -35,38 +35,9 @@ RUSH_LIMIT = 2  # so many new ones since the last look
 # Of one holder, the newest: a robot has one an uplink, and another while it takes a new certificate
 # into use. Zenoh has room for 128 of all holders together.
 LINKS_LIMIT = 16
-_RESERVE = 32  # descriptors
-
-
-class DescriptorReserve:
-    """File descriptors held in reserve against floods of connections. For one thread.
-
-    Without one, nothing tells whose the connections at the port are, no preemption notice is read
-    and no state is written.
-    """
-
-    def __init__(self) -> None:
-        self._kept: list[int] = []
-        self.fill()
-
-    def fill(self) -> bool:
-        """Fill the reserve; return False if no further descriptor is left besides."""
-        try:
-            while len(self._kept) < _RESERVE:
-                self._kept.append(_open())
-            os.close(_open())
-        except OSError:
-            return False
-        return True
-
-    def release(self) -> None:
-        """Release the reserve for the process to use."""
-        while self._kept:
-            os.close(self._kept.pop())
-
-
-def _open() -> int:
-    return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+# Descriptors held in reserve against floods. Without one, nothing tells whose the connections at
+# the port are, no preemption notice is read and no state is written.
+_RESERVE = 32
 
 
 def surplus(links: Mapping[Address, str]) -> list[Address]:
@@ -109,7 +80,8 @@ class ConnectionReaper:
         self._linked: dict[Address, str] = {}  # oldest first
         self._filter = ListenFilter(port)
         self._door = Door()
-        self._reserve = DescriptorReserve()
+        self._reserve: list[int] = []
+        self._fill_reserve()
         self._shut = False
         self._descriptors = sockets.count()
         self._stop = threading.Event()
@@ -131,7 +103,21 @@ class ConnectionReaper:
                 log.exception("doorkeeper_failed port=%d", self._port)
                 self._filter.drop(frozenset())
         self._filter.close()
-        self._reserve.release()
+        self._release_reserve()
+
+    def _fill_reserve(self) -> bool:
+        """Fill the reserve; return False if no further descriptor is left besides."""
+        try:
+            while len(self._reserve) < _RESERVE:
+                self._reserve.append(_open())
+            os.close(_open())
+        except OSError:
+            return False
+        return True
+
+    def _release_reserve(self) -> None:
+        while self._reserve:
+            os.close(self._reserve.pop())
 
     def _await_look(self) -> None:
         """Wait until it is time to look: soon after somebody came, at once where many do."""
@@ -146,10 +132,10 @@ class ConnectionReaper:
 
     def look(self, now: float) -> None:
         """Check once, and close the connections that must go."""
-        short = not self._reserve.fill()
+        short = not self._fill_reserve()
         if short:
             self._filter.drop(None)  # first: what is given back is not for strangers
-            self._reserve.release()
+            self._release_reserve()
             self._counters.warn(log, "descriptors_short", "descriptors_short port=%d", self._port)
         with contextlib.ExitStack() as stack:
             found = {
@@ -212,3 +198,7 @@ class ConnectionReaper:
         self._counters.warn(
             log, event, "connection_ended reason=%s peer=%s:%d name=%r", event, *peer, name
         )
+
+
+def _open() -> int:
+    return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)

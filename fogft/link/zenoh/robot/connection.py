@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 
 import zenoh
 from zenoh import handlers
@@ -53,14 +53,11 @@ class Shared:
     gate: LargeSendGate = field(default_factory=LargeSendGate)
     records: bytes = b""  # signed, for every replica, packed; empty for none
     newer: dict[int, bytes] = field(default_factory=dict)  # slot -> what its replica said instead
-    _signer: Signer | None = None
 
-    @property
+    @cached_property
     def signer(self) -> Signer:
-        """The robot's key, read once. Raises CredentialError where it cannot be used."""
-        if self._signer is None:
-            self._signer = Signer(self.credentials.certificate, self.credentials.key)
-        return self._signer
+        """The robot's key. Raises CredentialError where it cannot be used."""
+        return Signer(self.credentials.certificate, self.credentials.key)
 
 
 _ALL = zenoh.QueryTarget.ALL
