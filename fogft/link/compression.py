@@ -46,8 +46,7 @@ class Compression:
     def pack(self, payload: bytes, bytes_per_s: float | None) -> bytes | None:
         """Return the compressed payload; None if it is to be sent uncompressed.
 
-        Args:
-            bytes_per_s: What the link was seen to drain; None for not known, which is fast.
+        `bytes_per_s` is what the link was seen to drain; None for not known, which is fast.
         """
         if bytes_per_s is None or bytes_per_s > FASTEST_BYTES_PER_S:
             return None

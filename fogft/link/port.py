@@ -197,12 +197,9 @@ class Link(Protocol):
     ) -> bool:
         """Take one attempt, or return False when the window is full or the link not usable.
 
-        Never blocks. `service` is the name in the pool; its key was set by `services`.
-        Not to be called from within a `LinkEvents` callback: it may send.
-
-        Args:
-            more: Others follow at once, then `send`: it may wait for them, to leave in one message.
-            handling: What the replica is asked to do with it.
+        Never blocks. `service` is the name in the pool; its key was set by `services`. With `more`,
+        others follow at once, then `send`: it may wait for them, to leave in one message. Not to be
+        called from within a `LinkEvents` callback: it may send.
         """
 
     def send(self) -> None:
@@ -257,11 +254,9 @@ class Incoming(Protocol):
     payload: bytes
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
-        """Send the serialised response. Never blocks.
+        """Send the serialised response, with what the replica has to do for this service.
 
-        Args:
-            load: What the replica has to do for this service.
-            more: Others will soon follow, to leave in one message with it.
+        Never blocks. With `more`, others will soon follow, to leave in one message with it.
         """
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:

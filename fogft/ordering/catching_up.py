@@ -94,9 +94,8 @@ class OrderedLog:
 class CatchingUp:
     """A term's log, and each replica's progress in it.
 
-    Args:
-        counts: Whether a replica's state may be given to others, and its answer to a caller.
-        handed_over: Whether the term begins with what replicas of another version left.
+    It `counts` whose state may be given to others, and whose answer to a caller. A term that was
+    `handed_over` begins with what replicas of another version left.
     """
 
     def __init__(self, epoch: int, counts: Callable[[int], bool], *, handed_over: bool) -> None:

@@ -45,9 +45,8 @@ class _Robot(Generic[T]):
 class FairQueue(Generic[T]):
     """The queue of one service at a replica, by request id.
 
-    Args:
-        latest: The newest request of a robot goes first, and the oldest gives way: with one
-            time-out a service, the latest deadline is the newest request's.
+    Of the `latest` the newest request of a robot goes first, and the oldest gives way: with one
+    time-out a service, the latest deadline is the newest request's.
     """
 
     def __init__(self, *, latest: bool = False) -> None:

@@ -225,9 +225,8 @@ class PendingRequests:
     ) -> Judged:
         """Take an answer about `request`; None for no request.
 
-        Returns:
-            What it means; the request that it answers, None where it comes too late or is no
-            success; who else is to stop working on that; what is to be done where it goes on.
+        Returns what it means; the request that it answers, None where it comes too late or is no
+        success; who else is to stop working on that; what is to be done where it goes on.
         """
         if load is not None and request is not None:
             self.choose.heard(request, replica, load, now)

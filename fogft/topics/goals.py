@@ -133,9 +133,8 @@ class Goals:
     ) -> tuple[bytes | None, bool]:
         """Note a replica's answer whether it accepts a goal. Unknown ids are ignored.
 
-        Returns:
-            The goal, or None where the replica did not accept it, had it before, or it is not known
-            any more; and whether the goal is over, or cancelled.
+        Returns the goal, or None where the replica did not accept it, had it before, or it is not
+        known any more; and whether the goal is over, or cancelled.
         """
         known = self._given_by(id)
         if known is None:

@@ -52,10 +52,8 @@ class _Waiting:
 class DialIn:
     """The dial-in port of one robot or gateway, at ``host:port``; port 0 for any that is free.
 
-    Replicas of other pools, and `revoked` common names, are turned away.
-
-    Raises:
-        WireError: The port cannot be had.
+    Replicas of other pools, and `revoked` common names, are turned away. Raises WireError: the port
+    cannot be had.
     """
 
     def __init__(

@@ -54,14 +54,11 @@ class ZenohListener:
     """A replica's end: receives requests and probes of robots that its CA admits.
 
     Args:
-        listen: ``host:port``; port 0 for any that is free.
+        listen: ``host:port``; port 0 for any that is free. Raises WireError: it is not that.
         credentials: The replica's certificate and key, and the pool's CA.
         id: Which replica this is: it hears the keys of its slot only.
         handshakes: Tells which handshakes were refused; None where they need not be counted.
         certificate_name: The common name of its certificate, where that is not the replica's.
-
-    Raises:
-        WireError: `listen` is not ``host:port``.
     """
 
     def __init__(
@@ -120,12 +117,9 @@ class ZenohListener:
     ) -> None:
         """Start listening. Callbacks come from Zenoh's threads and must not block.
 
-        Args:
-            on_cancel: Takes the ids of requests whose answers are no longer wanted. It may
-                block for a moment, which holds up nothing but probes.
-
-        Raises:
-            WireError: The port is taken, or the credentials cannot be used.
+        `on_cancel` takes the ids of requests whose answers are no longer wanted. It may block for a
+        moment, which holds up nothing but probes. Raises WireError: the port is taken, or the
+        credentials cannot be used.
         """
         try:
             session = self._session = zenoh.open(to_zenoh(self._config))

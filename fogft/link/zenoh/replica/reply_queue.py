@@ -126,9 +126,7 @@ class ReplyQueue:
 class ReplyQueues:
     """All reply queues of a listener.
 
-    Args:
-        counters: Counts ``replies``, ``refused``, ``reply_dropped`` and ``failed``.
-        later: Has something done by a thread that may block; the collector of garbage calls it.
+    `later` has something done by a thread that may block; the collector of garbage calls it.
     """
 
     idle_s = 5.0  # a thread that had nothing to send for so long ends

@@ -78,9 +78,8 @@ class Callbacks:
 class Attempts:
     """The attempts of one connection.
 
-    Args:
-        origin: What the headers of all its requests say (`frame.origin`).
-        cancellations: Of whom the replica is told that it may stop; None to tell of nobody.
+    `origin` is what the headers of all its requests say. The replica is told of `cancellations`;
+    None to tell of nobody.
     """
 
     def __init__(

@@ -20,11 +20,10 @@ _CLOSE_WAIT_S = 3.0
 
 
 class ZenohDialer:
-    """Creates links over Zenoh; see `port.Dialer`.
+    """Creates links over Zenoh; see `port.Dialer`. Peers of another pool are refused.
 
     Args:
         credentials: The robot's certificate and key, and the pool's CA.
-        pool_uid: The pool; peers of another are refused.
         suspect_after_s: Probes unanswered for so long make a link suspect.
         tell_losers: Whether replicas are told which requests are no longer wanted.
     """

@@ -62,8 +62,7 @@ Heard = tuple["Connection", bytes, float, float]
 class Probing:
     """Probes to one replica. For the link's thread; any thread may read the attributes.
 
-    Args:
-        came: Called, from any thread, when an answer came.
+    `came` is called, from any thread, when an answer came.
     """
 
     def __init__(self, peer: Peer, came: Callable[[], None]) -> None:
