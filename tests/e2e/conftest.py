@@ -9,7 +9,7 @@ from tests.e2e.pool import Pool
 
 @pytest.fixture
 def pool(tmp_path, ros_domain):
-    """A pool that is written but not up; ended and checked for leftovers afterwards."""
+    """A pool that is written but not up; ended by force afterwards."""
     made = Pool(tmp_path, ros_domain)
     made.write()
     yield made

@@ -18,6 +18,7 @@ import yaml
 
 from fogft.pool.commands import status as seen
 from fogft.pool.folder.paths import PoolPaths
+from fogft.ros import shared_memory
 from tests.link import forked
 
 NODES = Path(__file__).parent / "nodes"
@@ -154,14 +155,12 @@ class Pool:
         return found
 
     def close(self) -> None:
-        """End the pool through the command line, and what is left of it by force."""
-        if (self.home / "pools").exists():
-            self.fogft("down", ok=False)
-        for pid in self.processes():
-            try:
-                os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                continue
+        """End what is left of the pool by force, which takes seconds less than `fogft down`."""
+        while left := self.processes():  # the manager and the proxy start each other
+            for pid in left:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+        shared_memory.sweep()
 
 
 class Machine:

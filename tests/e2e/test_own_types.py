@@ -76,7 +76,6 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
     said = pool.fogft("up", str(pool.file), "--yes", ok=False, limit_s=200)
     assert "cannot answer: robot and replicas disagree on its type" in said
     assert "field `response.words` is `uint64` here and `uint32` on the replica" in said
-    pool.environ = bare
 
 
 @needs("build")
