@@ -19,6 +19,7 @@ class FallbackTimer:
     def __init__(self, spec: FallbackSpec) -> None:
         self.spec = spec
         self._arrived: dict[bytes, float] = {}  # not handed over yet, oldest first
+        self.submitted = self._arrived.__setitem__  # a new request, and when
         self._handed: set[bytes] = set()
         self.failed = self._handed.discard  # it could not be asked: once more at the deadline
         self._awaited: dict[bytes, tuple[float, Pending]] = {}  # past the deadline: until when
@@ -26,10 +27,6 @@ class FallbackTimer:
     def __len__(self) -> int:
         """Count the requests past their deadline whose fallback is awaited."""
         return len(self._awaited)
-
-    def submitted(self, request: bytes, now: float) -> None:
-        """Note a new request."""
-        self._arrived[request] = now
 
     def look_at(self, *, able: bool) -> float:
         """Return when `due` can next return requests; `able` if a replica is ready."""

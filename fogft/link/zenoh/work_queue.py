@@ -30,14 +30,11 @@ class WorkQueue:
         self._lanes: dict[bytes, deque[Callable[[], None]]] = {}  # none is empty
         self._closing = False
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
+        self.start = self._thread.start  # jobs queued earlier wait until then
 
     def __len__(self) -> int:
         with self._lock:
             return sum(map(len, self._lanes.values()))
-
-    def start(self) -> None:
-        """Start the thread. Jobs queued earlier wait until then."""
-        self._thread.start()
 
     def offer(self, job: Callable[[], None], lane: bytes = b"") -> bool:
         """Queue a job; if its lane is full, count it and return False."""

@@ -1,11 +1,11 @@
 """Close connections at a replica's port that belong to no admitted robot or are stuck.
 
-Zenoh keeps room for 32 connections that never say who they are. So we look at this process's own
-sockets, twice a second and whenever somebody comes: strangers are ended or kept out as `door` says,
-a link of a revoked holder is ended at once, as are those of one holder beyond `LINKS_LIMIT`, and
-one that delivers nothing of what it holds after a while. All are counted. Where strangers hold all
-descriptors that the process may have, all of them are ended. Who looks sees, too, which links are
-thin.
+Zenoh has room for 32 connections that do not say who they are, lets those stand for ever, and lets
+nobody else in meanwhile. So we look at this process's own sockets, twice a second and whenever
+somebody comes: strangers are ended or kept out as `door` says, a link of a revoked holder is ended
+at once, as are those of one holder beyond `LINKS_LIMIT`, and one that delivers nothing of what it
+holds after a while. All are counted. Where strangers hold all descriptors that the process may
+have, all of them are ended. Who looks sees, too, which links are thin.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.records.listening import listening
-from fogft.records.record import Record, RecordKind
+from fogft.records.record import RecordKind
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import Verifier
 
@@ -83,15 +83,19 @@ class ZenohListener:
             Verifier(credentials.ca, lazy=True),
         )
         self._counters = Counters()
+        self.counters = self._counters.snapshot  # since the start, by event
         self._turns = QueryTurns()
         self.revoke = self._sessions.revoke  # let these holders in no more
         self._work_queue = WorkQueue("fogft-probes", self._counters)
         self._queues = ReplyQueues(self._counters, later=self._work_queue.add)
+        self.refusals = self._queues.refusals.snapshot  # of requests and messages, by their values
         self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
         self.streams = Streams(slow=self._slow)
         self._records = RecordSet(id.pool_uid, Verifier(credentials.ca, lazy=True))
+        # The newest one of the manager that robots have passed on; None before the first.
+        self.lease = partial(self._records.get, RecordKind.LEASE)
         self._control = ControlQueries(
             sessions=self._sessions,
             records=self._records,
@@ -281,18 +285,6 @@ class ZenohListener:
         self._work_queue.offer(partial(on_cancel, ids))
 
     # -- the owner ------------------------------------------------------------------------
-
-    def lease(self) -> Record | None:
-        """Return the newest manager lease that robots have passed on."""
-        return self._records.get(RecordKind.LEASE)
-
-    def counters(self) -> Mapping[str, int]:
-        """Return counts since the start, by event."""
-        return self._counters.snapshot()
-
-    def refusals(self) -> Mapping[str, int]:
-        """Return how many requests and messages their receivers refused, by the refusal's value."""
-        return self._queues.refusals.snapshot()
 
     def close(self) -> None:
         """Send what is queued, then stop. Repeatable; takes a second at most."""

@@ -86,6 +86,7 @@ class ZenohLink:
         self._thread = threading.Thread(
             target=self._keep, name=f"fogft-keep-{peer.id.short}", daemon=True
         )
+        self.join = self._thread.join  # once closed
         self._thread.start()
 
     # -- port.Link ------------------------------------------------------------------------
@@ -163,10 +164,6 @@ class ZenohLink:
         """Switch to new credentials over a new connection; returns at once, no request is lost."""
         self._renew_at = 0.0
         self._wake.set()
-
-    def join(self, timeout_s: float) -> None:
-        """Wait for the link's thread of a closed link."""
-        self._thread.join(timeout_s)
 
     # -- the link's thread ----------------------------------------------------------------
 

@@ -74,6 +74,8 @@ class Probing:
         self.silent_s = self._of_replica.for_s  # for how long the replica has been
         self.nobody_to_ask = self._of_replica.began  # it is not reached: silent from now on
         self._of_connection = Silence()
+        self.unheard_s = self._of_connection.for_s
+        self.another_connection = self._of_connection.ended  # probes go over another from now on
         self._doubted = False
         self._content = b""  # of the last answer: what is idle says the same again and again
         self.answer: ProbeAnswer | None = None  # the last one
@@ -133,18 +135,10 @@ class Probing:
 
     # -- silence --------------------------------------------------------------------------
 
-    def another_connection(self) -> None:
-        """Send probes over another connection from now on."""
-        self._of_connection = Silence()
-
     def excuse(self, seconds: float, now: float) -> None:
         """Exclude time before `now` in which nothing could be received."""
         for silence in (self._of_replica, self._of_connection):
             silence.excuse(seconds, now)
-
-    def unheard_s(self, now: float) -> float:
-        """Return for how long the current connection has received no answer, in seconds."""
-        return self._of_connection.for_s(now)
 
     def late(self, now: float) -> tuple[bool, float]:
         """Return whether an answer is late (true once per silence), and the time left until then.
