@@ -112,10 +112,10 @@ class OrderedResponder:
                 clients.service.call(begin.payload, lambda answer: self._done(begin, answer))
             elif begin.op is Op.SNAPSHOT:
                 request = self._state.snapshot_request()
-                clients.snapshot.call(request, lambda answer: self._snapshot(begin, answer))
+                clients.snapshot.call(request, lambda answer: self._answered(begin, answer))
             else:
                 request = self._state.restore_request(begin.payload)
-                clients.restore.call(request, lambda answer: self._restored(begin, answer))
+                clients.restore.call(request, lambda answer: self._answered(begin, answer))
         except Unreadable as error:
             log.warning("request_unreadable service=%s reason=%r", self._name, error.message)
             self._done(begin, None)
@@ -126,22 +126,18 @@ class OrderedResponder:
             else:
                 self._failed(begin, error)
 
-    def _snapshot(self, begin: Begin, response: bytes) -> None:
+    def _answered(self, begin: Begin, response: bytes) -> None:
+        answer = b""
         try:
-            state = self._state.read_snapshot(response)
+            if begin.op is Op.SNAPSHOT:
+                answer = self._state.read_snapshot(response)
+            else:
+                self._state.check_restored(response)
+                log.info("state_restored service=%s bytes=%d", self._name, len(begin.payload))
         except RosError as error:
             self._failed(begin, error)
         else:
-            self._done(begin, state)
-
-    def _restored(self, begin: Begin, response: bytes) -> None:
-        try:
-            self._state.check_restored(response)
-        except RosError as error:
-            self._failed(begin, error)
-        else:
-            log.info("state_restored service=%s bytes=%d", self._name, len(begin.payload))
-            self._done(begin, b"")
+            self._done(begin, answer)
 
     def _failed(self, begin: Begin, error: RosError) -> None:
         what = begin.op.name.lower()

@@ -149,7 +149,11 @@ class ClientProxy:
             self._version = version
             self._membership = membership
             good = (m for m in membership.members if m.certificate_name not in membership.revoked)
-            members = {} if self._shut_out(membership) else {m.id: m for m in good}
+            members = {m.id: m for m in good}
+            own = self._dialer.certificate()
+            if own in membership.revoked:  # then nobody is to be talked to
+                log.error("robot_revoked certificate=%s", own)
+                members = {}
             through = any(member.gateway for member in members.values())
             if through != self._through_gateways:
                 self._through_gateways = through
@@ -168,14 +172,6 @@ class ClientProxy:
         if self._membership is not None:
             self.follow(self._membership)  # who was shut out under the old ones may be in again
         log.info("credentials_renewed")
-
-    def _shut_out(self, membership: Membership) -> bool:
-        """Whether our own certificate was taken back: then nobody is to be talked to."""
-        own = self._dialer.certificate()
-        if own not in membership.revoked:
-            return False
-        log.error("robot_revoked certificate=%s", own)
-        return True
 
     def redial(self) -> None:
         """Redial all replicas over other uplinks; requests in flight are sent again."""
@@ -301,12 +297,7 @@ class ClientProxy:
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
         dispatchers = [service.dispatcher for service in self._services.values()]
-        return self.links.reports(dispatchers, self._differences, self._misreads)
-
-    def _misreads(self, replica: int) -> bool:
-        services = self._services.values()
-        by_services = any(service.dispatcher.misreads(replica) for service in services)
-        return by_services or self._topics.misreads(replica)
+        return self.links.reports(dispatchers, self._differences, self._topics.misreads)
 
     def behind(self) -> tuple[GatewayView, ...]:
         """Return the state of each replica, as a gateway reports it to its robots."""

@@ -41,6 +41,7 @@ def link_report(
     answer = status.probe_answer
     ours = next(iter(differ.values()), "") if link.usable else ""
     key = key_of(link)
+    misread = misread or any(one.misreads(key) for one in dispatchers)
     ended = [one.outcomes.of.get(key, OfReplica()) for one in dispatchers]
     return {
         "slot": id.slot,
