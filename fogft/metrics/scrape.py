@@ -1,28 +1,25 @@
 """Metrics as `prometheus-client` has them, made at a scrape, and served over plain HTTP.
 
 Nothing is counted through the library: counting on a request's way stays a plain addition. It is
-imported at the first scrape, so that a process that nobody scrapes never loads it. A slow or
-hostile scraper occupies a thread, but there are few: a newer connection ends the oldest.
+imported once an endpoint is asked for, like Python's HTTP server (`fogft.metrics.server`), so that
+a process that nobody scrapes never loads it.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import math
 import platform
-import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
-from socketserver import ThreadingMixIn
-from typing import TYPE_CHECKING, Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
+from typing import TYPE_CHECKING
 
 import fogft
-from fogft.model.names import host_and_port
 
 if TYPE_CHECKING:
+    from wsgiref.simple_server import WSGIServer
+
     from prometheus_client import Metric
 
 log = logging.getLogger(__name__)
@@ -30,8 +27,6 @@ log = logging.getLogger(__name__)
 Labels = Mapping[str, str]
 Values = Iterable[tuple[float, Labels]]
 Measure = Callable[[], "Iterable[Metric]"]
-_LIMIT_S = 5.0
-_AT_ONCE = 8
 
 
 def counter(name: str, help: str, values: Values) -> Metric:
@@ -126,11 +121,12 @@ class Scrape:
             return
         from prometheus_client import CollectorRegistry, make_wsgi_app
 
+        from fogft.metrics.server import bound
+
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
         try:
-            app = make_wsgi_app(registry)
-            self._server = make_server(*host_and_port(endpoint), app, _Server, _Request)
+            self._server = bound(endpoint, make_wsgi_app(registry))
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))
             return
@@ -144,32 +140,3 @@ class Scrape:
         if server is not None:
             server.shutdown()
             server.server_close()
-
-
-class _Server(ThreadingMixIn, WSGIServer):
-    daemon_threads = True
-    block_on_close = False
-
-    def server_activate(self) -> None:
-        self._open: dict[socket.socket, None] = {}  # oldest first
-        super().server_activate()
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        self._open[request] = None
-        if len(self._open) > _AT_ONCE:
-            oldest = list(self._open)[0]  # noqa: RUF015 - in one step: other threads take theirs out
-            self._open.pop(oldest, None)
-            with contextlib.suppress(OSError):  # its thread closes it
-                oldest.shutdown(socket.SHUT_RDWR)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        self._open.pop(request, None)
-        super().shutdown_request(request)
-
-
-class _Request(WSGIRequestHandler):
-    timeout = _LIMIT_S
-
-    def log_message(self, format: str, *arguments: object) -> None:
-        """Log no line for each scrape."""
