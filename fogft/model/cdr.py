@@ -1,11 +1,10 @@
 """Whether bytes are a well-formed message of a type, checked before a middleware reads them. Pure.
 
-A middleware that is given bytes it cannot read may fail, end its process, or read another
-message than was meant; each does so in its own way. So bytes that come over the network are
-walked along the type first: nothing is decoded, and whole runs of numbers are stepped over.
+A middleware that is given bytes it cannot read may fail, end its process, or read another message
+than was meant. Here nothing is decoded: whole runs of numbers are stepped over.
 
-Serialised messages are plain CDR, as ROS 2 writes them: four bytes of header that tell the byte
-order, then each field at a multiple of its own size, counted from behind the header.
+Serialised messages are plain CDR: four bytes of header that tell the byte order, then each field
+at a multiple of its own size, counted from behind the header.
 """
 
 from __future__ import annotations
@@ -43,12 +42,7 @@ class _Uncheckable(Exception):
 
 
 class _Bytes:
-    """A message's bytes.
-
-    Attributes:
-        length_at: Reads a length in the message's byte order.
-        booleans: Where the booleans that were stepped over stand.
-    """
+    """A message's bytes, and where the booleans stand that were stepped over."""
 
     __slots__ = "booleans", "length_at", "payload", "size"
 
@@ -83,16 +77,11 @@ _Walk = Callable[[_Bytes, int], int]  # from an offset in the payload to the one
 
 @dataclass(frozen=True)
 class _Kind:
-    """How to step over a value of one type.
-
-    Attributes:
-        align: Of its widest number; where it starts only matters modulo this.
-        has_fixed_size: Whether its size follows from where it starts.
-    """
+    """How to step over a value of one type."""
 
     walk: _Walk
-    align: int
-    has_fixed_size: bool
+    align: int  # of its widest number; where it starts only matters modulo this
+    has_fixed_size: bool  # its size follows from where it starts
 
 
 class Shape:

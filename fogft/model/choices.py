@@ -116,10 +116,7 @@ class Correlation:
 
 @dataclass(frozen=True)
 class Assumption:
-    """Assumptions about machines, for lack of measurements.
-
-    With 20 min of recovery, 12 million seconds are the 99.99 % that clouds promise.
-    """
+    """Assumptions about machines, for lack of measurements."""
 
     spot_uptime_s: float = key(
         Number(1e9, "seconds"),
@@ -129,7 +126,7 @@ class Assumption:
     on_demand_uptime_s: float = key(
         Number(1e9, "seconds"),
         "Mean time until a ready on-demand machine fails.",
-        default=12_000_000.0,
+        default=12_000_000.0,  # with 20 min of recovery, the 99.99 % that clouds promise
     )
     recovery_s: float = key(
         Number(DAY_S, "seconds"),
@@ -355,11 +352,7 @@ def _robot_at(written: Any) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class PlacementSpec:
-    """How locations are scored, and known distances.
-
-    Attributes:
-        rtt_s: ``cloud/region`` or ``cloud`` -> round trip in seconds; goes before measurements.
-    """
+    """How locations are scored, and known distances."""
 
     latency_weight: float = key(
         Number(100, "times", from_zero=True),
@@ -413,10 +406,7 @@ class TrafficSpec:
 
 @dataclass(frozen=True)
 class FallbackSpec:
-    """The service on the robot that answers when the replicas do not.
-
-    Its answer is awaited until `limit_s` past the deadline.
-    """
+    """The service on the robot that answers when the replicas do not."""
 
     service: str = key(
         service_name("write the name of a service on the robot"),
@@ -436,4 +426,4 @@ class FallbackSpec:
         "start.",
         default=False,
     )
-    limit_s: float = 1.0
+    limit_s: float = 1.0  # its answer is awaited until so long past the deadline

@@ -1,9 +1,8 @@
 """Certificate holders and their roles. Pure.
 
 A certificate's common name says who its holder is: ``role.name.generation.pool``, for
-instance ``robot.ada.2.0123456789abcdef``; a replica's name is its slot. TLS proves the
-name; this module says what follows from it. A revoked name is revoked for good: who gets
-in again does so under the next generation.
+instance ``robot.ada.2.0123456789abcdef``; a replica's name is its slot. A revoked name is
+revoked for good: who gets in again does so under the next generation.
 """
 
 from __future__ import annotations
@@ -61,11 +60,7 @@ def manager_of(pool_uid: str) -> Holder:
 
 
 def holder_of(common_name: str) -> Holder:
-    """Read a certificate's common name.
-
-    Raises:
-        ValueError: It is none of ours.
-    """
+    """Read a certificate's common name. Raises ValueError where it is none of ours."""
     role, _, rest = common_name.partition(".")
     name, generation, uid = rest.split(".") if rest.count(".") == 2 else ("", "", "")
     if (
@@ -86,3 +81,8 @@ class CredentialPaths:
     ca: Path
     certificate: Path
     key: Path
+
+    @classmethod
+    def of(cls, folder: Path, stem: str) -> CredentialPaths:
+        """Return those of a name in a folder."""
+        return cls(folder / "ca.crt", folder / f"{stem}.crt", folder / f"{stem}.key")

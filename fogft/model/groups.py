@@ -1,12 +1,8 @@
 """Groups of replicas within one pool, and their slots. Pure.
 
-A group has machines of its own kind: a small on-demand one for up-time, large spot ones for
-speed. Where the pool file names no groups there is one. Every replica carries every service.
-
-Slots tell the groups apart, so nothing else has to be remembered: group k has the slots
+Where the pool file names no groups there is one. Slots tell the groups apart: group k has the slots
 from ``k * BLOCK`` on; the upper half of a block, from `STAND_INS` on, is for on-demand machines
-that stand in for spot ones. From `FIRST_BY_HAND` on they are free for replicas that people start
-themselves.
+that stand in for spot ones.
 """
 
 from __future__ import annotations
@@ -94,10 +90,7 @@ def task_at(spec: PoolSpec, slot: int) -> dict[str, Any]:
 
 
 def sales(spec: PoolSpec) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-    """Return the resources to get prices for, by group name.
-
-    A group that mixes spot and on-demand is asked for twice.
-    """
+    """Return the resources to get prices for, by group name; twice for one that mixes markets."""
     found: list[tuple[str, Mapping[str, Any]]] = []
     for group in groups_of(spec):
         if group.on_demand.base or group.on_demand.fallback:

@@ -1,7 +1,6 @@
 """The user's changes besides the pool file: scale, drain, exclude, down. Pure.
 
-Each command is one operation that returns a new intent, so that it works whether or not
-a manager lives: the command line writes the result, the manager reads it.
+The command line writes what an operation returns, the manager reads it.
 """
 
 from __future__ import annotations

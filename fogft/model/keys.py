@@ -1,9 +1,8 @@
 """Descriptions of pool file keys, each beside the dataclass field that it sets. Pure.
 
-A field of a specification's dataclass is made by `key`: what may stand there, its unit, its
-default and its help. The reader of the pool file, the JSON Schema, the page
-`docs/reference/pool-file.md`, the ROS parameters and the proxies' configuration files all come from
-that.
+A field of a specification's dataclass is made by `key`. The reader of the pool file, the JSON
+Schema, the page `docs/reference/pool-file.md`, the ROS parameters and the proxies' configuration
+files all come from that.
 
     class HealthSpec:
         suspect_after_s: float = key(Number(3600, "seconds"), "Mark a replica ...", default=2.0)
@@ -132,13 +131,10 @@ class Free:
 
 @dataclass(frozen=True)
 class Special:
-    """Any other form: its description, its reader and its JSON Schema.
-
-    `read` raises ValueError; a hint may follow ``; ``.
-    """
+    """Any other form: its description, its reader and its JSON Schema."""
 
     what: str
-    read: Callable[[Any], Any]
+    read: Callable[[Any], Any]  # raises ValueError; a hint may follow ``; ``
     schema: dict[str, Any]
 
 
@@ -175,11 +171,7 @@ def words(form: Form) -> str:  # noqa: PLR0911
 
 
 def checked(form: Form, value: Any) -> Any:
-    """Return a value of a proxy's configuration key, if its form allows it.
-
-    Raises:
-        ValueError: It does not.
-    """
+    """Return a value of a proxy's configuration key. Raises ValueError if its form forbids it."""
     match form:
         case Text() if not form.has_parts:
             try:

@@ -1,8 +1,6 @@
 """Membership: which replicas exist and where, written by the manager, read by proxies. Pure.
 
-A membership is ordered by (epoch, version): the epoch is the writing manager's lease, so
-what an old manager wrote late never replaces what its successor wrote. Its JSON form
-carries a checksum; a damaged one is an error and changes nothing.
+What an old manager wrote late never replaces what its successor wrote: see `Membership.epoch`.
 """
 
 from __future__ import annotations
@@ -45,10 +43,7 @@ def members_of(
     revoked: Collection[str] = (),
     found: Found = Found.BY_CLOUD,
 ) -> tuple[Member, ...]:
-    """Return the members that a proxy should hold links to.
-
-    Those are ours, not ending, not revoked, and can be found.
-    """
+    """Return the members to hold links to: ours, not ending, not revoked, and can be found."""
     return tuple(
         Member(
             machine.id,
@@ -94,10 +89,7 @@ def successor(
     revoked: Collection[str] = (),
     topology: Topology | None = None,
 ) -> Membership | None:
-    """Return the next membership to write, or None when nothing would change.
-
-    What was revoked stays revoked, whether or not it is named again.
-    """
+    """Return the next membership to write, or None when nothing would change."""
     topology = topology or Topology()
     if current is None or current.pool_uid != pool_uid:
         return Membership(pool, pool_uid, epoch, 1, members, frozenset(revoked), topology)
@@ -118,11 +110,7 @@ def to_dict(membership: Membership) -> dict[str, Any]:
 
 
 def from_dict(raw: Any) -> Membership:
-    """Read a membership back.
-
-    Raises:
-        StateError: It is none, or it is damaged.
-    """
+    """Read a membership back. Raises StateError where it is none, or damaged."""
     try:
         content = {key: value for key, value in raw.items() if key != "checksum"}
         if raw["checksum"] != checksum(content):

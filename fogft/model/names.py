@@ -1,8 +1,7 @@
 """Identifiers that both ends derive: Zenoh keys, certificate names, request ids.
 
 A connection is known by pool, slot, service and type, never by an address, so a replica
-that is launched again elsewhere resumes the same connection. The identifier is the
-SHA-256 of those parts with their lengths, so that no two lists of parts collide.
+that is launched again elsewhere resumes the same connection.
 
 Source: FogROS2-SGC's construction of identifiers, extended to connections by FogROS2-FT.
 """
@@ -68,10 +67,8 @@ def service_keys(pool_uid: str, slot: int, types: Mapping[str, str]) -> dict[str
 
 
 def gateway_slot(gateway: str) -> int:
-    """Return the slot of a gateway, which robots treat like a replica.
-
-    It holds 32 bits of a hash of the name; the pool file's reader refuses two that share one.
-    """
+    """Return the slot of a gateway, which robots treat like a replica."""
+    # The pool file's reader refuses two names that share one.
     digest = hashlib.sha256(f"gateway {gateway}".encode()).digest()
     return GATEWAY_SLOTS + int.from_bytes(digest[:4], "big")
 
@@ -93,20 +90,12 @@ def endpoint(hint: str) -> Text:
 
 
 def network(text: str) -> str:
-    """Return an address or a network (``203.0.113.0/24``) as a network.
-
-    Raises:
-        ValueError: It is neither, or the address has more bits than the network.
-    """
+    """Return an address or a network (``203.0.113.0/24``) as a network. Raises ValueError."""
     return str(ipaddress.ip_network(text))
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:
-    """Return both parts of ``host:port``, an IPv6 address without its brackets.
-
-    Raises:
-        ValueError: There is no number.
-    """
+    """Return both parts of ``host:port``, an IPv6 address without brackets. Raises ValueError."""
     host, _, port = endpoint.rpartition(":")
     return host.strip("[]"), int(port)
 

@@ -1,8 +1,8 @@
 """Values as plain JSON data, and back. Pure.
 
-A dataclass says by the types of its fields what may stand where, and nothing else
-has to. An `Annotated` type has checks besides, and a key of a pool file the check of its form.
-Keys that a class does not know are left alone: a newer program may have written them.
+The types of a dataclass's fields say what may stand where. An `Annotated` type has checks besides,
+and a key of a pool file the check of its form. Unknown keys are left alone: a newer program may
+have written them.
 """
 
 from __future__ import annotations
@@ -106,11 +106,7 @@ def from_plain(cls: type[T], raw: Any) -> T:
 
 
 def stored(cls: type[T], raw: Any, what: str, hint: str = "") -> T:
-    """Return the value that JSON data of ours describes.
-
-    Raises:
-        StateError: It describes none; the message begins with ``what``.
-    """
+    """Do the same for JSON data of ours: a StateError begins with ``what``."""
     try:
         return from_plain(cls, raw)
     except ValueError as error:

@@ -248,10 +248,7 @@ class LinkReport:
 
     @property
     def doubted(self) -> bool:
-        """Whether it was up and has been silent for longer than answers take.
-
-        Nothing follows from it but a question to the cloud.
-        """
+        """Whether it was up and is silent for longer than answers take: the cloud is asked."""
         if self.state is LinkState.UP:
             return self.silent_for_s >= doubted_after_s(self.rtt_s)
         return self.state is LinkState.SUSPECT

@@ -21,11 +21,7 @@ _INTERFACE = re.compile(r"[A-Z][A-Za-z0-9]*")
 
 
 def absolute_service_name(name: str) -> str:
-    """Return a service's absolute name: ``detect`` becomes ``/detect``.
-
-    Raises:
-        ValueError: It is not a service name; the text says why.
-    """
+    """Return a service's absolute name: ``detect`` becomes ``/detect``. Raises ValueError."""
     if name.startswith("~") or "{" in name:
         raise ValueError("private names and substitutions need a node; write the full name")
     absolute = name if name.startswith("/") else "/" + name

@@ -1,8 +1,6 @@
 """Replicas and cap by the time of the week. Pure: `now` is an argument.
 
-Windows are told by the clock on the wall, so they follow daylight-saving time: a window of
-08:00 to 18:00 is nine hours long on no day, and begins at 08:00 on all. The rules of time
-zones are the standard library's data.
+Windows are told by the clock on the wall, so they follow daylight-saving time.
 
     now ──► window that holds now ───────────► replicas, cap
         └─► window that holds now + prelaunch ─► the more replicas, with its cap
@@ -15,8 +13,7 @@ import zoneinfo
 from typing import NamedTuple
 
 from fogft.model.choices import ScheduleSpec, WindowSpec
-
-DAY_S = 86_400
+from fogft.model.keys import DAY_S
 
 
 class Wish(NamedTuple):
@@ -28,11 +25,7 @@ class Wish(NamedTuple):
 
 
 def zone(name: str) -> datetime.tzinfo:
-    """Return a time zone by its name.
-
-    Raises:
-        ValueError: There is no such zone, or this machine has no database of them.
-    """
+    """Return a time zone by its name. Raises ValueError where this machine knows none."""
     if name == "UTC":
         return datetime.timezone.utc
     try:

@@ -1,8 +1,7 @@
 """Gateways: their upstream gateways, and the robots that use them. Pure.
 
-Whoever goes through gateways holds links to them and to no replica; all others hold links
-to the replicas. A gateway may go through others, so they form trees; a loop is refused
-wherever a topology is read.
+Whoever goes through gateways holds links to them and to no replica. A gateway may go through
+others; a loop is refused wherever a topology is read.
 """
 
 from __future__ import annotations
@@ -27,11 +26,7 @@ _NAMES = Listed(_NAME, GATEWAYS_LIMIT, least=0)
 
 @dataclass(frozen=True)
 class Gateway:
-    """A gateway as the pool file describes it.
-
-    Attributes:
-        generations: Of its certificates that are good; more than one while they change.
-    """
+    """A gateway as the pool file describes it."""
 
     name: str = key(_NAME, "Name of the gateway, as in its certificate.")
     endpoint: str = key(
@@ -45,7 +40,7 @@ class Gateway:
         default=(),
         usual="the replicas",
     )
-    generations: tuple[Generation, ...] = ()
+    generations: tuple[Generation, ...] = ()  # of certificates that are good; two while they change
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,8 @@
 """Definitions of service types, and the differences between two of one name. Pure.
 
-The robot and a replica load a type by its name, each from its own workspace. Where the two
-definitions are not the same, bytes of one are read as another message: numbers that look
-right and are not. So the definitions are compared before the first request.
-
-A distribution that has type hashes (Iron and later) tells sameness by them. Where either side
-has none (Humble), or to say what differs, fields are compared one by one.
+The robot and a replica load a type by its name, each from its own workspace: bytes of another
+definition would be read as numbers that look right and are not. Distributions with type hashes
+(Iron and later) tell sameness by them; else, or to say what differs, fields are compared.
 """
 
 from __future__ import annotations

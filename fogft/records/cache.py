@@ -1,9 +1,7 @@
 """A cache of records on disk, so that a process can start while no peer can be reached.
 
-The file is written whole, has a version and a checksum, and each record in it keeps its
-signature, which is checked again. A damaged file is told and costs only itself.
-
-Owns: the file. Not here: when it is written, and what stands in a record.
+The file has a version and a checksum, and each record in it keeps its signature, which is checked
+again. A damaged file is told and costs only itself.
 """
 
 from __future__ import annotations
@@ -34,11 +32,11 @@ class _File:
     records: list[Any]
 
 
-def write(path: Path, records: Sequence[SignedRecord], *, durable: bool = True) -> None:
+def write(path: Path, records: Sequence[SignedRecord]) -> None:
     """Replace the file."""
     content = [to_plain(one) for one in records]
     whole = {"version": VERSION, "checksum": checksum(content), "records": content}
-    disk.write_json(path, whole, durable=durable)
+    disk.write_json(path, whole)
 
 
 def read(path: Path) -> list[SignedRecord]:

@@ -1,10 +1,8 @@
 """A process's membership records: kept on disk, exchanged with every rendezvous it can reach.
 
-It dials all endpoints and keeps on dialling; nothing waits for it. What it publishes is its
-own to say; what it passes on from others is signed by them. So a process goes on with what
+It dials all endpoints and keeps on dialling; nothing waits for it. So a process goes on with what
 it knows, and knows everything again moments after one rendezvous is back.
 
-Owns: one thread with its event loop, the connections, own sequence numbers, the cache.
 Not here: what records mean (`fogft.records.roster`).
 """
 
@@ -157,11 +155,8 @@ class RendezvousClient:
             self._main.cancel()
 
     async def _live(self) -> None:
-        tasks = [asyncio.ensure_future(self._call(endpoint)) for endpoint in self._endpoints]
-        tasks += [
-            asyncio.ensure_future(self._keep_cache()),
-            asyncio.ensure_future(self._keep_own()),
-        ]
+        steps = [*map(self._call, self._endpoints), self._keep_cache(), self._keep_own()]
+        tasks = [self._loop.create_task(step) for step in steps]
         try:
             await asyncio.gather(*tasks)
         finally:

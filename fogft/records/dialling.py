@@ -1,10 +1,9 @@
 """Open a connection to a rendezvous, soon after it becomes reachable, and verify it.
 
-A new attempt begins every 0.25 s while earlier ones are still under way. One that was sent
-into a black hole would be repeated by TCP after 1, 3, 7 seconds; one that crosses a slow
-link needs seconds. Overlapping attempts serve both.
+A new attempt begins every 0.25 s while earlier ones are still under way: TCP repeats one that was
+lost only after 1, 3, 7 seconds, and one that crosses a slow link needs seconds.
 
-Owns: TCP, TLS and the greeting. Not here: what is exchanged then (`exchange`).
+Not here: what is exchanged then (`exchange`).
 """
 
 from __future__ import annotations

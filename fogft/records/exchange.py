@@ -3,8 +3,7 @@
 Both ends of a connection do the same: tell what they have, send what the other lacks, pass
 on at once what is new. So a rendezvous that comes back empty is filled by whoever connects.
 
-Owns: the record set, and the connections that it is exchanged over.
-Not here: making connections (`server`, `client`).
+Not here: making connections (`server`, `dialling`).
 """
 
 from __future__ import annotations

@@ -2,8 +2,6 @@
 
 Each message is a JSON object behind its length. Whatever bytes come in, and however they are
 cut, a reader gives messages or raises `RecordError`, and holds no more than one frame.
-
-Owns: the bytes and the shape of messages. Not here: records (`fogft.records.record`), sockets.
 """
 
 from __future__ import annotations
@@ -89,14 +87,8 @@ def proof_bytes(purpose: str, nonce: bytes, binding: bytes) -> bytes:
 
 def greeting(certificate: bytes, signature: bytes) -> bytes:
     """Return the caller's first message: its certificate and the proof."""
-    return frame(
-        {
-            "type": "greeting",
-            "v": VERSION,
-            "certificate": certificate.hex(),
-            "signature": signature.hex(),
-        }
-    )
+    proof = {"certificate": certificate.hex(), "signature": signature.hex()}
+    return frame({"type": "greeting", "v": VERSION, **proof})
 
 
 def read_greeting(message: dict[str, Any]) -> tuple[bytes, bytes]:

@@ -1,11 +1,8 @@
 """Membership records, each signed by its only allowed writer. Pure.
 
-A record has one key (kind and subject), one writer, and an order (generation, sequence).
 What travels is its body as bytes, with the writer's certificate and signature over exactly
-these bytes, so anybody may pass a record on and nobody can change it. Whatever comes in, a
-reader returns a value or raises `RecordError`.
+these bytes, so anybody may pass a record on and nobody can change it.
 
-Owns: the bytes of records, and who may write which.
 Not here: merging (`record_set`), what contents mean (`roster`), cryptography (passed in).
 """
 

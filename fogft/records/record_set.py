@@ -1,11 +1,9 @@
 """Records merged by (generation, sequence): the same set, whatever order they came in. Pure.
 
-Everybody holds such a set: robots, replicas, gateways, the manager and each rendezvous.
-Offering a record again, late or out of order changes nothing, so any two that meet can
+Offering a record again, late or out of order changes nothing, so any two processes that meet can
 simply exchange what the other lacks.
 
-Owns: which record stands for a key, what is refused, and how often.
-Not here: a record's bytes (`records`), its meaning (`roster`), how it travels (`fogft.link`).
+Not here: a record's bytes (`record`), its meaning (`roster`), how it travels (`exchange`).
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from fogft.records.record import (
     read_body,
     verified_writer,
 )
-from fogft.records.roster import check_content, revoked_names
+from fogft.records.roster import READERS, revoked_names
 
 KEYS_LIMIT = 1024
 
@@ -84,7 +82,7 @@ class RecordSet:
             return Verdict.KNOWN
         if held is not None and not _replaces(record, signed, held):
             return Verdict.OLDER
-        check_content(record)
+        READERS[record.kind](record)
         if held is None and len(self._held) >= self._limit:
             raise RecordError("full", f"a record beyond the {self._limit} that are kept")
         # Last, being the costly step: a flood of old records costs no signature checks.

@@ -4,8 +4,7 @@ The manager's admission says which generation of which slot is in. A replica's o
 says where it is: it counts only while its generation is the one admitted. A content that is
 none raises `RecordError`.
 
-Owns: the contents of records, and the membership that follows from them.
-Not here: who may write them (`records`) and which one stands (`record_set`).
+Not here: who may write them (`record`) and which one stands (`record_set`).
 """
 
 from __future__ import annotations
@@ -105,12 +104,7 @@ def lease(record: Record) -> ServingLease:
     return read(ServingLease, record.content)
 
 
-def check_content(record: Record) -> None:
-    """Check that a record's content is valid."""
-    _READERS[record.kind](record)
-
-
-_READERS: dict[RecordKind, Callable[[Record], object]] = {
+READERS: dict[RecordKind, Callable[[Record], object]] = {
     RecordKind.ADMISSION: admission,
     RecordKind.REVOCATION: revoked_names,
     RecordKind.LEASE: lease,
@@ -118,6 +112,7 @@ _READERS: dict[RecordKind, Callable[[Record], object]] = {
     RecordKind.ROBOT: dial_in,
     RecordKind.GATEWAY: dial_in,
 }
+"""What reads, and so checks, the content of each kind of record."""
 
 
 def located(membership: Membership, slots: Iterable[Record]) -> Membership:
@@ -127,12 +122,8 @@ def located(membership: Membership, slots: Iterable[Record]) -> Membership:
     a rendezvous saw. One that dials out has no endpoint: it is waited for.
     """
     said = {(int(r.subject), r.generation): slot_state(r) for r in slots}
-    return replace(
-        membership,
-        members=tuple(
-            _located(m, said.get((m.id.slot, m.id.generation))) for m in membership.members
-        ),
-    )
+    members = (_located(m, said.get((m.id.slot, m.id.generation))) for m in membership.members)
+    return replace(membership, members=tuple(members))
 
 
 def gateways_of(membership: Membership, holder: Holder) -> tuple[Member, ...] | None:
@@ -145,13 +136,9 @@ def gateways_of(membership: Membership, holder: Holder) -> tuple[Member, ...] | 
         return None
     uid = membership.pool_uid
     return tuple(
-        Member(
-            ReplicaId(uid, gateway_slot(gateway.name), generation),
-            gateway.endpoint,
-            gateway=gateway.name,
-        )
-        for gateway in gateways
-        for generation in gateway.generations
+        Member(ReplicaId(uid, gateway_slot(one.name), generation), one.endpoint, gateway=one.name)
+        for one in gateways
+        for generation in one.generations
     )
 
 

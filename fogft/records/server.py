@@ -1,11 +1,9 @@
 """The rendezvous server, which stores and passes on a pool's records.
 
 TLS proves the rendezvous to its callers; a caller proves itself by signing a challenge. What
-comes from anybody else, or is no message, ends that connection, is counted by reason, and
-changes nothing.
+comes from anybody else, or is no message, ends that connection and is counted by reason.
 
-Owns: the port, the greeting and its limits. Not here: records (`exchange`), the
-process (`fogft.pool.commands.rendezvous`).
+Not here: records (`exchange`), the process (`fogft.pool.commands.rendezvous`).
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
 """Sign with a certificate's key, and verify signatures: for records and greetings.
 
-Every process of a pool has a key and a certificate of the pool's CA for TLS; the same pair
-signs what it says of itself. So no further keys have to be handed out, and whoever may not
-open a link may not write a record either.
+The pair that a process has for TLS signs what it says of itself: no further keys have to be handed
+out, and whoever may not open a link may not write a record either.
 
-Owns: signatures and the judgement of certificates (CA, time, role).
 Not here: what may be signed by whom (`fogft.records.record`), making keys (`fogft.pool`).
 """
 
@@ -180,9 +178,6 @@ def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
 def _attribute(certificate: x509.Certificate, which: str) -> str:
     from cryptography import x509
 
-    oid = {
-        "CN": x509.NameOID.COMMON_NAME,
-        "OU": x509.NameOID.ORGANIZATIONAL_UNIT_NAME,
-    }[which]
-    attributes = certificate.subject.get_attributes_for_oid(oid)
+    oids = {"CN": x509.NameOID.COMMON_NAME, "OU": x509.NameOID.ORGANIZATIONAL_UNIT_NAME}
+    attributes = certificate.subject.get_attributes_for_oid(oids[which])
     return str(attributes[0].value) if len(attributes) == 1 else ""

@@ -147,7 +147,7 @@ def _content(data: bytes) -> None:
     content = _object(data)
     for kind in RecordKind:
         with contextlib.suppress(RecordError):
-            roster.check_content(records.Record(UID, kind, "0", 1, 1, content))
+            roster.READERS[kind](records.Record(UID, kind, "0", 1, 1, content))
     for read in (roster.slot_state, roster.dial_in, roster.admission, roster.revoked_names):
         with contextlib.suppress(RecordError):
             read(records.Record(UID, RecordKind.SLOT, "0", 1, 1, content))

@@ -24,10 +24,7 @@ def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
     """Build an image of a pool file, and push it. Docker's own words go to this process's stderr.
 
     Args:
-        file: The pool file.
-        tag: The image's name.
         base: What it is built on; None for the pool file's own image, else plain Ubuntu.
-        push: Whether it is pushed.
 
     Raises:
         SpecError: The pool file runs on no real cloud, or cannot be baked.

@@ -1,10 +1,8 @@
 """Change a running pool besides its file: scale, drain, exclude, retry, certificates.
 
-`scale`, `drain`, `exclude`, `include` and `retry` write the new intent under the pool's lock and
-return; the manager, now or when there is one again, acts on it. Certificates that are revoked or
-rotated are waited for until that has taken effect.
+The first five write the new intent under the pool's lock and return; the manager, now or when there
+is one again, acts on it. Certificates are waited for until they are revoked or in use.
 
-Owns: reading, changing and writing the intent as one step; revoking and rotating.
 Not here: what the operations mean (`fogft.model.intent`), bundles (`joining`), the CA and its
 ledger (`fogft.pool.credentials`).
 """

@@ -1,10 +1,8 @@
 """Join bundles: their content, and how `fogft join` sets a machine up from one.
 
-The bundle brings all that a proxy needs: configuration, certificate and key, the CA, and
-the membership as it was. It is used once: the file is destroyed when it has been opened, a
-copy is refused here by its id, and on other machines by what was said at the rendezvous.
-What was there for the same holder is replaced, file by file, with the certificate last: a
-proxy that runs takes it into use by itself.
+It is used once: the file is destroyed when it has been opened, a copy is refused here by its id,
+and on other machines by what was said at the rendezvous. What was there for the same holder is
+replaced with the certificate last: a proxy that runs takes it into use by itself.
 
 Owns: the content of bundles, and the folders of joined holders.
 Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`claiming`).
@@ -199,10 +197,9 @@ def used_once(root: Path, label: Label) -> Iterator[None]:
 @contextlib.contextmanager
 def _on_disk(folder: Path, files: Mapping[str, str], holder: Holder) -> Iterator[CredentialPaths]:
     """Have credentials in files of their own before they are put where a proxy sees them."""
-    stem = holder.role.value
     named = {PurePosixPath(name).name: text for name, text in files.items()}
     with tempfile.TemporaryDirectory(dir=folder) as made:
-        place = CredentialPaths(*(Path(made) / n for n in ("ca.crt", f"{stem}.crt", f"{stem}.key")))
+        place = CredentialPaths.of(Path(made), holder.role.value)
         for path in (place.ca, place.certificate, place.key):
             disk.write_whole(path, named.get(path.name, ""))
         yield place

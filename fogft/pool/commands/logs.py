@@ -20,10 +20,7 @@ EVENTS = 200
 
 
 def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[str, Path]]:
-    """Return logs with their names: ``manager``, ``proxy``, then ``slot.generation``.
-
-    Of one slot where it is given: then only those of its replicas.
-    """
+    """Return logs by name: ``manager``, ``proxy``, ``slot.generation``; or one slot's replicas'."""
     uid = store.identity().uid
     events = [e for e in store.recent(sys.maxsize) if e.kind not in OF_NO_REPLICA]
     launched = {(e.slot, e.generation) for e in events[-EVENTS:]}

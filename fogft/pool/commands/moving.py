@@ -1,9 +1,6 @@
 """Move a pool to another machine: CA, history, spec and intent in one sealed file.
 
-Replicas are not touched and go on answering. From the export on no manager starts for the pool on
-the old machine and no command changes it. Managers on the new one take epochs of a later term, so
-what the old machine may still say is out of date to everybody who hears both. Where copies of a
-file were imported on two machines, the manager of the earlier term hears of it and steps back.
+docs/design/manager.md says what keeps the old machine, or another copy, from managing it too.
 
 Owns: what is in the file, and the order of steps. Not here: sealing (`bundle`).
 """

@@ -69,14 +69,11 @@ class Awaited:
         )
 
     def is_answering(self, seen: Seen) -> bool:
-        """Whether every service has a ready replica and a client proxy.
-
-        A pool whose schedule wants no replica now is as it should be.
-        """
+        """Whether every service has a ready replica and a client proxy."""
         status = seen.status
         if status.observed_at < self.since:
             return False
-        if status.cloud_reachable and not status.target:
+        if status.cloud_reachable and not status.target:  # its schedule wants no replica now
             return True
         names = {service.name for service in status.services}
         ready = {service.name for service in status.services if service.ready_replicas}

@@ -1,7 +1,6 @@
 """``fogft rendezvous --config FILE``: a rendezvous as a process.
 
-It needs a port that robots and replicas can reach, a certificate, and nothing else. Its
-memory on disk spares callers a moment after a restart; without it they bring everything.
+Its memory on disk spares callers a moment after a restart; without it they bring everything.
 """
 
 from __future__ import annotations

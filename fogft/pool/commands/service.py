@@ -145,10 +145,7 @@ def environment(environ: Mapping[str, str] = os.environ) -> str:
 
 
 def install(where: Services, units: Sequence[Unit]) -> list[str]:
-    """Write units and their environment, and have them started now and at each boot.
-
-    Returns what systemd said against it; nothing where they were started.
-    """
+    """Have units started now and at each boot; return what systemd said against it."""
     disk.write_whole(units[0].environment, environment())
     if not where.folder.is_dir():
         disk.make_folder(where.folder)

@@ -77,27 +77,22 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
         shutdown.without_manager(paths, ended.append),
         shutdown.without_client_proxy(paths, ended.append),
     ):
-        return _create_anew(store, spec, source, file, cloud)
-
-
-def _create_anew(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Identity:
-    paths = store.paths
-    uid = secrets.token_hex(8)
-    old = (
-        *(paths.history, paths.membership, paths.lease, paths.records, paths.manager_records),
-        *(paths.good_spec, paths.trial, paths.discovered, paths.status, paths.proxy_status),
-    )
-    for left in (paths.credentials, *old):
-        if left.is_dir() and not left.is_symlink():
-            shutil.rmtree(left, ignore_errors=True)
-        else:
-            left.unlink(missing_ok=True)
-    authority.create_authority(paths.credentials, uid)
-    disk.write_whole(paths.spec, source)
-    store.write_intent(Intent())
-    identity = Identity(spec.name, uid, cloud, str(file), time.time())
-    write_identity(paths, identity)
-    return identity
+        uid = secrets.token_hex(8)
+        old = (
+            *(paths.history, paths.membership, paths.lease, paths.records, paths.manager_records),
+            *(paths.good_spec, paths.trial, paths.discovered, paths.status, paths.proxy_status),
+        )
+        for left in (paths.credentials, *old):
+            if left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+        authority.create_authority(paths.credentials, uid)
+        disk.write_whole(paths.spec, source)
+        store.write_intent(Intent())
+        identity = Identity(spec.name, uid, cloud, str(file), time.time())
+        write_identity(paths, identity)
+        return identity
 
 
 def revive_client_proxy(paths: PoolPaths) -> None:
@@ -108,11 +103,7 @@ def revive_client_proxy(paths: PoolPaths) -> None:
 
 
 def manager_version(paths: PoolPaths, pid: int | None = None) -> str:
-    """Return the fogft version of a pool's manager; empty if unknown.
-
-    Args:
-        pid: Its process: what another one has written does not count.
-    """
+    """Return the fogft version of a pool's manager, of process `pid`; empty if unknown."""
     said = disk.read_json(paths.status)
     if not isinstance(said, dict) or (pid is not None and said.get("manager_pid", pid) != pid):
         return ""

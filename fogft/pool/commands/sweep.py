@@ -1,10 +1,8 @@
 """Find and end machines of this user's pools that no manager owns.
 
 A manager owns a machine while it holds its pool's lock on this computer. Whatever else is
-listed costs money that nobody watches: the pool's folder was lost, its manager was ended for
-good, or `down` was cut short.
+listed costs money that nobody watches.
 
-Owns: who owns what.
 Not here: what exists (`fogft.cloud`, past every memory) and asking the user (`fogft.cli`).
 """
 
@@ -36,13 +34,9 @@ class Unowned:
 
 @dataclass(frozen=True)
 class Swept:
-    """The machines found in one cloud.
+    """The machines found in one cloud."""
 
-    Attributes:
-        cloud: Its name, one of `composition.CLOUDS`.
-    """
-
-    cloud: str
+    cloud: str  # one of `composition.CLOUDS`
     unowned: Sequence[Unowned]
     asked: frozenset[str]
 
@@ -94,10 +88,7 @@ def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
 
 
 def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
-    """End machines one by one; return the errors.
-
-    One that a manager has taken over meanwhile is left alone.
-    """
+    """End machines one by one, but for those with a manager again; return the errors."""
     cloud = make_cloud(found.cloud, Path.cwd())
     problems: list[FogftError] = []
     for one in found.unowned:
@@ -115,11 +106,7 @@ def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
 
 
 def _pools() -> dict[str, tuple[str, bool]]:
-    """Return uid -> name and whether it has a manager, of the pools here.
-
-    Raises:
-        StateError: A pool's identity cannot be read: its machines would look like nobody's.
-    """
+    """Return uid -> name and whether it has a manager, of the pools here."""
     found = {}
     for name in pools():
         paths = PoolPaths.of(name)

@@ -82,11 +82,9 @@ class CostBook:
         self._written_at: float | None = None
         self._looked_at = 0.0
         found = _read(path)
-        known = found is not None and found.uid == uid
-        self.costs = found if found is not None and known else Costs(pool, uid)
-        self._days = {(one.day, one.replica): one for one in self.costs.spent}
-        self._running = dict(self.costs.running)
-        self._before_usd = self.costs.before_usd
+        self._kept = found if found is not None and found.uid == uid else Costs(pool, uid)
+        self._days = {(one.day, one.replica): one for one in self._kept.spent}
+        self._running = self._kept.running
 
     def look(
         self, now: float, machines: Sequence[Machine], offers: Sequence[Offer], alone_s: float
@@ -126,13 +124,13 @@ class CostBook:
         if due or ended:
             self._settle(now)
             disk.make_folder(self._path.parent)
-            disk.write_json(self._path, to_plain(self.costs), durable=False)
+            disk.write_json(self._path, to_plain(self._kept), durable=False)
             self._written_at = now
 
     @property
     def usd(self) -> float:
         """The total cost, in US dollars."""
-        return self._before_usd + sum(one.usd for one in self._days.values())
+        return self._kept.before_usd + sum(one.usd for one in self._days.values())
 
     def _charge(self, name: str, place: Placement, begun: float, end: float, price: float) -> None:
         while begun < end:
@@ -150,11 +148,9 @@ class CostBook:
     def _settle(self, now: float) -> None:
         oldest = _day(now - _DAYS_KEPT * DAY_S)
         old = [key for key in self._days if key[0] < oldest]
-        self._before_usd += sum(self._days.pop(key).usd for key in old)
+        before_usd = self._kept.before_usd + sum(self._days.pop(key).usd for key in old)
         spent = tuple(self._days[key] for key in sorted(self._days))
-        self.costs = Costs(
-            self.costs.pool, self.costs.uid, spent, dict(self._running), self._before_usd
-        )
+        self._kept = replace(self._kept, spent=spent, running=self._running, before_usd=before_usd)
 
 
 def read_all(folder: Path) -> list[Costs]:

@@ -7,12 +7,12 @@ Owns: `history.jsonl`. Not here: what follows from events (`fogft.planning.obser
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
@@ -87,18 +87,9 @@ def _append_durably(path: Path, line: bytes) -> None:
 
 
 def _read_events(path: Path) -> list[Event]:
-    """Return the events of a file, without a torn last line and what else is damaged.
-
-    A line that cannot be read is skipped but its generation cannot be: the cloud's list
-    then still keeps generations from being used twice.
-    """
-    lines = (disk.read_bytes(path) or b"").splitlines()
-    return [event for event in map(_event, lines) if event is not None]
-
-
-def _event(line: bytes) -> Event | None:
-    try:
-        value: Any = json.loads(line)
-        return from_plain(Event, value)
-    except (ValueError, RecursionError):
-        return None
+    """Return the events of a file, without a torn last line and what else is damaged."""
+    events = []
+    for line in (disk.read_bytes(path) or b"").splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
+            events.append(from_plain(Event, json.loads(line)))
+    return events

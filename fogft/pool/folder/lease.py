@@ -1,9 +1,7 @@
 """The manager's lease: one holder per pool, an epoch for each holder, and a heartbeat.
 
-The lock keeps two managers of one folder apart; the epoch, which goes into every
-membership, fences off what an earlier one may still write; the beat tells the proxies
-(and through them the replicas) that somebody looks after the pool. A machine that imports a pool
-counts from a random later term, so of two that import copies one is the later one, for everybody.
+A machine that imports a pool counts from a random later term, so of two that import copies one is
+the later one, for everybody.
 
 Owns: `manager.lock` and `lease.json`.
 """

@@ -32,8 +32,6 @@ _NO_IDENTITY = (
     "restore it, or remove the pool's folder, which ends the manager and the client proxy; "
     "`fogft sweep --end` then ends the machines"
 )
-
-
 _Name = Annotated[str, only(POOL_NAME_PATTERN.fullmatch, "a pool's name")]
 
 

@@ -1,8 +1,7 @@
 """The manager's signed records: membership, revocations and its lease.
 
-The same membership goes to the client proxy of this machine as a file, and to everybody else
-as signed records. Without a rendezvous in the pool file only what was taken back and the lease are
-signed, for the client proxy to pass on.
+Without a rendezvous in the pool file only revocations and the lease are signed, for the client
+proxy to pass on.
 
 Owns: the manager's certificate for signing, and its record client.
 Not here: what the membership is (`reconciler`).
@@ -98,12 +97,7 @@ class ManagerRecords:
         return Record(self._pool_uid, kind, "", self._epoch, sequence, content)
 
     def _files(self) -> CredentialPaths:
-        folder = self._paths.credentials
-        return CredentialPaths(
-            folder / authority.AUTHORITY_CERTIFICATE,
-            folder / f"{_STEM}.crt",
-            folder / f"{_STEM}.key",
-        )
+        return CredentialPaths.of(self._paths.credentials, _STEM)
 
     def _say(self, client: RendezvousClient, membership: Membership) -> None:
         client.publish(
@@ -135,9 +129,8 @@ class ManagerRecords:
         """Return the problem; None if at least one rendezvous can be reached."""
         if self._client is None or self._client.known.connected:
             return None
-        said = self._client.status()["rendezvous"]
-        details = "; ".join(str(one["detail"]) for one in said)
-        return Reason(Cause.NO_RENDEZVOUS, words=details)
+        details = (str(one["detail"]) for one in self._client.status()["rendezvous"])
+        return Reason(Cause.NO_RENDEZVOUS, words="; ".join(details))
 
     def close(self) -> None:
         """Leave. Repeatable."""

@@ -82,7 +82,6 @@ def proxy_config(
     role: Role = Role.ROBOT,
 ) -> str:
     """Return a client proxy's configuration, or a gateway's; this robot's unless named."""
-    folder, stem = Path(paths.credentials.name), role.value
     config = ClientProxyConfig(
         pool=identity.name,
         pool_uid=identity.uid,
@@ -90,9 +89,7 @@ def proxy_config(
         membership=Path(paths.membership.name),
         status=Path(paths.proxy_status.name),
         lock=Path(paths.proxy_lock.name),
-        credentials=CredentialPaths(
-            folder / "ca.crt", folder / f"{stem}.crt", folder / f"{stem}.key"
-        ),
+        credentials=CredentialPaths.of(Path(paths.credentials.name), role.value),
         services=spec.proxied,
         suspect_after_s=spec.health.suspect_after_s,
         rendezvous=spec.rendezvous,
@@ -144,13 +141,12 @@ def build_order(
     holder = holder_of(id.certificate_name)
     issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
     bare = bare_order(identity, spec, planned)
+    config = replica_config(identity, spec, id, announcements=bool(announcements))
     return replace(
         bare,
         task=with_build(absolute(bare.task, Path(identity.file).parent)),
         files={
-            "replica.yaml": replica_config(
-                identity, spec, id, announcements=bool(announcements)
-            ).encode(),
+            "replica.yaml": config.encode(),
             "ca.crt": issued.authority_pem,
             "replica.crt": issued.certificate_pem,
             "replica.key": issued.key_pem,
@@ -199,7 +195,7 @@ def gateway_order(
         membership=Path("membership.json"),
         status=Path("gateway-status.json"),
         lock=Path("gateway.lock"),
-        credentials=_beside("gateway"),
+        credentials=CredentialPaths.of(Path(), "gateway"),
         services=spec.proxied,
         suspect_after_s=spec.health.suspect_after_s,
         rendezvous=(near,),
@@ -208,7 +204,10 @@ def gateway_order(
         listen=listens,
     )
     meeting = RendezvousConfig(
-        identity.uid, _beside("rendezvous"), rendezvous, Path("rendezvous-records.json")
+        identity.uid,
+        CredentialPaths.of(Path(), "rendezvous"),
+        rendezvous,
+        Path("rendezvous-records.json"),
     )
     replica = ServerProxyConfig(
         pool=identity.name,
@@ -217,7 +216,7 @@ def gateway_order(
         generation=generation,
         services=(),
         run=_RUN_GATEWAY,
-        credentials=_beside("replica"),
+        credentials=CredentialPaths.of(Path(), "replica"),
         rendezvous=(near,),
         records=Path("records.json"),
         announcements=Path(paths.announcements.name) if announcements else None,
@@ -241,10 +240,6 @@ def gateway_order(
     )
 
 
-def _beside(stem: str) -> CredentialPaths:
-    return CredentialPaths(Path("ca.crt"), Path(f"{stem}.crt"), Path(f"{stem}.key"))
-
-
 def replica_config(
     identity: Identity, spec: PoolSpec, id: ReplicaId, *, announcements: bool = False
 ) -> str:
@@ -261,7 +256,7 @@ def replica_config(
         services=spec.services,
         run=str(spec.task.get("run") or ""),
         spare=spec.spare,
-        credentials=_beside("replica"),
+        credentials=CredentialPaths.of(Path(), "replica"),
         envs={str(k): "" if v is None else str(v) for k, v in envs.items()},
         rendezvous=spec.rendezvous,
         records=Path("records.json"),
@@ -277,7 +272,9 @@ def replica_config(
 
 def rendezvous_config(identity: Identity) -> str:
     """Return a rendezvous's configuration."""
-    config = RendezvousConfig(identity.uid, _beside("rendezvous"), status=Path("status.json"))
+    config = RendezvousConfig(
+        identity.uid, CredentialPaths.of(Path(), "rendezvous"), status=Path("status.json")
+    )
     return config_file.document(config, _RENDEZVOUS_HEADING)
 
 

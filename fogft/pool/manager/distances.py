@@ -3,13 +3,9 @@
     the pool file's `rtt_s`, links to replicas, connects to regional endpoints, great circles
 
 A provider's public endpoint of a region ends TCP in that region, so the time to connect is one
-round trip. It is timed on its own, after the name is resolved; the fastest of a few counts, for
-everything slower is somebody's queue. Measurements are kept in the home folder for a day and
-renewed in the background. A link refines what is known of a region otherwise: where nothing
-else is known, a region with a replica would look nearer than all others. Positions stand in
-`templates/regions.csv`.
+round trip; the fastest of a few counts. A link only refines what is known of a region otherwise:
+where nothing else is known, a region with a replica would look nearer than all others.
 
-Owns: measuring, keeping, and the order above.
 Not here: what they are for (`fogft.planning.listing`).
 """
 
@@ -63,14 +59,9 @@ def endpoint(region: str) -> tuple[str, int] | None:
     return None if pattern is None or not name else (pattern.format(region=name), PORT)
 
 
-def position(region: str) -> tuple[float, float] | None:
-    """Return latitude and longitude of a ``cloud/region`` in degrees; None where not known."""
-    return positions().get(region)
-
-
 @functools.cache
 def positions() -> dict[str, tuple[float, float]]:
-    """Return the positions of all regions that are known, by ``cloud/region``."""
+    """Return latitude and longitude in degrees of all known regions, by ``cloud/region``."""
     lines = template_files.read_text("regions.csv").splitlines()
     rows = csv.DictReader(line for line in lines if not line.startswith("#"))
     return {row["region"]: (float(row["latitude"]), float(row["longitude"])) for row in rows}
@@ -241,7 +232,7 @@ def regions_of(offers: Iterable[Offer]) -> set[str]:
 
 
 def _estimated(region: str, placement: PlacementSpec) -> Distance | None:
-    there = position(region)
+    there = positions().get(region)
     if placement.robot_at is None or there is None:
         return None
     return Distance(estimated_rtt_s(placement.robot_at, there), "estimated")

@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fogft import __version__, disk, logfile
 from fogft.cloud.port import Cloud, Launch, RealCloud
@@ -56,6 +56,7 @@ from fogft.process import Watchdog, notify, start_log, stop_on_signal
 from fogft.records.roster import ServingLease
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 TICK_S = 1.0
 WATCH_S = 0.05
@@ -169,7 +170,7 @@ class Manager:
         self._attempt(self._step_back)
         self._attempt(self._bound_logs)
         self._attempt(self._keep_proxy)
-        tick = self._attempt_tick()
+        tick = self._attempt(self._reconciler.tick)
         if tick is None:
             return False
         self._scrape.at(tick.spec.metrics.manager if self._metrics is None else self._metrics)
@@ -259,24 +260,16 @@ class Manager:
                 limit_s=LEAVE_LIMIT_S,
             )
 
-    def _attempt(self, step: Callable[[], None]) -> None:
+    def _attempt(self, step: Callable[[], T]) -> T | None:
         try:
-            step()
+            return step()
         except (PoolNotFound, PoolBusy):
             raise
-        except FogftError as error:
-            self._failed(error.message)
-        except OSError as error:  # no room, no descriptor, a folder that was taken away
-            self._failed(str(error))
-
-    def _failed(self, message: str) -> None:
-        log.error("manager_step_failed reason=%r", message)
-        self._trouble.append(Reason(Cause.TROUBLE, words=message))
-
-    def _attempt_tick(self) -> Tick | None:
-        ticks: list[Tick] = []
-        self._attempt(lambda: ticks.append(self._reconciler.tick()))
-        return ticks[0] if ticks else None
+        except (FogftError, OSError) as error:  # no room, no descriptor, a folder that is gone
+            message = error.message if isinstance(error, FogftError) else str(error)
+            log.error("manager_step_failed reason=%r", message)
+            self._trouble.append(Reason(Cause.TROUBLE, words=message))
+            return None
 
     def _keep_proxy(self) -> None:
         now = time.time()

@@ -4,7 +4,6 @@ An operation stays in the list until its outcome was collected, so whoever takes
 *before* asking the cloud what exists misses nothing: an order is either still in the list
 or already in the cloud's.
 
-Owns: which replicas have an operation under way, and how it ended.
 Not here: what to order (`reconciler`) and the threads (the `Submit` that comes in).
 """
 

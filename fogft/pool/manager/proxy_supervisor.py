@@ -1,9 +1,8 @@
 """Keep a client proxy, its standby and a spare running.
 
-The death of one is no reason to touch a replica, and its life needs no manager: each is started
-in a session of its own and lives on when the manager goes. Who is in line takes over by itself, in
-the instant in which the one before it ends, and the spare leaves another (`proxy.robot.standby`);
-here they are started where the line has no end, and adopted where they run already.
+Each is started in a session of its own and lives on when the manager goes. Who is in line takes
+over by itself, and the spare leaves another (`proxy.robot.standby`): here they are started where
+the line has no end, and adopted where they run already.
 
 Owns: starting them again, with backoff, and killing what hangs; and `manager.json`, by which a
 client proxy starts a manager again that was killed (`fogft.proxy.robot.manager_restart`).

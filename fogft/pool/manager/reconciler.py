@@ -1,9 +1,7 @@
 """The reconciler: observe, plan and apply, each tick from the current state.
 
-Killed at any point it leaves nothing that its successor does not repair: a launch is in
-the history before the cloud is asked, and everything else is read again from the cloud.
-
-Owns: the order of reading and writing within a tick.
+Owns: the order of reading and writing within a tick, so that one killed at any point leaves nothing
+that its successor does not repair.
 Not here: the decisions (`fogft.planning.planner`), the loop and the processes (`manager`).
 """
 
@@ -141,7 +139,7 @@ class Reconciler:
         self._by_hand = by_hand
         self._gateways = gateways
         self._gateway = gateway
-        # A planned launch is what a launch is about; None stands for a termination.
+        # The machine that is expected of a launch; None for a termination.
         self.operations: Operations[Machine | None] = Operations(submit, on_done)
         self._refreshes: Operations[None] = Operations(submit, on_done)
         self._silent = Silent()
@@ -215,11 +213,9 @@ class Reconciler:
             if outcome.subject is None:
                 log.warning("terminate_failed replica=%s reason=%r", id.short, str(error))
             else:
+                zone = outcome.subject.placement.location
                 log.warning(
-                    "launch_refused replica=%s zone=%s reason=%r",
-                    id.short,
-                    outcome.subject.placement.location,
-                    str(error),
+                    "launch_refused replica=%s zone=%s reason=%r", id.short, zone, str(error)
                 )
                 cause = _refusal(error)
                 if cause:

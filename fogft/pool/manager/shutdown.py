@@ -1,12 +1,9 @@
 """What `down` does: end everything of a pool, with or without its manager.
 
-Manager first (it would repair what we end), then the client proxy, then every machine
-that carries the pool's uid, then the folder. Stopped half-way, it can be run again.
+Manager first (it would repair what we end), then the client proxy, the machines and the folder.
+Stopped half-way, it can be run again. It takes each lock from the process that it ends, and keeps
+it: what is only starting finds its place taken and ends.
 
-It takes each lock from the process that it ends, and keeps it: what is only starting, a manager
-that the client proxy began or a standby, finds its place taken and ends.
-
-Owns: the order, and the end of our own processes.
 Not here: the machines, and the proof that none is left (`teardown`).
 """
 

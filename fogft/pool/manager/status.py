@@ -153,8 +153,7 @@ class TopicStatus:
     """One topic, possibly of an action.
 
     Attributes:
-        heard_by: The replicas, as ``slot.generation``, that pass it on now: of a topic of the
-            robot's those where a node subscribes.
+        heard_by: The replicas, as ``slot.generation``, that pass it on, or subscribe to it, now.
     """
 
     name: str

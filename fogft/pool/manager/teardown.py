@@ -8,7 +8,7 @@ Not here: ending one machine (`fogft.cloud`).
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -68,7 +68,7 @@ def end_machines(
     """
     deadline = time.monotonic() + limit_s
     told: set[str] = set()
-    refusals: dict[ReplicaId, CloudError] | None = None
+    refusals: dict[ReplicaId, FogftError] | None = None
     while True:
         try:
             left = _left(cloud, uid, known, warned)
@@ -105,28 +105,22 @@ def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -
     return left
 
 
-def _end(cloud: Cloud, machines: Iterable[Machine]) -> dict[ReplicaId, CloudError]:
+def _end(cloud: Cloud, machines: Sequence[Machine]) -> dict[ReplicaId, FogftError]:
     """End machines side by side; return those that did not end, with why."""
 
-    def terminate(machine: Machine) -> tuple[Machine, CloudError | StateError | None]:
+    def terminate(machine: Machine) -> FogftError | None:
         try:
             cloud.terminate(machine.id)
         except (CloudError, StateError) as refused:
-            return machine, refused
-        return machine, None
+            return refused
+        return None
 
     with ThreadPoolExecutor(max_workers=8) as threads:
-        outcomes = list(threads.map(terminate, machines))
-    return {
-        machine.id: error
-        if isinstance(error, CloudError)
-        else CloudError(error.message, error.hint)
-        for machine, error in outcomes
-        if error is not None
-    }
+        outcomes = zip(machines, threads.map(terminate, machines), strict=True)
+        return {machine.id: error for machine, error in outcomes if error is not None}
 
 
-def _stubborn(refusals: dict[Machine, CloudError], known: Known) -> FogftError:
+def _stubborn(refusals: dict[Machine, FogftError], known: Known) -> FogftError:
     names = ", ".join(f"`{m.id.short}` ({m.placement.location})" for m in refusals)
     why = "; ".join(sorted({error.message for error in refusals.values()}))
     hints = sorted({error.hint for error in refusals.values() if error.hint})

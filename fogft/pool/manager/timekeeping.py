@@ -1,12 +1,9 @@
 """Record in the history what happened to each replica and to the clock.
 
-One tick has one time, whoever sets the clock meanwhile. Where it was set, or the machine slept,
-that is written into the history first, and all that is remembered moves along
-(`planning.observed.clock_jumps`).
+One tick has one time. Where the clock was set, or the machine slept, that is written into the
+history first, and all that is remembered moves along.
 
-Owns: which observation is an event, when a jump is looked for, and that none is lost.
-Not here: when to look at replicas (`reconciler`), where events are stored (`store`), what a jump
-is (`planning.observed.clock_jumps`), and what moves (`planning.observed.history`, `updating`).
+Not here: what a jump is (`planning.observed.clock_jumps`), and what moves (`history`, `updating`).
 """
 
 from __future__ import annotations
@@ -53,8 +50,8 @@ class Remembering:
     def losses(self, observed: Observed) -> None:
         """Record replicas that are no longer listed. The cloud's list must be known.
 
-        It went when it was observed, not a moment later: the plan of the same observation must
-        not take the loss for something of the future, and go to the same place again.
+        The loss has the observation's time: the plan that follows must not take it for something
+        of the future, and go to the same place again.
         """
         uid = self._store.identity().uid
         ids = [m.id for m in (*(observed.machines or ()), *observed.gateway)]
@@ -103,12 +100,7 @@ log = logging.getLogger(__name__)
 
 
 class Timekeeping:
-    """The time of one manager's ticks.
-
-    Args:
-        reading: Tells in place of `clock` what time it is, and whether it was set; None where
-            nobody sets it.
-    """
+    """The time of one manager's ticks; see `Reconciler`."""
 
     def __init__(
         self,
@@ -128,8 +120,7 @@ class Timekeeping:
     def look(self) -> bool:
         """Read the clocks for a tick; return whether the time jumped.
 
-        Raises:
-            StateError: A jump cannot be written down. It is tried again at the next look.
+        Raises StateError where a jump cannot be written down; the next look tries again.
         """
         if self._reading is None:
             self.now = self._clock()
@@ -167,11 +158,7 @@ _TRIES = 10
 
 
 def read() -> Reading:
-    """Read all three clocks at one moment.
-
-    A process that is held up between two of them would see a jump where there is none, so it
-    reads again.
-    """
+    """Read all three clocks at one moment, again where the process was held up between two."""
     for _ in range(_TRIES):
         awake_s = time.monotonic()
         steady_s = time.clock_gettime(time.CLOCK_BOOTTIME)

@@ -1,10 +1,8 @@
 """Carry out updates of the pool file, and roll back to the last good one.
 
-Two files, both the manager's: the good file, byte for byte, and what is remembered of the one
-applied last. `up` writes neither: another file's digest makes what is remembered void, so the
+`up` writes neither the good file nor the trial: another file's digest makes the trial void, so the
 next `up` with a changed file tries again. Killed anywhere, the next tick goes on.
 
-Owns: when the good file is kept, and when a version is given up.
 Not here: the judgement (`fogft.planning.rollout`), the files' place (`store`).
 """
 

@@ -109,7 +109,7 @@ def test_a_damaged_file_holds_nothing(tmp_path: Path, content: str):
 def test_estimates_grow_with_the_distance():
     here = (37.87, -122.26)
     regions = ["aws/us-west-1", "aws/us-west-2", "aws/us-east-1", "aws/eu-central-1"]
-    guesses = [distances.estimated_rtt_s(here, distances.position(r)) for r in regions]
+    guesses = [distances.estimated_rtt_s(here, distances.positions()[r]) for r in regions]
     assert guesses == sorted(guesses)
     assert guesses[0] < 0.02
     assert 0.1 < guesses[-1] < 0.25
