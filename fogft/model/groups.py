@@ -35,11 +35,6 @@ class Group(GroupSpec):
         """The lowest slot of the group."""
         return self.block * BLOCK
 
-    @property
-    def first_stand_in(self) -> int:
-        """The lowest slot of its on-demand stand-ins for spot machines."""
-        return self.first_slot + STAND_INS
-
     def owns(self, slot: int) -> bool:
         """Whether a slot belongs to the group."""
         return slot // BLOCK == self.block

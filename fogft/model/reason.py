@@ -155,21 +155,11 @@ class Reason:
     words: str = ""
     because: tuple[Reason, ...] = ()
 
-    @property
-    def place_at_fault(self) -> bool:
-        """Whether the location is at fault: a replacement goes elsewhere."""
-        return self.cause not in _NOT_THE_PLACE
 
-    @property
-    def is_move(self) -> bool:
-        """Whether a healthy replica moves to a better location."""
-        return self.cause in _MOVES
-
-
-_MOVES = frozenset(
+MOVES = frozenset(
     {Cause.BETTER_SPREAD, Cause.BETTER_SCORE, Cause.SPOT_AGAIN, Cause.ON_DEMAND_AGAIN}
 )
-_NOT_THE_PLACE = _MOVES | {Cause.OUTDATED}
+"""Of a healthy replica, to a better location."""
 
 
 def because(reason: Reason | None) -> tuple[Reason, ...]:

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from fogft.model.choices import Spread
 from fogft.model.groups import Group, group_of, is_stand_in, replica_hash
 from fogft.model.intent import Intent
-from fogft.model.reason import Cause, Reason, because
+from fogft.model.reason import MOVES, Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.spec import PoolSpec
 from fogft.planning.classification import Classification
@@ -264,11 +264,12 @@ class Buyer:
         old = need.replaces
         avoid = set()
         why = old.why if old is not None else None
-        if old is not None and (why is None or why.place_at_fault):
+        moves = why is not None and why.cause in MOVES
+        is_outdated = why is not None and why.cause is Cause.OUTDATED
+        if old is not None and not (moves or is_outdated):  # the place is at fault
             avoid.add(old.placement.location)
         taken = self.places(old, lasting=not need.stands_in)
         spot = False if need.stands_in else self.kind(need.group, old)
-        moves = why is not None and why.is_move
         market = self.market(need.group, spot, at_leisure=moves)
         found = market.choose(taken, avoid=avoid, budget_usd_per_hour=budget)
         last = None if found.offer or moves else self._in_spite(need.group, spot)

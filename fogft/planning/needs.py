@@ -10,7 +10,7 @@ import itertools
 from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
-from fogft.model.groups import Group, group_of, is_stand_in
+from fogft.model.groups import STAND_INS, Group, group_of, is_stand_in
 from fogft.model.reason import Cause, Reason, because
 from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment
@@ -100,7 +100,7 @@ def _missing(
 
 def stand_in(group: Group, used: Collection[int]) -> Need:
     """Return the launch of an on-demand machine that serves until a spot one does."""
-    slot = _lowest_free(group.first_stand_in, used)
+    slot = _lowest_free(group.first_slot + STAND_INS, used)
     return Need(slot, Reason(Cause.STANDS_IN), group, stands_in=True)
 
 

@@ -56,10 +56,7 @@ def read(path: Path) -> list[SignedRecord]:
 
 
 def restore(path: Path, records: RecordSet, ca: Path) -> bool:
-    """Restore the records on disk, also those whose certificates have expired since.
-
-    A damaged file is told; then false is returned.
-    """
+    """Restore the records on disk, expired certificates' too; return false for a damaged file."""
     try:
         known = read(path)
     except StateError as error:  # whoever connects brings them back

@@ -37,16 +37,12 @@ _END_WAIT_S = 2.0
 
 @dataclass(frozen=True)
 class Known:
-    """The records known at one moment. Immutable, so any thread may read it.
-
-    Attributes:
-        seen_host: Our own address, as a rendezvous saw it; empty if none did.
-    """
+    """The records known at one moment. Immutable, so any thread may read it."""
 
     records: tuple[Record, ...] = ()
     revoked: frozenset[str] = frozenset()
     connected: int = 0
-    seen_host: str = ""
+    seen_host: str = ""  # our own address, as a rendezvous saw it; empty if none did
 
     def of(self, kind: RecordKind) -> list[Record]:
         """Return the records of a kind."""
@@ -114,11 +110,7 @@ class RendezvousClient:
         *,
         sequence: int | None = None,
     ) -> None:
-        """Publish a record of our own from now on. Any thread.
-
-        Args:
-            sequence: Its number; None for one above all that were said before.
-        """
+        """Publish our own record from now on; without `sequence` above all before. Any thread."""
         own = _Own(generation, dict(content), sequence)
         self._loop.call_soon_threadsafe(self._say, kind, subject, own)
 

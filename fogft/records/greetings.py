@@ -24,10 +24,7 @@ def oldest_of_most(greeting: Mapping[T, str]) -> T:
 
 @lru_cache(maxsize=1024)
 def network_of(host: str) -> str:
-    """Return the network of an IPv6 address, 64 bits, for who has one has them all; else the host.
-
-    It is written as its first address.
-    """
+    """Return the network of an IPv6 address, 64 bits, as its first address; else the host."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

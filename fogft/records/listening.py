@@ -8,11 +8,7 @@ from fogft.errors import WireError
 
 
 def listening(endpoint: str) -> socket.socket:
-    """Return a socket that listens at ``host:port``; port 0 for any that is free.
-
-    Raises:
-        WireError: The port cannot be had.
-    """
+    """Return a socket that listens at ``host:port``; port 0 for any free one. Raises WireError."""
     host, _, port = endpoint.rpartition(":")
     is_v6 = ":" in host
     try:

@@ -99,15 +99,11 @@ class Record:
 
 @dataclass(frozen=True)
 class SignedRecord:
-    """A record in its signed form, as sent and stored.
-
-    Attributes:
-        signature: Over `signed_bytes(body)`, with that certificate's key (DER).
-    """
+    """A record in its signed form, as sent and stored."""
 
     body: bytes
-    certificate: bytes
-    signature: bytes
+    certificate: bytes  # DER
+    signature: bytes  # over `signed_bytes(body)`, with that certificate's key
 
 
 @dataclass(frozen=True)
@@ -130,11 +126,7 @@ def signed_bytes(body: bytes) -> bytes:
 
 
 def sign_record(record: Record, sign: Sign) -> SignedRecord:
-    """Sign a record.
-
-    Raises:
-        ValueError: It could not be read back: too large, or not JSON data.
-    """
+    """Sign a record. Raises ValueError for one that could not be read back, such as too large."""
     value = {"v": VERSION, **plain.to_plain(record)}
     body = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     if _decode(body) != record:

@@ -38,11 +38,7 @@ CALLERS = frozenset({"manager", "robot", "replica", "gateway"})
 
 
 class RendezvousServer:
-    """Listens for callers of one pool; all on the event loop that calls `serve`.
-
-    Args:
-        listen: ``host:port``; port 0 for any that is free.
-    """
+    """Listens for callers of one pool; all on the event loop that calls `serve`."""
 
     def __init__(
         self, listen: str, credentials: CredentialPaths, verify: Verify, exchange: Exchange

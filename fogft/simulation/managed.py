@@ -18,6 +18,7 @@ from fogft.model.spec import PoolSpec
 from fogft.planning.endings import DRAIN_LIMIT_S, DRAIN_SETTLE_S
 from fogft.planning.fallback import OFTEN_S, SETTLED_S, STAYS_S, losses_of_late
 from fogft.planning.observed import backoff, launches
+from fogft.planning.observed.clock_jumps import Reading
 from fogft.planning.observed.hazard import EVERY_S, as_of
 from fogft.planning.observed.health import LONE_SILENCE_FACTOR
 from fogft.planning.observed.history import Event, History, compacted
@@ -111,8 +112,11 @@ class Managed:
         ]
         self._ready = frozenset(service.name for service in spec.services)
         self._reconciler = Reconciler(
-            world, self.store, clock=lambda: world.now, links=self._links, submit=self._submit
+            world, self.store, clock=self._clock, links=self._links, submit=self._submit
         )
+
+    def _clock(self) -> Reading:
+        return Reading(self.world.now, self.world.now, self.world.now)
 
     def tick(self, now: float) -> float:
         """Run the manager once."""

@@ -120,8 +120,7 @@ class World:
         return Reconciler(
             self.cloud,
             self.store,
-            clock=lambda: self.now,
-            reading=lambda: Reading(self.now + self.clock_ahead_s, self.now, self.now),
+            clock=lambda: Reading(self.now + self.clock_ahead_s, self.now, self.now),
             links=self.links,
             submit=self._queue.append if self.deferred else lambda run: run(),
             epoch=epoch,

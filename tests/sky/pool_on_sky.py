@@ -11,6 +11,7 @@ from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState
 from fogft.model.replica import LinkReport, LinkState, Offer, Placement, ReplicaId
 from fogft.model.spec import PoolSpec, ServiceSpec
+from fogft.planning.observed.clock_jumps import Reading
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager.reconciler import Reconciler, Tick
 from fogft.reason_words import words
@@ -55,7 +56,7 @@ class PoolOnSky:
         return Reconciler(
             self.scene.cloud,
             self.store,
-            clock=lambda: self.scene.now,
+            clock=lambda: Reading(*[self.scene.now] * 3),
             links=self.links,
             epoch=epoch,
         )

@@ -14,6 +14,7 @@ from fogft.model.replica import Offer, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import LaunchedGateway as Asked
 from fogft.planning.gateway import version
+from fogft.planning.observed.clock_jumps import Reading
 from fogft.pool.manager.launched_gateway import LaunchedGateway
 from fogft.pool.manager.reconciler import Reconciler
 from tests.sky.pool_on_sky import UID, PoolOnSky
@@ -38,7 +39,7 @@ def pool(tmp_path: Path) -> PoolOnSky:
     made.manager = Reconciler(
         made.scene.cloud,
         made.store,
-        clock=lambda: made.scene.now,
+        clock=lambda: Reading(*[made.scene.now] * 3),
         links=made.links,
         gateway=LaunchedGateway(made.scene.cloud, is_up, order, place),
     )

@@ -32,21 +32,15 @@ _DAYS_KEPT = 400
 
 @dataclass(frozen=True)
 class Spent:
-    """The cost of one replica on one day.
+    """The cost of one replica on one day."""
 
-    Attributes:
-        day: As in ``2026-11-23``, of UTC.
-        replica: ``slot.generation``.
-        usd: With its disk, its address and the responses that leave the cloud.
-    """
-
-    day: str
-    replica: str
+    day: str  # as in ``2026-11-23``, of UTC
+    replica: str  # ``slot.generation``
     location: str
     instance: str
     spot: bool
     hours: float
-    usd: float
+    usd: float  # with its disk, its address and the responses that leave the cloud
 
 
 @dataclass(frozen=True)

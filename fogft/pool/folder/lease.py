@@ -51,11 +51,7 @@ class Lease:
         return lease
 
     def beat(self) -> None:
-        """Write the heartbeat.
-
-        Raises:
-            PoolBusy: A later manager has it: this one must stop at once.
-        """
+        """Write the heartbeat. Raises PoolBusy where a later manager has it: stop at once."""
         if read_epoch(self._paths) > self.epoch:
             raise PoolBusy(f"a later manager has taken over pool `{self._paths.folder.name}`")
         self._beat += 1

@@ -37,18 +37,14 @@ _Name = Annotated[str, only(POOL_NAME_PATTERN.fullmatch, "a pool's name")]
 
 @dataclass(frozen=True)
 class Identity:
-    """The permanent identity of a pool.
-
-    Attributes:
-        first_epoch: Managers on this machine take epochs above it; see `lease`.
-    """
+    """The permanent identity of a pool."""
 
     name: _Name
     uid: PoolUid
     cloud: _Name  # parts of paths, like the name
     file: str
     created_at: float
-    first_epoch: Count = 0
+    first_epoch: Count = 0  # managers on this machine take epochs above it; see `lease`
 
 
 @dataclass(frozen=True)
@@ -90,10 +86,7 @@ class PoolStore:
         return read_identity(self.paths)
 
     def spec(self) -> PoolSpec:
-        """Return the pool file in force: as applied last, or the good one after a rollback.
-
-        Where it lists no services, what was discovered is with it.
-        """
+        """Return the pool file in force: as applied last, or the good one after a rollback."""
         raw = self._applied()
         trial = self.trial()
         if trial.fault and trial.file == digest(raw):

@@ -243,10 +243,7 @@ def gateway_order(
 def replica_config(
     identity: Identity, spec: PoolSpec, id: ReplicaId, *, announcements: bool = False
 ) -> str:
-    """Return a replica's configuration. The machine adds address, domain and folder.
-
-    With `announcements`, what the manager has signed lies beside it.
-    """
+    """Return a replica's configuration, with what the manager has signed beside it or not."""
     envs = spec.task.get("envs") or {}
     config = ServerProxyConfig(
         pool=identity.name,
@@ -279,10 +276,7 @@ def rendezvous_config(identity: Identity) -> str:
 
 
 def absolute(task: Mapping[str, Any], base: Path) -> dict[str, Any]:
-    """Return a task whose local paths no longer depend on where a process runs.
-
-    Relative paths in a pool file are relative to the file's own folder.
-    """
+    """Return a task whose local paths are absolute: those in a pool file start at its folder."""
     out = dict(task)
     if isinstance(out.get("workdir"), str):
         out["workdir"] = _absolute(out["workdir"], base)
@@ -302,11 +296,8 @@ def _absolute(path: str, base: Path) -> str:
 def with_build(task: Mapping[str, Any]) -> dict[str, Any]:
     """Return a task that builds its workspace if it has one and no `setup`."""
     workdir = task.get("workdir")
-    if task.get("setup") or not isinstance(workdir, str) or not is_workspace(Path(workdir)):
+    if task.get("setup") or not isinstance(workdir, str):
+        return dict(task)
+    if next(Path(workdir, "src").rglob("package.xml"), None) is None:
         return dict(task)
     return {**task, "setup": (template_files.folder() / "workspace.sh").read_text()}
-
-
-def is_workspace(folder: Path) -> bool:
-    """Whether there are packages below its `src`."""
-    return next((folder / "src").rglob("package.xml"), None) is not None

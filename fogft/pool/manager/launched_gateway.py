@@ -38,7 +38,7 @@ class LaunchedGateway:
     is_up: Callable[[float], bool]
     order: Callable[[PoolSpec, Offer, int], Launch]
     place: Callable[[str], object]
-    _up_at: float | None = field(default=None, init=False)
+    up_at: float | None = field(default=None, init=False)  # when the robot reached it last
     _asked_at: float = field(default=-math.inf, init=False)
 
     def look(
@@ -46,24 +46,20 @@ class LaunchedGateway:
     ) -> GatewayPlan:
         """Return the next step. The cloud must have answered."""
         if self.is_up(observed.now):
-            self._up_at = observed.now
+            self.up_at = observed.now
         wanted = spec.gateway.launch and not observed.gateway and not intent.stopping
         try:
             sold = offered(self.cloud, spec) if wanted else ()
         except FogftError as error:
             return GatewayPlan(note=Reason(Cause.NO_PRICES, words=told(error)))
-        step = plan_gateway(spec, intent, observed, history, sold, up_at=self._up_at)
+        step = plan_gateway(spec, intent, observed, history, sold, up_at=self.up_at)
         if step.host and spec.dial_in != spec.gateway.endpoints(step.host)[2]:
             self.place(step.host)
         return step
 
-    def just_seen(self, now: float) -> bool:
-        """Whether the robot reached it at this look."""
-        return self._up_at == now
-
     def is_doubted(self, now: float) -> bool:
         """Whether the cloud is to be asked about it: it was reached, and is not. Not too often."""
-        due = self._up_at not in (None, now) and not 0 <= now - self._asked_at < ASK_EVERY_S
+        due = self.up_at not in (None, now) and not 0 <= now - self._asked_at < ASK_EVERY_S
         self._asked_at = now if due else self._asked_at
         return due
 

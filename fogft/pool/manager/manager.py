@@ -122,8 +122,7 @@ class Manager:
         self._reconciler = Reconciler(
             cloud,
             store,
-            clock=time.time,
-            reading=timekeeping.read,
+            clock=timekeeping.read,
             links=self._links,
             build_order=self._build_order,
             submit=on_thread,
@@ -160,11 +159,7 @@ class Manager:
         log.info("manager_stopped pool=%s", self._identity.name)
 
     def _work(self) -> bool:
-        """Do one round. What goes wrong is logged and tried again in the next one.
-
-        Returns:
-            Whether the pool has ended by itself: there is nothing left to manage.
-        """
+        """Do one round, each step again in the next if it fails; return whether the pool ended."""
         self._trouble = []
         self._attempt(self._lease.beat)
         self._attempt(self._step_back)

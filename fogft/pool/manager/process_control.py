@@ -35,7 +35,6 @@ def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0)
     hang only then. Another that waited for the lock may hold it by then.
 
     Args:
-        lock: The lock's file.
         only: End no other process than this one.
         patience_s: How long each signal is given.
 

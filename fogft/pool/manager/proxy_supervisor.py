@@ -49,9 +49,6 @@ class ProxySupervisor:
     Args:
         command: What to start, alone; ``python -m fogft proxy --config ...`` unless told.
         ended: Called, from any thread, when a proxy has ended: then `look` is due at once.
-
-    Attributes:
-        replacements: How often another client proxy was seen to serve than the one before.
     """
 
     def __init__(
@@ -81,13 +78,10 @@ class ProxySupervisor:
         self._failures = 0
         self._last_end = ""
         self._serving = 0
-        self.replacements = 0
+        self.replacements = 0  # how often another one was seen to serve than the one before
 
     def look(self, *, outdated: bool = False) -> bool:
-        """Start missing proxies; return whether one works or is starting.
-
-        One of ours takes over from one that is outdated: of another version of fogft.
-        """
+        """Start missing proxies, and replace those of another version; return whether one works."""
         now = self._clock()
         for child in [one for one in self._children if one.process.poll() is not None]:
             self._children.remove(child)

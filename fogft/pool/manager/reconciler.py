@@ -101,8 +101,6 @@ class Reconciler:
     """Reconciles one pool with its spec.
 
     Args:
-        reading: Tells in place of `clock` what it is, and whether it was set; see
-            `planning.observed.clock_jumps`.
         by_hand: Replicas that people start themselves, and that are still let in.
         gateways: Name -> generations of its certificates that are good.
         gateway: The gateway that the pool may launch; None where it cannot.
@@ -114,8 +112,7 @@ class Reconciler:
         cloud: Cloud,
         store: PoolStore,
         *,
-        clock: Callable[[], float],
-        reading: Callable[[], Reading] | None = None,
+        clock: Callable[[], Reading],
         links: Links,
         build_order: BuildOrder = bare_order,
         submit: Submit = lambda run: run(),
@@ -146,7 +143,7 @@ class Reconciler:
         self._offers: tuple[Offer, ...] = ()
         self._offers_for: tuple[str, float] | None = None
         self._updating = Updating(store)
-        self._time = Timekeeping(store, self._updating, clock, reading)
+        self._time = Timekeeping(store, self._updating, clock)
         self._remember = Remembering(store, lambda: self._time.now)
         self._membership: Membership | None = store.membership()
         self._published_for: tuple[Any, ...] | None = None  # what it follows from
@@ -291,7 +288,7 @@ class Reconciler:
             return None
         step = self._gateway.look(spec, intent, observed, history)
         cloud = self._refreshing
-        is_seen = self._gateway.just_seen(observed.now)
+        is_seen = self._gateway.up_at == observed.now
         is_doubted = cloud is not None and self._gateway.is_doubted(observed.now)
         for machine in observed.gateway:
             record = history.record(machine.id.slot, machine.id.generation)

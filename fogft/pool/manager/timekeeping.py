@@ -100,20 +100,13 @@ log = logging.getLogger(__name__)
 
 
 class Timekeeping:
-    """The time of one manager's ticks; see `Reconciler`."""
+    """The time of one manager's ticks."""
 
-    def __init__(
-        self,
-        store: PoolStore,
-        updating: Updating,
-        clock: Callable[[], float],
-        reading: Callable[[], Reading] | None,
-    ) -> None:
+    def __init__(self, store: PoolStore, updating: Updating, clock: Callable[[], Reading]) -> None:
         self.now = 0.0
         self._store = store
         self._updating = updating
         self._clock = clock
-        self._reading = reading
         self._watch = Watch()
         self._unwritten: list[tuple[EventKind, float, Reason]] = []
 
@@ -122,10 +115,7 @@ class Timekeeping:
 
         Raises StateError where a jump cannot be written down; the next look tries again.
         """
-        if self._reading is None:
-            self.now = self._clock()
-            return False
-        reading = self._reading()
+        reading = self._clock()
         self.now = reading.wall_s
         jump = self._watch.look(reading)
         if jump is not None:

@@ -10,6 +10,7 @@ import pytest
 from fogft.errors import CloudUnreachable, NoCapacity, StateError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
+from fogft.planning.observed.clock_jumps import Reading
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.planner import PlannedLaunch
 from fogft.pool.folder.store import Identity
@@ -67,7 +68,7 @@ class Bench:
         self.reconciler = Reconciler(
             self.cloud,
             self.store,
-            clock=lambda: self.now,
+            clock=lambda: Reading(*[self.now] * 3),
             links=self.links,
             submit=self.waiting.append,
         )
@@ -167,7 +168,11 @@ def test_machine_that_history_lacks_is_adopted() -> None:
     successor = Bench()
     successor.store.published = bench.store.published
     reconciler = Reconciler(
-        bench.cloud, successor.store, clock=lambda: bench.now, links=bench.links, epoch=2
+        bench.cloud,
+        successor.store,
+        clock=lambda: Reading(*[bench.now] * 3),
+        links=bench.links,
+        epoch=2,
     )
     tick = reconciler.tick()
     assert (tick.plan.launches, tick.plan.terminations) == ((), ())
@@ -184,7 +189,7 @@ def test_order_that_cannot_be_built_launches_nothing() -> None:
     reconciler = Reconciler(
         bench.cloud,
         bench.store,
-        clock=lambda: bench.now,
+        clock=lambda: Reading(*[bench.now] * 3),
         links=bench.links,
         build_order=fail,  # type: ignore[arg-type]
     )

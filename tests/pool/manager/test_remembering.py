@@ -9,6 +9,7 @@ import pytest
 
 from fogft.model.replica import MachinePhase
 from fogft.model.spec import PoolSpec
+from fogft.planning.observed.clock_jumps import Reading
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager.reconciler import Reconciler
 from tests.fakes.cloud import MockCloud, zones
@@ -28,7 +29,7 @@ class Pool:
         spec = PoolSpec(name="p", services=(SERVICE,), replicas=1, task={"run": "x"})
         store = MemoryStore(Identity("p", UID, "mock", "/p.yaml", START), spec)
         self.manager = Reconciler(
-            self.cloud, store, clock=lambda: self.now + next(self._looks) / 1000,
+            self.cloud, store, clock=lambda: Reading(*[self.now + next(self._looks) / 1000] * 3),
             links=lambda uid, now: (),
         )  # fmt: skip
 

@@ -29,9 +29,7 @@ def test_a_jump_that_cannot_be_written_down_is_written_later(
     store, wall_s, awake_s = scene.store, [1e9], [0.0]
     store.write_trial(Trial("file", began_at=1e9))
     store.append(Event(1e9, EventKind.LAUNCH, 0, 1, "c/r/a"))
-    time = Timekeeping(
-        store, Updating(store), lambda: 0.0, lambda: Reading(wall_s[0], awake_s[0], awake_s[0])
-    )
+    time = Timekeeping(store, Updating(store), lambda: Reading(wall_s[0], awake_s[0], awake_s[0]))
     assert not time.look()
     wall_s[0], awake_s[0] = 1e9 + 3601, 1.0
     with monkeypatch.context() as patched:
