@@ -30,15 +30,6 @@ class Select(str, Enum):
 
 
 @dataclass(frozen=True)
-class Quality:
-    """Quality of service of a topic: how many messages are kept, and for whom."""
-
-    depth: int = 10
-    reliable: bool = True
-    latched: bool = False
-
-
-@dataclass(frozen=True)
 class TopicSpec:
     """One proxied topic."""
 
@@ -88,11 +79,6 @@ class TopicSpec:
     def key_name(self) -> str:
         """Its name on the link, and in a replica's list of what is ready."""
         return PREFIX + self.name
-
-    @property
-    def quality(self) -> Quality:
-        """The quality of service that both ends ask ROS for."""
-        return Quality(self.depth, self.reliable, self.latched)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 from fogft.errors import RosError
 from fogft.model import ros_names
-from fogft.model.topic import Quality
+from fogft.model.topic import TopicSpec
 from fogft.ros import cyclone, spdp, topic_ends, vendors
 from fogft.ros.entities import Client, Server
 from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
@@ -148,30 +148,29 @@ class SerialisedNode:
 
         return self._add(name, create)
 
-    def publisher(self, name: str, type_name: str, quality: Quality) -> Publisher:
+    def publisher(self, topic: TopicSpec) -> Publisher:
         """Create a publisher of a topic. Raises RosError: the type cannot be loaded."""
-        message_type = load_message_type(type_name)
+        message_type = load_message_type(topic.type)
 
         def create() -> Publisher:
-            made: Any = self._node.create_publisher(message_type, name, topic_ends.profile(quality))
+            profile = topic_ends.profile(topic)
+            made: Any = self._node.create_publisher(message_type, topic.name, profile)
             return Publisher(made, shape(message_type), self._withdraw)
 
-        return self._add(name, create)
+        return self._add(topic.name, create)
 
-    def subscribe(
-        self, name: str, type_name: str, quality: Quality, on_message: Callable[[bytes], None]
-    ) -> Subscription:
+    def subscribe(self, topic: TopicSpec, on_message: Callable[[bytes], None]) -> Subscription:
         """Subscribe to a topic: serialised messages. Raises RosError: the type cannot be loaded."""
-        message_type = load_message_type(type_name)
+        message_type = load_message_type(topic.type)
 
         def create() -> Subscription:
             made: Any = self._node.create_subscription(
-                message_type, name, lambda _: None, topic_ends.profile(quality), raw=True
+                message_type, topic.name, lambda _: None, topic_ends.profile(topic), raw=True
             )
             publishers = self._node.get_publishers_info_by_topic
-            return Subscription(made, quality, on_message, self._withdraw, publishers)
+            return Subscription(made, topic, on_message, self._withdraw, publishers)
 
-        return self._add(name, create)
+        return self._add(topic.name, create)
 
     def make_visible(
         self, name: str, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""

@@ -12,22 +12,22 @@ from typing import Any
 
 from fogft.errors import RosError, Unreadable
 from fogft.model.cdr import Shape
-from fogft.model.topic import Quality
+from fogft.model.topic import TopicSpec
 from fogft.ros.entities import BURST
 
 log = logging.getLogger(__name__)
 
 
-def profile(quality: Quality) -> Any:
-    """Return a quality of service as an rclpy QoSProfile."""
+def profile(topic: TopicSpec) -> Any:
+    """Return a topic's quality of service as an rclpy QoSProfile."""
     from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
     reliability, durability = ReliabilityPolicy, DurabilityPolicy
     return QoSProfile(
         history=HistoryPolicy.KEEP_LAST,
-        depth=quality.depth,
-        reliability=reliability.RELIABLE if quality.reliable else reliability.BEST_EFFORT,
-        durability=durability.TRANSIENT_LOCAL if quality.latched else durability.VOLATILE,
+        depth=topic.depth,
+        reliability=reliability.RELIABLE if topic.reliable else reliability.BEST_EFFORT,
+        durability=durability.TRANSIENT_LOCAL if topic.latched else durability.VOLATILE,
     )
 
 
@@ -79,12 +79,12 @@ class Subscription:
     def __init__(
         self,
         subscription: Any,
-        quality: Quality,
+        topic: TopicSpec,
         on_message: Callable[[bytes], None],
         withdraw: Callable[[Subscription], None],
         publishers: Callable[[str], Any],
     ) -> None:
-        self._quality = quality
+        self._topic = topic
         self._publishers = publishers
         self.handle = subscription.handle
         self._subscription = subscription
@@ -103,9 +103,9 @@ class Subscription:
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
             return ""
         for offered in found:
-            if self._quality.reliable and offered.reliability == ReliabilityPolicy.BEST_EFFORT:
+            if self._topic.reliable and offered.reliability == ReliabilityPolicy.BEST_EFFORT:
                 return f"a publisher of `{name}` offers best effort: write `reliable: false`"
-            if self._quality.latched and offered.durability == DurabilityPolicy.VOLATILE:
+            if self._topic.latched and offered.durability == DurabilityPolicy.VOLATILE:
                 return f"a publisher of `{name}` is not latched: write `latched: false`"
         return ""
 

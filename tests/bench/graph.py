@@ -31,15 +31,14 @@ class Graph:
     """Says, hears, and sends goals in one ROS domain."""
 
     def __init__(self, domain_id: int, name: str) -> None:
-        from fogft.model.topic import Quality
         from fogft.ros.node import SerialisedNode
 
         self._node = SerialisedNode(name, domain_id)
         said, heard = TOPICS
-        self._publisher = self._node.publisher(said.name, said.type, Quality(said.depth))
+        self._publisher = self._node.publisher(said)
         self._awaited = b""
         self._heard = threading.Event()
-        self._node.subscribe(heard.name, heard.type, Quality(heard.depth), self._hear)
+        self._node.subscribe(heard, self._hear)
         self._clients = {
             s.name.rpartition("/")[2]: self._node.client(s.name, s.type) for s in ACTION_SERVICES
         }

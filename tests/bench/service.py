@@ -105,11 +105,9 @@ def _offer_graph(node: Any) -> None:
     from rclpy.serialization import serialize_message
     from test_msgs.action import Fibonacci
 
-    from fogft.model.topic import Quality
-
     heard, said = TOPICS
-    again = node.publisher(said.name, said.type, Quality(said.depth))
-    node.subscribe(heard.name, heard.type, Quality(heard.depth), again.publish)
+    again = node.publisher(said)
+    node.subscribe(heard, again.publish)
     parts = Fibonacci.Impl
     answers = {
         "send_goal": parts.SendGoalService.Response(accepted=True),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import threading
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -30,8 +31,9 @@ class FakeTopics:
         self.heard: dict[str, object] = {}
         self.mismatch = ""
 
-    def publisher(self, name, type_name, quality):
-        node, said = self, self.published.setdefault(name, [])
+    def publisher(self, topic):
+        node, name = self, topic.name
+        said = self.published.setdefault(name, [])
 
         class Publisher:
             def check(self, payload):
@@ -52,9 +54,9 @@ class FakeTopics:
 
         return Publisher()
 
-    def subscribe(self, name, type_name, quality, on_message):
-        self.heard[name] = on_message
-        return self.publisher("unused", type_name, quality)
+    def subscribe(self, topic, on_message):
+        self.heard[topic.name] = on_message
+        return self.publisher(replace(topic, name="unused"))
 
 
 class Carried:
@@ -307,9 +309,9 @@ def test_a_probe_is_answered_while_topics_are_being_made(monkeypatch):
     replica = TopicsOnReplica([TO, TopicSpec("/second", TO.type, TO.origin)])
     make = node.publisher
 
-    def publisher(name, type_name, quality):
-        made = make(name, type_name, quality)
-        if name == "/second":
+    def publisher(topic):
+        made = make(topic)
+        if topic.name == "/second":
             first_made.set()
             go_on.wait(10.0)
         else:

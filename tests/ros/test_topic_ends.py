@@ -2,55 +2,59 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from fogft.errors import RosError, Unreadable
-from fogft.model.topic import Quality
+from fogft.model.topic import Origin, TopicSpec
 
 from .conftest import wait_for
 
 pytestmark = pytest.mark.ros
 STRING = "std_msgs/msg/String"
+SAID = TopicSpec("/said", STRING, Origin.ROBOT)
+EASY = replace(SAID, reliable=False)
 HELLO = b"\0\1\0\0\6\0\0\0hello\0"
 
 
 def test_bytes_go_out_and_come_in(make_node, ros_domain):
     """Also to who subscribes later, where the topic is latched."""
     heard: list[bytes] = []
-    latched = Quality(1, latched=True)
-    publisher = make_node(ros_domain).publisher("/said", STRING, latched)
+    latched = replace(SAID, depth=1, latched=True)
+    publisher = make_node(ros_domain).publisher(latched)
     publisher.publish(HELLO)
-    make_node(ros_domain).subscribe("/said", STRING, latched, heard.append)
+    make_node(ros_domain).subscribe(latched, heard.append)
     wait_for(lambda: heard, "the message")
     assert heard[0][: len(HELLO)] == HELLO
     assert publisher.subscribers() == 1
 
 
 def test_what_is_no_message_is_found_before_it_is_published(make_node, ros_domain):
-    publisher = make_node(ros_domain).publisher("/said", STRING, Quality())
+    publisher = make_node(ros_domain).publisher(SAID)
     for noise in (b"", b"\0\1", b"\0\1\0\0\xff\xff\xff\xffx"):
         with pytest.raises(Unreadable):
             publisher.check(noise)
 
 
 def test_a_publisher_that_offers_less_is_told_of_with_the_remedy(make_node, ros_domain):
-    make_node(ros_domain).publisher("/said", STRING, Quality(reliable=False))
+    make_node(ros_domain).publisher(EASY)
     other = make_node(ros_domain)
-    heard = other.subscribe("/said", STRING, Quality(), lambda _: None)
+    heard = other.subscribe(SAID, lambda _: None)
     wait_for(heard.mismatch, "the publisher")
     assert "`reliable: false`" in heard.mismatch()
-    latched = other.subscribe("/said", STRING, Quality(reliable=False, latched=True), print)
+    latched = other.subscribe(replace(EASY, latched=True), print)
     wait_for(latched.mismatch, "the publisher")
     assert "`latched: false`" in latched.mismatch()
-    fine = other.subscribe("/said", STRING, Quality(reliable=False), lambda _: None)
+    fine = other.subscribe(EASY, lambda _: None)
     assert fine.mismatch() == ""
 
 
 def test_withdrawn_ends_do_nothing_more(make_node, ros_domain):
     heard: list[bytes] = []
     node = make_node(ros_domain)
-    publisher = node.publisher("/said", STRING, Quality())
-    subscription = make_node(ros_domain).subscribe("/said", STRING, Quality(), heard.append)
+    publisher = node.publisher(SAID)
+    subscription = make_node(ros_domain).subscribe(SAID, heard.append)
     wait_for(publisher.subscribers, "discovery")
     subscription.close()
     wait_for(lambda: not publisher.subscribers(), "its end")
@@ -64,7 +68,7 @@ def test_withdrawn_ends_do_nothing_more(make_node, ros_domain):
 def test_an_unknown_type_is_a_clear_error_and_the_node_lives_on(make_node, ros_domain):
     node = make_node(ros_domain)
     with pytest.raises(RosError, match="no package `nope_msgs` with messages"):
-        node.publisher("/said", "nope_msgs/msg/T", Quality())
+        node.publisher(replace(SAID, type="nope_msgs/msg/T"))
     with pytest.raises(RosError, match="not the name of a message type"):
-        node.subscribe("/said", "std_srvs/srv/SetBool", Quality(), print)
+        node.subscribe(replace(SAID, type="std_srvs/srv/SetBool"), print)
     assert node.alive

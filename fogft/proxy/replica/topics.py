@@ -146,12 +146,10 @@ class TopicsOnReplica:
         for name, topic in self._topics.items():
             try:
                 if topic.origin is Origin.ROBOT:
-                    self._publishers[name] = node.publisher(topic.name, topic.type, topic.quality)
+                    self._publishers[name] = node.publisher(topic)
                 else:
                     heard = self._outgoing[name].heard
-                    self._subscriptions[name] = node.subscribe(
-                        topic.name, topic.type, topic.quality, heard
-                    )
+                    self._subscriptions[name] = node.subscribe(topic, heard)
             except RosError as error:
                 self._note(name, error.message)
             else:

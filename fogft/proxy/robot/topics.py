@@ -86,9 +86,9 @@ class RobotTopic:
         """Create the publisher or subscription. Raises RosError."""
         topic = self.topic
         if topic.origin is Origin.ROBOT:
-            self._subscription = node.subscribe(topic.name, topic.type, topic.quality, self.heard)
+            self._subscription = node.subscribe(topic, self.heard)
         else:
-            self._publisher = node.publisher(topic.name, topic.type, topic.quality)
+            self._publisher = node.publisher(topic)
 
     def close(self) -> None:
         """Close the publisher or subscription."""
