@@ -240,9 +240,8 @@ class RendezvousClient:
         self._refresh()
 
     def _refresh(self) -> None:
-        kinds = (self._records.of(kind) for kind in RecordKind)
         self.known = Known(
-            records=tuple(record for kind in kinds for record in kind),
+            records=tuple(one for kind in RecordKind for one in self._records.of(kind)),
             revoked=self._records.revoked,
             connected=sum(not detail for detail in self._details.values()),
             seen_host=self._seen_host,

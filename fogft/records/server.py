@@ -23,9 +23,8 @@ from fogft.counters import Counters
 from fogft.errors import CredentialError
 from fogft.model.credentials import CredentialPaths
 from fogft.records import frames
+from fogft.records.accepting import listening, oldest_of_most
 from fogft.records.exchange import Connection, Exchange
-from fogft.records.greetings import oldest_of_most
-from fogft.records.listening import listening
 from fogft.records.record import RecordError, Verify, Writer
 
 log = logging.getLogger(__name__)

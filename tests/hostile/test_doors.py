@@ -12,8 +12,8 @@ from fogft.link.dial_out.replica import DialOut
 from fogft.link.dial_out.robot import GREETINGS_LIMIT, DialIn
 from fogft.metrics.scrape import Scrape, gauge
 from fogft.model.replica import ReplicaId
+from fogft.records.accepting import oldest_of_most
 from fogft.records.exchange import OF_ONE_LIMIT
-from fogft.records.greetings import oldest_of_most
 from fogft.records.server import HANDSHAKES_LIMIT
 from fogft.records.signing import Signer, Verifier
 from tests.link.wire_pool import POOL_UID, Authority, wait_for

@@ -19,7 +19,7 @@ import time
 from functools import partial
 
 from fogft.cloud.local.faults import LinkFaults
-from fogft.records.greetings import oldest_of_most
+from fogft.records.accepting import oldest_of_most
 
 CHUNK_BYTES = 256 << 10
 MAX_HELD_BYTES = 32 << 20

@@ -25,8 +25,7 @@ from fogft.link.dial_out.tunnel import Tunnels, hang_up, keep_alive
 from fogft.model.credentials import Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.records import frames
-from fogft.records.greetings import oldest_of_most
-from fogft.records.listening import listening
+from fogft.records.accepting import listening, oldest_of_most
 from fogft.records.record import RecordError, Verify
 
 log = logging.getLogger(__name__)

@@ -78,8 +78,9 @@ class ManagerRecords:
 
     def _announce(self, more: frozenset[str], lease: ServingLease) -> None:
         """Sign what is new, for the client proxy to pass on: there may be no rendezvous."""
-        revoked = self._revoked | more
-        if revoked == self._revoked and not _is_due(self._lease, lease):
+        revoked, last = self._revoked | more, self._lease
+        pause_s = min(_LEASE_EVERY_S, _LEASE_SHARE * lease.lasts_s)
+        if revoked == self._revoked and last is not None and abs(lease.at - last.at) < pause_s:
             return
         self._certify(datetime.datetime.now(datetime.timezone.utc))
         files = self._files()
@@ -87,8 +88,8 @@ class ManagerRecords:
         self._leases += 1
         records = [self._record(RecordKind.LEASE, self._leases, to_plain(lease))]
         if revoked:  # they only grow, so their number counts the writings of one epoch
-            names_ = {"names": sorted(revoked)}
-            records.append(self._record(RecordKind.REVOCATION, len(revoked), names_))
+            names = {"names": sorted(revoked)}
+            records.append(self._record(RecordKind.REVOCATION, len(revoked), names))
         cache.write(self._paths.announcements, [sign_record(one, signer) for one in records])
         self._announced = self._paths.announcements.read_bytes()
         self._revoked, self._lease = revoked, lease
@@ -107,8 +108,8 @@ class ManagerRecords:
             admission_content(membership),
             sequence=membership.version,
         )
-        names_ = {"names": sorted(membership.revoked)}
-        client.publish(RecordKind.REVOCATION, "", self._epoch, names_)
+        names = {"names": sorted(membership.revoked)}
+        client.publish(RecordKind.REVOCATION, "", self._epoch, names)
 
     def _certify(self, now: datetime.datetime) -> None:
         if self._certified_at is not None and abs(now - self._certified_at) < _CERTIFY_EVERY:
@@ -137,11 +138,3 @@ class ManagerRecords:
         client, self._client = self._client, None
         if client is not None:
             client.close()
-
-
-def _is_due(signed: ServingLease | None, now: ServingLease) -> bool:
-    """Whether a lease that could be signed now is worth it: it lasts longer than the last one."""
-    if signed is None:
-        return True
-    since_s = abs(now.at - signed.at)
-    return since_s >= min(_LEASE_EVERY_S, _LEASE_SHARE * now.lasts_s)

@@ -119,10 +119,9 @@ class ProxyReport:
 def read(path: Path, pool_uid: str) -> ProxyReport | None:
     """Return the last report; None if there is none or it is damaged."""
     try:
-        raw = disk.read_json(path)
+        return parse(disk.read_json(path), pool_uid)
     except StateError:
         return None
-    return None if raw is None else parse(raw, pool_uid)
 
 
 def parse(raw: Any, pool_uid: str) -> ProxyReport | None:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 
 from fogft.link.zenoh.sockets import Address
-from fogft.records.greetings import network_of
+from fogft.records.accepting import network_of
 
 PATIENCE_S = 5.0  # longer than Zenoh takes to accept or give up a peer that talks
 STRANGERS_LIMIT = 16

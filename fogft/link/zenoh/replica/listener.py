@@ -38,7 +38,7 @@ from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from fogft.records.listening import listening
+from fogft.records.accepting import listening
 from fogft.records.record import RecordKind
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import Verifier

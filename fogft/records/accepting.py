@@ -1,4 +1,4 @@
-"""Who makes room where too many have connected that have not proved yet who they are. Pure.
+"""Bind a TCP port, and make room where too many have connected that have not proved who they are.
 
 One host cannot keep others out for longer than these take to greet: where the room is used up, the
 oldest connection of the host that has most of them is ended.
@@ -7,10 +7,13 @@ oldest connection of the host that has most of them is ended.
 from __future__ import annotations
 
 import ipaddress
+import socket
 from collections import Counter
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import TypeVar
+
+from fogft.errors import WireError
 
 T = TypeVar("T")
 
@@ -32,3 +35,21 @@ def network_of(host: str) -> str:
     if address.version == 4:
         return host
     return str(ipaddress.IPv6Address(int(address) >> 64 << 64))
+
+
+def listening(endpoint: str) -> socket.socket:
+    """Return a socket that listens at ``host:port``; port 0 for any free one. Raises WireError."""
+    host, _, port = endpoint.rpartition(":")
+    is_v6 = ":" in host
+    try:
+        return socket.create_server(
+            (host.strip("[]"), int(port)),
+            family=socket.AF_INET6 if is_v6 else socket.AF_INET,
+            backlog=128,
+            dualstack_ipv6=is_v6,
+        )
+    except (OSError, ValueError, OverflowError) as error:
+        words = getattr(error, "strerror", None) or str(error)
+        raise WireError(
+            f"cannot listen at `{endpoint}`: {words}", "give `host:port` with a free port"
+        ) from error
