@@ -95,7 +95,7 @@ def _traffic_json(shown: PlanShown, service: ServiceSpec) -> dict[str, Any]:
     return {
         **vars(traffic),
         "source": "measured" if measured else source,
-        "measured_over_s": measured.over_s if measured else None,
+        "measured_over_s": shown.measured_over_s if measured else None,
     }
 
 
@@ -152,9 +152,9 @@ def _summary(shown: PlanShown) -> list[str]:
         )
     for name, one in shown.traffic.items():
         out.append(
-            f"  {name} measured over {one.over_s / 3600:.3g} h: "
-            f"{one.traffic.requests_per_s:.3g} requests/s of {one.traffic.request_bytes:.0f} B, "
-            f"responses of {one.traffic.response_bytes:.0f} B"
+            f"  {name} measured over {shown.measured_over_s / 3600:.3g} h: "
+            f"{one.requests_per_s:.3g} requests/s of {one.request_bytes:.0f} B, "
+            f"responses of {one.response_bytes:.0f} B"
         )
     if plan.single is not None:
         offer, alone = plan.single

@@ -13,6 +13,7 @@ from fogft.cli import main
 from fogft.pool.commands import composition, preview, startup
 from fogft.pool.commands import plan as plans
 from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.manager import proxy_report
 from tests.needs import needs
 
 POOL = """
@@ -149,9 +150,9 @@ def test_a_report_that_says_nothing_is_not_guessed_from(tmp_path, report):
     count = {"received": 5, "answered": 5, "request_bytes": 5, "response_bytes": 5}
     file = tmp_path / "proxy-status.json"
     file.write_text(json.dumps({**usual, "services": {"/plan": count}}))
-    assert list(plans.measured(file, "0" * 16)) == ["/plan"]
+    assert list(plans.measured(proxy_report.read(file, "0" * 16))) == ["/plan"]
     file.write_text(json.dumps({**usual, "services": {"/plan": count}, **report}))
-    assert plans.measured(file, "0" * 16) == {}
+    assert plans.measured(proxy_report.read(file, "0" * 16)) == {}
 
 
 def test_losses_of_the_pool_are_shown(pool, capsys):

@@ -23,6 +23,7 @@ from fogft.pool.folder.paths import latency_file
 from fogft.pool.manager import launched_gateway, offers, proxy_report
 from fogft.pool.manager.distances import Distance, Latencies, regions_of
 from fogft.pool.manager.offers import Seller
+from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.poolfile import named_clouds
 from fogft.poolfile.file import parse, read_text
 
@@ -37,7 +38,8 @@ class PlanShown:
         cloud: The adapter or the table that the prices are from.
         clouds: What each cloud lacks for such a pool; empty on the local cloud.
         distances: ``cloud/region`` -> how far it is, and how that is known.
-        traffic: Service name -> what its client proxy counted, where the file says nothing.
+        traffic: Service name -> what its client proxy counted, where the file says nothing, in the
+            last `measured_over_s`.
         ready_p90_s: By when nine in ten of this pool's launches were ready; None for too few.
     """
 
@@ -47,7 +49,8 @@ class PlanShown:
     explanation: Explanation
     distances: Mapping[str, Distance]
     notes: tuple[str, ...]
-    traffic: Mapping[str, Measured] = field(default_factory=dict)
+    traffic: Mapping[str, TrafficSpec] = field(default_factory=dict)
+    measured_over_s: float = 0.0
     ready_p90_s: float | None = None
     launches: int = 0
     clouds: Mapping[str, str] = field(default_factory=dict)
@@ -98,15 +101,12 @@ def plan_file(
         store = make_store(spec.name)
         events = store.recent(1 << 30)
         intent, history, took_s = store.intent(), History(events), ready_after(events)
-        counted = measured(store.paths.proxy_status, store.identity().uid)
+        report = proxy_report.read(store.paths.proxy_status, store.identity().uid)
     except PoolNotFound:
-        intent, history, counted, took_s = Intent(), History(), {}, []
+        intent, history, took_s, report = Intent(), History(), [], None
     silent = {service.name for service in spec.services if service.traffic == TrafficSpec()}
-    counted = {name: one for name, one in counted.items() if name in silent}
-    services = (
-        replace(one, traffic=counted[one.name].traffic) if one.name in counted else one
-        for one in spec.services
-    )
+    counted = {name: one for name, one in measured(report).items() if name in silent}
+    services = (replace(one, traffic=counted.get(one.name, one.traffic)) for one in spec.services)
     spec = replace(spec, services=tuple(services))
     now = time.time()
     observed = Observed(now, (), None, sold, rtt_s={r: d.rtt_s for r, d in distances.items()})
@@ -116,7 +116,10 @@ def plan_file(
         seller.lacking(spec.task.get("resources") or {}) if isinstance(seller, RealCloud) else {}
     )
     return PlanShown(
-        *(spec, now, name, explained, distances, tuple(notes), counted, ready_p90_s, len(took_s)),
+        *(spec, now, name, explained, distances, tuple(notes), counted),
+        measured_over_s=0.0 if report is None else report.uptime_s,
+        ready_p90_s=ready_p90_s,
+        launches=len(took_s),
         clouds=clouds,
     )
 
@@ -166,27 +169,17 @@ def _on_demand(seller: Seller, spec: PoolSpec) -> Sequence[Offer]:
 LEAST_S = 60.0
 
 
-@dataclass(frozen=True)
-class Measured:
-    """The measured traffic of one service."""
-
-    traffic: TrafficSpec
-    over_s: float
-
-
-def measured(proxy_status: Path, pool_uid: str) -> dict[str, Measured]:
+def measured(report: ProxyReport | None) -> dict[str, TrafficSpec]:
     """Return the measured traffic of each service that has any."""
-    report = proxy_report.read(proxy_status, pool_uid)
     if report is None or not report.uptime_s >= LEAST_S:
         return {}
     found = {}
     for name, raw in report.services.items():
         count = from_plain(proxy_report.Counted, raw)
         if count.received:
-            traffic = TrafficSpec(
+            found[name] = TrafficSpec(
                 count.received / report.uptime_s,
                 count.request_bytes / count.received,
                 count.response_bytes / max(1, count.answered),
             )
-            found[name] = Measured(traffic, report.uptime_s)
     return found
