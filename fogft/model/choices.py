@@ -106,13 +106,6 @@ class Correlation:
     region: float = 0.43
     cloud: float = 0.14
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.cloud <= self.region <= self.zone <= 1:
-            raise ValueError(
-                "correlations must be from 0 to 1, and zone >= region >= cloud, not "
-                f"{self.zone:g}, {self.region:g} and {self.cloud:g}"
-            )
-
 
 @dataclass(frozen=True)
 class Assumption:

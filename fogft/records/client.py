@@ -19,7 +19,6 @@ from typing import Any
 
 from fogft.errors import StateError, WireError
 from fogft.model.credentials import CredentialPaths
-from fogft.model.names import is_endpoint
 from fogft.records.cache import restore, write
 from fogft.records.dialling import connect
 from fogft.records.exchange import Exchange
@@ -66,9 +65,6 @@ class RendezvousClient:
         cache: Path | None = None,
         changed: Callable[[], None] = lambda: None,
     ) -> None:
-        for endpoint in endpoints:
-            if not is_endpoint(endpoint):
-                raise WireError(f"`{endpoint}` is not the `host:port` of a rendezvous")
         self._endpoints = tuple(endpoints)
         self._credentials = credentials
         self._signer = Signer(credentials.certificate, credentials.key)

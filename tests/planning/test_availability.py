@@ -142,12 +142,6 @@ def test_no_replica_never_answers():
     assert expected([], Assumption()).correlated == 0.0
 
 
-@pytest.mark.parametrize("three", [(0.1, 0.2, 0.0), (1.1, 0.2, 0.1), (0.5, 0.2, -0.1)])
-def test_impossible_correlations_are_errors(three):
-    with pytest.raises(ValueError, match=r"^correlations must be"):
-        Correlation(*three)
-
-
 @pytest.mark.parametrize("down", [-0.1, 1.1, math.nan])
 def test_impossible_unavailability_is_an_error(down):
     with pytest.raises(ValueError, match=r"^an unavailability must be"):
