@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from fogft.model.plain import Count
@@ -108,11 +107,6 @@ def ping() -> bytes:
     return frame({"type": "ping"})
 
 
-@dataclass(frozen=True)
-class _Have:
-    digest: tuple[tuple[str, str, Count, Count], ...]
-
-
 def have(digest: Digest) -> bytes:
     """Return a digest of our records, so that the other side can send missing ones."""
     return frame({"type": "have", "digest": [[*key, *order] for key, order in digest.items()]})
@@ -120,7 +114,7 @@ def have(digest: Digest) -> bytes:
 
 def read_have(message: dict[str, Any]) -> dict[Key, Order]:
     """Return the other side's digest."""
-    rows = read(_Have, message).digest
+    rows = read(tuple[tuple[str, str, Count, Count], ...], message.get("digest"))
     if len(rows) > _DIGEST_LIMIT:
         raise RecordError("malformed", f"a digest of {len(rows)} records")
     return {(kind, subject): (first, then) for kind, subject, first, then in rows}

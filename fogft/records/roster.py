@@ -61,11 +61,6 @@ class DialIn:
     dial_in: EndpointOrEmpty = ""
 
 
-@dataclass(frozen=True)
-class _Revoked:
-    names: tuple[Annotated[str, holder_of], ...]
-
-
 def slot_state(record: Record) -> SlotState:
     """Read a replica's record."""
     return read(SlotState, record.content)
@@ -93,10 +88,10 @@ def admission(record: Record) -> Membership:
 
 def revoked_names(record: Record) -> frozenset[str]:
     """Return the common names that a revocation record revokes."""
-    holders = [holder_of(name) for name in read(_Revoked, record.content).names]
-    if any(holder.pool_uid != record.pool_uid for holder in holders):
+    names = read(frozenset[Annotated[str, holder_of]], record.content.get("names"))
+    if any(holder_of(name).pool_uid != record.pool_uid for name in names):
         raise RecordError("malformed", "names of another pool")
-    return frozenset(holder.common_name for holder in holders)
+    return names
 
 
 def lease(record: Record) -> ServingLease:

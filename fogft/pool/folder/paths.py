@@ -39,7 +39,7 @@ class _File:
 
 @dataclass(frozen=True)
 class PoolPaths:
-    """The files of one pool.
+    """The files of one pool. A process holds its lock as long as it lives.
 
     Commands write `identity`, `spec` and `intent` (under `intent_lock`; who ends a pool takes its
     `identity` away), the client proxy `proxy_status` and `records` (under `proxy_lock`), and the
@@ -68,7 +68,6 @@ class PoolPaths:
     intent_lock = _File("intent.lock")
     """Held while `identity`, `spec` or `intent` is changed."""
     manager_lock = _File("manager.lock")
-    """Held by the manager as long as it lives."""
     lease = _File("lease.json")
     """``{epoch, beat}``: the active manager; `beat` grows while it works."""
     status = _File("status.json")
@@ -90,17 +89,13 @@ class PoolPaths:
     credentials = _File("credentials")
     """Folder of the pool's CA and its certificates."""
     proxy_config = _File("proxy.yaml")
-    """The client proxy's configuration."""
     proxy_lock = _File("proxy.lock")
-    """Held by the client proxy as long as it lives."""
     manager_start = _File("manager.json")
     """``{command, folder}``: how to start a killed manager; gone when it ended well."""
     proxy_status = _File("proxy-status.json")
     """What the client proxy reports: links and counters."""
     manager_log = _File("manager.log")
-    """The manager's log."""
     proxy_log = _File("proxy.log")
-    """The client proxy's log."""
 
     @property
     def standby_lock(self) -> Path:
