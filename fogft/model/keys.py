@@ -233,11 +233,7 @@ def key(
 ) -> Any:
     """Return a dataclass's field that is a key of the pool file; `more` is the rest of `Key`."""
     said = {"key": Key(form, help, **more)}
-    if default_factory is not MISSING:
-        return field(default_factory=default_factory, metadata=said)
-    if default is not MISSING:
-        return field(default=default, metadata=said)
-    return field(metadata=said, kw_only=kw_only)
+    return field(default=default, default_factory=default_factory, kw_only=kw_only, metadata=said)
 
 
 ORDINARY = Key(Free(""), "")

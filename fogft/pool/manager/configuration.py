@@ -28,7 +28,6 @@ from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
-from fogft.pool.manager.launched_gateway import ports
 from fogft.pool.manager.reconciler import bare_order
 from fogft.poolfile import config_file
 
@@ -236,7 +235,7 @@ def gateway_order(
         task={"resources": resources(spec)},
         files=files,
         link_port=spec.link_port,
-        more_ports=ports(spec),
+        more_ports=tuple(spec.gateway.port + n for n in range(3)),
     )
 
 

@@ -70,11 +70,6 @@ def planned(cloud: Seller, spec: PoolSpec) -> tuple[PlannedLaunch, ...]:
     return tuple(PlannedLaunch(GATEWAY_SLOT, 1, offer, Reason(Cause.NEW_SLOT)) for offer in sold)
 
 
-def ports(spec: PoolSpec) -> tuple[int, ...]:
-    """Return the ports that its machine opens beside that of links."""
-    return tuple(spec.gateway.port + n for n in range(3))
-
-
 def offered(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
     """Return what is sold for its machine, the cheapest first."""
     sold = cloud.offers(resources(spec))
