@@ -40,7 +40,7 @@ def encode_probe_answer(answer: ProbeAnswer) -> bytes:
     then the next. Raises ValueError: it names more services than any pool file may.
     """
     behind = tuple(_shortened(one) for one in answer.behind)
-    written = replace(answer, detail=_cut(answer.detail, DETAIL_LIMIT), behind=behind)
+    written = replace(answer, detail=as_line(answer.detail[:DETAIL_LIMIT]), behind=behind)
     frame = _encoded(written)
     while len(frame) > PROBE_ANSWER_LIMIT and (written.types or written.behind):
         kept = written.behind if written.types else written.behind[: len(written.behind) // 2]
@@ -64,12 +64,8 @@ def _shortened(one: GatewayView) -> GatewayView:
         one,
         silent_for_s=round(one.silent_for_s, 3),
         rtt_s=None if one.rtt_s is None else round(one.rtt_s, 6),
-        detail=_cut(one.detail, BEHIND_DETAIL_LIMIT),
+        detail=as_line(one.detail[:BEHIND_DETAIL_LIMIT]),
     )
-
-
-def _cut(detail: str, limit: int) -> str:
-    return as_line(detail[:limit])
 
 
 def _encoded(value: Probe | ProbeAnswer) -> bytes:

@@ -50,10 +50,7 @@ def _plain(host: str) -> str:
 
 def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
     """Yield the connections at a local port: the peer, and a socket of ours to it."""
-    for number in _numbers():
-        connection = _duplicate(number)
-        if connection is None:
-            continue
+    for connection in filter(None, map(_duplicate, _numbers())):
         ends = _ends(connection)
         if ends is None or ends[0][1] != port:
             connection.close()
@@ -63,10 +60,7 @@ def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
 
 def listening(port: int) -> socket.socket | None:
     """Return a socket that listens at a port; None if there is none."""
-    for number in _numbers():
-        connection = _duplicate(number)
-        if connection is None:
-            continue
+    for connection in filter(None, map(_duplicate, _numbers())):
         with contextlib.suppress(OSError):
             listens = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
             if listens and connection.getsockname()[1] == port:

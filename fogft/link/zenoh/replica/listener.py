@@ -72,6 +72,7 @@ class ZenohListener:
         certificate_name: str = "",
     ) -> None:
         self.endpoint = _with_port(listen)  # ``host:port`` as bound
+        self._port = int(self.endpoint.rpartition(":")[2])
         self._handshakes = handshakes
         self._reaper: ConnectionReaper | None = None
         self._id = id
@@ -107,10 +108,6 @@ class ZenohListener:
         # What the pool has signed: taken before `serve`, none of the revoked is ever let in.
         self.take_records = self._control.take
         self._services: dict[str, str] = {}  # key -> service
-
-    @property
-    def _port(self) -> int:
-        return int(self.endpoint.rpartition(":")[2])
 
     def serve(
         self,
