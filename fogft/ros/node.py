@@ -172,9 +172,7 @@ class SerialisedNode:
 
         return self._add(topic.name, create)
 
-    def make_visible(
-        self, name: str, judge: Callable[[Mapping[str, Any]], str] = lambda _: ""
-    ) -> VisibleNode:
+    def make_visible(self, name: str, judge: Callable[[Mapping[str, Any]], str]) -> VisibleNode:
         """Create a second node, visible to ROS tools; `judge` as for it. It ends with this one.
 
         Raises RosError: ROS refuses it, or this node is closed.
@@ -191,18 +189,15 @@ class SerialisedNode:
         Asked node by node: the list of all names has clients' in it too.
         """
         found: dict[str, str] = {}
-        try:
-            nodes = self._node.get_node_names_and_namespaces()
-        except Exception:  # rclpy's InvalidHandle: closed meanwhile
-            return found
-        for name, namespace in nodes:
-            if not ros_names.is_application(name):
-                continue
-            with contextlib.suppress(Exception):  # the node has gone since
-                services = self._node.get_service_names_and_types_by_node(name, namespace)
-                for service, kinds in services:
-                    if kinds and ros_names.is_of_application(service, kinds[0]):
-                        found.setdefault(service, kinds[0])
+        with contextlib.suppress(Exception):  # rclpy's InvalidHandle: closed meanwhile
+            for name, namespace in self._node.get_node_names_and_namespaces():
+                if not ros_names.is_application(name):
+                    continue
+                with contextlib.suppress(Exception):  # the node has gone since
+                    services = self._node.get_service_names_and_types_by_node(name, namespace)
+                    for service, kinds in services:
+                        if kinds and ros_names.is_of_application(service, kinds[0]):
+                            found.setdefault(service, kinds[0])
         return found
 
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:

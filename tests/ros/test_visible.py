@@ -36,7 +36,7 @@ def our_level() -> Iterator[None]:
 
 def test_diagnostics_and_the_log_reach_whoever_looks(person, make_node, ros_domain):
     """Each record once, with its own level, also from a thread that must not block."""
-    visible = make_node(ros_domain).make_visible("fogft_arm")
+    visible = make_node(ros_domain).make_visible("fogft_arm", lambda _: "")
     person.watch_diagnostics()
     person.watch_log()
 
@@ -88,7 +88,7 @@ def test_the_level_can_be_set_by_ros(person, make_node, ros_domain):
     from rcl_interfaces.msg import LoggerLevel
     from rcl_interfaces.srv import SetLoggerLevels
 
-    make_node(ros_domain).make_visible("fogft_arm")
+    make_node(ros_domain).make_visible("fogft_arm", lambda _: "")
     wanted = LoggerLevel(name="fogft_arm", level=10)
     request = SetLoggerLevels.Request(levels=[wanted])
     person.ask(SetLoggerLevels, "/fogft_arm/set_logger_levels", request)
@@ -101,7 +101,7 @@ def test_without_diagnostic_msgs_one_warning_says_so(
 ):
     """All else works."""
     monkeypatch.setitem(sys.modules, "diagnostic_msgs.msg", None)
-    visible = make_node(ros_domain).make_visible("fogft_arm")
+    visible = make_node(ros_domain).make_visible("fogft_arm", lambda _: "")
     [warning] = [r.getMessage() for r in caplog.records if "diagnostics_off" in r.getMessage()]
     assert "install" in warning
     visible.diagnose([STATUS])
@@ -112,14 +112,14 @@ def test_without_diagnostic_msgs_one_warning_says_so(
 def test_a_bad_name_is_a_clear_error_and_the_node_lives_on(make_node, ros_domain):
     node = make_node(ros_domain)
     with pytest.raises(RosError, match="`not a name` cannot be created"):
-        node.make_visible("not a name")
+        node.make_visible("not a name", lambda _: "")
     assert node.alive
 
 
 def test_its_log_takes_nothing_when_it_is_closed(make_node, ros_domain):
     before = list(logging.getLogger("fogft").handlers)
     node = make_node(ros_domain)
-    node.make_visible("fogft_arm")
+    node.make_visible("fogft_arm", lambda _: "")
     assert logging.getLogger("fogft").handlers != before
     node.close()
     assert logging.getLogger("fogft").handlers == before
