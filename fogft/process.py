@@ -12,7 +12,7 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable
 
 _STEP_S = 2.0
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -30,9 +30,9 @@ def start_log() -> None:
     logging.getLogger("fogft").setLevel(logging.INFO)
 
 
-def notify(state: str, environ: Mapping[str, str] = os.environ) -> None:
+def notify(state: str) -> None:
     """Notify systemd (sd_notify) if it started this process; else do nothing."""
-    address = environ.get("NOTIFY_SOCKET", "")
+    address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):
         return
     if address.startswith("@"):
@@ -44,14 +44,9 @@ def notify(state: str, environ: Mapping[str, str] = os.environ) -> None:
 class Watchdog:
     """Notifies systemd's watchdog as often as the unit's WatchdogSec requires."""
 
-    def __init__(
-        self,
-        clock: Callable[[], float] = time.monotonic,
-        environ: Mapping[str, str] = os.environ,
-    ) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._environ = environ
-        written = environ.get("WATCHDOG_USEC", "")
+        written = os.environ.get("WATCHDOG_USEC", "")
         self._every_s = int(written) / 4e6 if written.isdecimal() and int(written) else None
         self._next_at = float("-inf")
 
@@ -59,7 +54,7 @@ class Watchdog:
         """Notify if it is time; call it in each round of the main loop."""
         if self._every_s is not None and self._clock() >= self._next_at:
             self._next_at = self._clock() + self._every_s
-            notify("WATCHDOG=1", self._environ)
+            notify("WATCHDOG=1")
 
 
 class Hanging:
@@ -110,20 +105,20 @@ def stop_on_signal() -> threading.Event:
 _THREADS = "OPENBLAS_NUM_THREADS"
 
 
-def load_numpy(environ: MutableMapping[str, str] = os.environ) -> None:
+def load_numpy() -> None:
     """Load numpy, where there is one, without threads, unless the user has set their number.
 
     ROS's types load it, and the threads of its OpenBLAS spin before they sleep: 30 to 100 ms of a
     start. Nothing of it is left in the environment: the user's command may want BLAS.
     """
-    if _THREADS in environ:
+    if _THREADS in os.environ:
         return
-    environ[_THREADS] = "1"  # OpenBLAS reads it as it is loaded
+    os.environ[_THREADS] = "1"  # OpenBLAS reads it as it is loaded
     try:
         with contextlib.suppress(Exception):  # what is wrong with it, its next user tells
             importlib.import_module("numpy")
     finally:
-        del environ[_THREADS]
+        del os.environ[_THREADS]
 
 
 def begin_start() -> None:

@@ -107,15 +107,16 @@ def test_systemd_finds_nothing_wrong_with_the_units(home, units, tmp_path):
     assert (judged.returncode, judged.stderr) == (0, "")
 
 
-def test_systemd_is_told_when_a_process_is_ready_and_that_it_works(tmp_path):
+def test_systemd_is_told_when_a_process_is_ready_and_that_it_works(tmp_path, monkeypatch):
     now = [100.0]
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told:
         told.bind(str(tmp_path / "notify"))
         told.settimeout(10)
-        environ = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "4000000"}
-        notify("READY=1", environ)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "4000000")
+        notify("READY=1")
         assert told.recv(100) == b"READY=1"
-        watchdog = Watchdog(lambda: now[0], environ)
+        watchdog = Watchdog(lambda: now[0])
         for at in (100.0, 100.5, 101.0):
             now[0] = at
             watchdog.work()
@@ -123,8 +124,10 @@ def test_systemd_is_told_when_a_process_is_ready_and_that_it_works(tmp_path):
         told.setblocking(False)
         with pytest.raises(BlockingIOError):
             told.recv(100)
-    Watchdog(lambda: now[0], {}).work()  # nobody to tell
-    notify("READY=1", {"NOTIFY_SOCKET": str(tmp_path / "nobody")})
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "nobody"))
+    notify("READY=1")
+    monkeypatch.delenv("WATCHDOG_USEC")
+    Watchdog(lambda: now[0]).work()  # nobody asks
 
 
 def test_the_client_proxy_that_runs_gives_way_once_another_stands_by(
