@@ -122,11 +122,8 @@ def expected(
 ) -> Expected:
     """Return the availability of a pool with replicas in these placements; 0 for none.
 
-    Args:
-        placements: A replica each.
-        assumed: Of machines and locations.
-        sold: The locations of spot machines, where nothing else replaces them; none: there is
-            always something that does.
+    `sold` are the locations of spot machines, where nothing else replaces them; none: there is
+    always something that does.
     """
     down = [unavailability_of(assumed, spot=place.spot) for place in placements]
     each = list(zip(placements, down, strict=True))
@@ -145,9 +142,7 @@ def full_together(sold: Collection[Placement], assumed: Assumption) -> float:
     Locations that are full together for a share f of the time are like log(f) / log(`no_room`)
     that are full independently: so often does one of them end it.
 
-    Args:
-        sold: The locations; where there are none, 0.
-        assumed: Of locations, and of spot machines, which are up while theirs has room.
+    Spot machines are up while their location has room.
     """
     share = assumed.no_room
     full = joint_unavailability([(place, share) for place in sold], assumed.correlation)
@@ -162,12 +157,8 @@ def joint_unavailability(
 ) -> float:
     """Return the fraction of time that all replicas are down together.
 
-    Args:
-        replicas: Where each is, and the fraction of time that it is down, in [0, 1].
-        correlation: How much they are down together.
-
-    Raises:
-        ValueError: A fraction is out of range.
+    Each is given by where it is, and the fraction of time that it is down. Raises ValueError: one
+    is not in [0, 1].
     """
     tree: dict[str, dict[str, dict[str, list[float]]]] = defaultdict(
         lambda: defaultdict(lambda: defaultdict(list))

@@ -53,8 +53,10 @@ def cost(offers: Sequence[Offer], services: Iterable[ServiceSpec]) -> Cost:
 
 def egress_bytes_per_s(services: Iterable[ServiceSpec], replicas: int) -> float:
     """Return the egress of one of this many replicas."""
+    # Under `auto` a replica that is idle gets a copy of every request: the most that it may be.
+    share = {HedgingMode.FAILOVER: 1.0 / max(1, replicas)}
     return sum(
-        one.traffic.requests_per_s * one.traffic.response_bytes * _share(one, replicas)
+        one.traffic.requests_per_s * one.traffic.response_bytes * share.get(one.hedging, 1.0)
         for one in services
     )
 
@@ -62,9 +64,3 @@ def egress_bytes_per_s(services: Iterable[ServiceSpec], replicas: int) -> float:
 def egress_price(cloud: str) -> float:
     """Return a cloud's egress price for a GB, in US dollars."""
     return EGRESS_USD_PER_GB.get(cloud, UNKNOWN_EGRESS_USD_PER_GB)
-
-
-def _share(service: ServiceSpec, replicas: int) -> float:
-    """Return the fraction of requests that one of so many replicas answers."""
-    # Under `auto` a replica that is idle gets a copy of every request: the most that it may be.
-    return 1.0 / replicas if replicas and service.hedging is HedgingMode.FAILOVER else 1.0

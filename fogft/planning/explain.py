@@ -10,9 +10,11 @@ Not here: the decisions (`planner`) and how they are shown (`fogft.cli`).
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from operator import itemgetter
+from typing import NamedTuple
 
 from fogft.model.choices import Assumption
 from fogft.model.groups import group_of, groups_of
@@ -37,11 +39,9 @@ LATELY_S = 4 * 3600.0
 
 @dataclass(frozen=True)
 class Considered:
-    """An offer, and why it was chosen or not.
+    """An offer, the slots that got it, and why it was not chosen.
 
     Attributes:
-        slots: The replicas that got it; none for not chosen.
-        why_not: Why it was not chosen; None when it was.
         rtt_s: Round trip to its region in seconds; None for not known.
         losses: Replicas of this pool lost there in the last hours.
         losses_per_hour: As the planner reckons with; None on demand.
@@ -62,14 +62,11 @@ class Explanation:
     """A plan that people can read.
 
     Attributes:
-        wanted: Replicas wanted now.
         cap: US dollars per hour; None for none.
         assumed: What the availability rests on.
         expected: That a request can be answered.
-        cost: Of the planned replicas.
         single: The cheapest on-demand machine that would do alone, and its cost; None where
             no price is known.
-        notes: What may surprise.
         with_fallback: That a request can be answered, and US dollars per hour, did on-demand
             machines stand in; None where they do, or cannot.
     """
@@ -122,13 +119,10 @@ def explain(
     *,
     recovery_s: float | None = None,
 ) -> Explanation:
-    """Plan a pool from scratch, and explain the plan.
+    """Plan a pool from scratch, whatever runs, and explain the plan.
 
     Args:
-        spec: The pool file.
-        intent: The user's wishes; exclusions count.
-        observed: Offers, distances and the time; machines and links are not looked at.
-        history: What happened to the pool before: losses and failures of places count.
+        history: Losses and failures of places count.
         on_demand: What one on-demand machine of this kind costs, for comparison.
         recovery_s: How long launches have taken, in place of what is assumed where nobody said.
     """
@@ -180,6 +174,14 @@ def _with_fallback(
     return expected([launch.offer.placement for launch in launches], assumed).correlated, usd
 
 
+class _Pick(NamedTuple):
+    """A launch, and what stood when it was chosen."""
+
+    launch: PlannedLaunch
+    crowd: Counter[str]
+    budget: float | None
+
+
 class _Reasons:
     """Says of each offer why it was not chosen."""
 
@@ -199,15 +201,15 @@ class _Reasons:
         self._backing_off = backing_off(history, observed.now)
         self._hazards = hazards(history, observed.now)
         self._scale = Scale(rtt_s=observed.rtt_s)
-        self._picks: dict[str, list[_Pick]] = {}
-        self._slots: dict[Offer, list[int]] = {}
+        self._picks: dict[str, list[_Pick]] = defaultdict(list)
+        self._slots: dict[Offer, list[int]] = defaultdict(list)
         taken: list[Placement] = []
         spent = 0.0
         for launch in launches:
             group = group_of(groups_of(spec), launch.slot)
-            pick = _Pick(launch, dict(crowding(taken)), None if cap is None else cap - spent)
-            self._picks.setdefault(group.name, []).append(pick)
-            self._slots.setdefault(launch.offer, []).append(launch.slot)
+            pick = _Pick(launch, crowding(taken), None if cap is None else cap - spent)
+            self._picks[group.name].append(pick)
+            self._slots[launch.offer].append(launch.slot)
             taken.append(launch.offer.placement)
             spent += launch.offer.usd_per_hour
 
@@ -250,7 +252,7 @@ class _Reasons:
         ours, theirs = self._rank(offer, pick), self._rank(chosen, pick)
         for level, domain in enumerate(offer.placement.domains):
             if ours[level] > theirs[level]:
-                count = pick.count[domain]
+                count = pick.crowd[domain]
                 crowded = Reason(Cause.CROWDED, slot=slot, location=domain, count=count)
                 return 3 + level, crowded
         return 6, replace(
@@ -260,7 +262,7 @@ class _Reasons:
         )
 
     def _rank(self, offer: Offer, pick: _Pick) -> tuple[int, ...]:
-        return tuple(pick.count.get(domain, 0) for domain in offer.placement.domains)
+        return tuple(pick.crowd[domain] for domain in offer.placement.domains)
 
     def _score(self, cause: Cause, offer: Offer) -> Reason:
         return Reason(
@@ -269,12 +271,3 @@ class _Reasons:
             seconds=self._scale.latency(offer.placement),
             usd_per_hour=offer.usd_per_hour,
         )
-
-
-@dataclass(frozen=True)
-class _Pick:
-    """A launch, and what stood when it was chosen."""
-
-    launch: PlannedLaunch
-    count: Mapping[str, int]
-    budget: float | None

@@ -86,13 +86,10 @@ def missing(
     surge: int,
     safe: bool,
 ) -> int:
-    """Return how many more stand-ins are needed.
+    """Return how many more stand-ins a group needs, for so many replicas to be ready.
 
     Args:
-        wanted: How many replicas should be ready.
-        here: The group's machines, without its stand-ins.
-        standing_in: Its stand-ins, booting ones included.
-        history: Of all launches.
+        here: The group's machines, without `standing_in`.
         surge: So many more boot while nobody serves.
         safe: See `is_safe`.
     """

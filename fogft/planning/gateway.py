@@ -74,13 +74,9 @@ def plan_gateway(
     *,
     up_at: float | None,
 ) -> GatewayPlan:
-    """Return the next step.
+    """Return the next step; the cloud must have answered.
 
     Args:
-        spec: The pool file.
-        intent: The user's wishes.
-        observed: The world now; the cloud must have answered.
-        history: Of all launches.
         offers: On-demand machines that would do, the cheapest first.
         up_at: When the robot's link to a gateway of the pool's own was last seen up.
     """

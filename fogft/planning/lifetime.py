@@ -18,13 +18,7 @@ SOON_S = 600.0
 
 
 def begun_at(intent: Intent, created_at: float, history: History) -> float:
-    """Return when a pool's `max_hours` began, by today's clock, which may have been set since.
-
-    Args:
-        intent: Says whether its hours began anew after its creation.
-        created_at: When it was created.
-        history: Knows when the clock was set.
-    """
+    """Return when a pool's `max_hours` began, by today's clock, which may have been set since."""
     return history.by_clock(intent.began_at or created_at)
 
 

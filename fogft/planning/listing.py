@@ -132,14 +132,7 @@ class Catalogue:
     def listing(
         self, group: str | None, spot: bool | None, excluded: Collection[str], scale: Scale
     ) -> Listing:
-        """Return the offers for a group, in order.
-
-        Args:
-            group: Its name; None for all offers.
-            spot: Of one kind only unless None.
-            excluded: Locations that the user ruled out.
-            scale: How price and distance are weighed.
-        """
+        """Return the offers for a group (None: for all), of one kind only unless `spot` is None."""
         far = tuple(sorted(scale.rtt_s.items()))
         key = group, spot, frozenset(excluded), scale.weight, far, scale.pool
         if key not in self._listings:

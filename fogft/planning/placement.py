@@ -50,7 +50,6 @@ class Market:
     """The available offers, indexed for many choices.
 
     Args:
-        listing: What is sold, in order.
         backing_off: Supplies in backoff, see `Placement.supply`.
         avoid: Locations to use only when no other is left: one was lost there lately.
         full: Locations that hold as many replicas as may be lost at once.
@@ -106,7 +105,6 @@ class Market:
 
         Args:
             taken: Where the replicas that stay are, or how many are where.
-            avoid: More locations to avoid.
             budget_usd_per_hour: The most that the new machine may cost; None for no limit.
         """
         if self._nothing:

@@ -82,13 +82,7 @@ def plan(
     It is planned again on the world as it is once a plan is under way, until nothing is added: a
     launch makes a replica superfluous, an ending leaves another one the last of its region.
 
-    Args:
-        pool_uid: Machines of other pools are ignored.
-        spec: The pool file.
-        intent: What the user wants besides.
-        observed: The world now, `observed.now` included.
-        history: What happened before.
-        health: What `judge` makes of these very arguments, where that is known already.
+    `health` is what `judge` makes of these very arguments, where that is known already.
     """
     health = health or judge(pool_uid, spec, observed, history)
     decided = latest = plan_once(spec, intent, observed, history, health=health)

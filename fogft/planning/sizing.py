@@ -54,12 +54,8 @@ class Size(NamedTuple):
 def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -> Size:
     """Return the wanted number of replicas of each group, and the cap.
 
-    Args:
-        spec: The pool file.
-        intent: The user's wishes.
-        observed: The world now: its time, offers and distances.
-        running: How many replicas there are. A target's number does not fall below it
-            while nothing is offered.
+    `running` is how many there are: near the cap, or while nothing is offered, a target's number
+    does not fall below it.
     """
     groups = groups_of(spec)
     usual = Wish(spec.replicas, spec.max_usd_per_hour)

@@ -26,10 +26,7 @@ HOUR_S = 3600.0
 def given_up(history: History, version: str, since: float) -> Reason | None:
     """Return why a version is no longer launched; None while it is.
 
-    Args:
-        history: What happened.
-        version: Of the launch that is needed.
-        since: What was launched before does not count: the user asked for it again.
+    What was launched before `since` does not count: the user asked for it again.
     """
     if history.was_ready(version):
         return None

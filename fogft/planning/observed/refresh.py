@@ -15,22 +15,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from fogft.model.replica import LinkReport, LinkState, MachinePhase, Observed, ReplicaId
+from fogft.model.replica import LinkState, MachinePhase, Observed, ReplicaId
 from fogft.planning.observed.health import was_heard
 from fogft.planning.observed.history import History
 
-FIRST_PAUSE_S = 4.0
 LONGEST_PAUSE_S = 60.0
-DOUBTED_PAUSE_S = 15.0  # whoever is lost after a doubt is asked about at once again
-NEVER_HEARD_PAUSE_S = 30.0
 FALSE_ALARM_REMEMBERED_S = 600.0
 """A link that often hesitates and then answers costs a question now and then, no more."""
 
 
-class _Silence(Enum):
-    NEVER_HEARD = "never heard"
-    DOUBTED = "doubted"  # still up: a probe's answer is late
-    LOST = "lost"
+class _Silence(float, Enum):
+    """How a replica is silent, with the first pause between questions in seconds."""
+
+    NEVER_HEARD = 30.0
+    DOUBTED = 15.0  # still up: a probe's answer is late; once it is lost, it is asked about at once
+    LOST = 4.0
 
 
 @dataclass
@@ -50,36 +49,27 @@ class Silent:
 
     def due(self, observed: Observed, history: History) -> list[ReplicaId]:
         """Return the replicas to ask about now; they count as asked."""
-        silent = _silent(observed, history)
+        silent, now = _silent(observed, history), observed.now
         self._asked = {
             id: asked
             for id, asked in self._asked.items()
-            if id in silent or _is_remembered(asked, observed.now)
+            if id in silent  # one whose link hesitated keeps its pause
+            or (
+                asked.silence is _Silence.DOUBTED and now - asked.next_at < FALSE_ALARM_REMEMBERED_S
+            )
         }
-        return [id for id, silence in silent.items() if self._is_due(id, silence, observed.now)]
+        return [id for id, silence in silent.items() if self._is_due(id, silence, now)]
 
     def _is_due(self, id: ReplicaId, silence: _Silence, now: float) -> bool:
         asked = self._asked.get(id)
         if asked is None or (silence is _Silence.LOST and asked.silence is not _Silence.LOST):
-            asked = self._asked[id] = _first(silence, now)
+            next_at = now + silence if silence is _Silence.NEVER_HEARD else now
+            asked = self._asked[id] = _Asked(silence, next_at, silence.value)
         if now < asked.next_at:
             return False
         asked.next_at = now + asked.pause_s
         asked.pause_s = min(LONGEST_PAUSE_S, 2 * asked.pause_s)
         return True
-
-
-def _first(silence: _Silence, now: float) -> _Asked:
-    if silence is _Silence.NEVER_HEARD:
-        return _Asked(silence, now + NEVER_HEARD_PAUSE_S, NEVER_HEARD_PAUSE_S)
-    doubted = silence is _Silence.DOUBTED
-    return _Asked(silence, now, DOUBTED_PAUSE_S if doubted else FIRST_PAUSE_S)
-
-
-def _is_remembered(asked: _Asked, now: float) -> bool:
-    """Whether one that answers again keeps its pause."""
-    recent = now - asked.next_at < FALSE_ALARM_REMEMBERED_S
-    return asked.silence is _Silence.DOUBTED and recent
 
 
 def _silent(observed: Observed, history: History) -> dict[ReplicaId, _Silence]:
@@ -90,13 +80,11 @@ def _silent(observed: Observed, history: History) -> dict[ReplicaId, _Silence]:
         link = links.get(machine.id)
         if machine.phase is not MachinePhase.RUNNING or machine.id in observed.ending:
             continue
-        if link is not None and (link.doubted or link.state is not LinkState.UP):
-            record = history.record(machine.id.slot, machine.id.generation)
-            out[machine.id] = _how(link, heard=was_heard(link, record))
+        if link is None or not (link.doubted or link.state is not LinkState.UP):
+            continue
+        if link.state is LinkState.UP:
+            out[machine.id] = _Silence.DOUBTED
+        else:
+            heard = was_heard(link, history.record(machine.id.slot, machine.id.generation))
+            out[machine.id] = _Silence.LOST if heard else _Silence.NEVER_HEARD
     return out
-
-
-def _how(link: LinkReport, *, heard: bool) -> _Silence:
-    if link.state is LinkState.UP:
-        return _Silence.DOUBTED
-    return _Silence.LOST if heard else _Silence.NEVER_HEARD
