@@ -13,12 +13,13 @@ Not here: the steps: how many (`sizing`), who is ill (`health`), who is what
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
-from fogft.model.groups import Group, group_of
+from fogft.model.groups import Group, group_of, replica_hash
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import Observed, ReplicaId
+from fogft.model.replica import Machine, MachinePhase, Observed, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning import fallback, migration, rollout
 from fogft.planning.buying import Buyer, PlannedLaunch
@@ -26,9 +27,8 @@ from fogft.planning.classification import Classification, classify
 from fogft.planning.endings import Endings, choose_endings
 from fogft.planning.needs import Need, needed_launches, stand_in
 from fogft.planning.observed.health import Assessment, Health, judge
-from fogft.planning.observed.history import History
+from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.placement import EPSILON_USD
-from fogft.planning.projected_state import projected_state
 from fogft.planning.sizing import Size, size
 
 __all__ = ["Plan", "PlannedEnd", "PlannedLaunch", "plan"]
@@ -91,15 +91,7 @@ def plan(
     for _ in range(MOST_PASSES):
         if latest.closed or not _changes(latest, history):
             break
-        world, memory = projected_state(
-            pool_uid,
-            spec,
-            observed,
-            history,
-            launches=decided.launches,
-            ends={end.id for end in decided.terminations},
-            draining=decided.draining,
-        )
+        world, memory = _under_way(pool_uid, spec, observed, history, decided)
         health = judge(pool_uid, spec, world, memory)
         latest = plan_once(spec, intent, world, memory, health=health)
         is_done = not latest.launches and not latest.terminations
@@ -119,12 +111,43 @@ def plan(
 
 def _changes(decided: Plan, history: History) -> bool:
     """Whether a plan makes any difference to what the next one is based on."""
-    if decided.launches or decided.terminations:
-        return True
+    return bool(decided.launches or decided.terminations or _newly_marked(decided, history))
+
+
+def _newly_marked(decided: Plan, history: History) -> list[ReplicaId]:
     if not decided.draining:
-        return False
+        return []
     marked = {(r.slot, r.generation) for r in history.open() if r.draining_since is not None}
-    return not marked.issuperset((id.slot, id.generation) for id in decided.draining)
+    return [id for id in decided.draining if (id.slot, id.generation) not in marked]
+
+
+def _under_way(
+    pool_uid: str, spec: PoolSpec, observed: Observed, history: History, decided: Plan
+) -> tuple[Observed, History]:
+    """Return the observation and history that follow if nothing but the plan happens."""
+    now = observed.now
+    ordered, events = [], []
+    for slot, generation, offer, _ in decided.launches:
+        ordered.append(
+            Machine(
+                id=ReplicaId(pool_uid, slot, generation),
+                placement=offer.placement,
+                phase=MachinePhase.PROVISIONING,
+                launched_at=now,
+                usd_per_hour=offer.usd_per_hour,
+                spec_hash=replica_hash(spec, slot),
+            )
+        )
+        place, on_demand = offer.placement.location, not offer.placement.spot
+        events.append(Event(now, EventKind.LAUNCH, slot, generation, place, on_demand=on_demand))
+    for id in _newly_marked(decided, history):
+        events.append(Event(now, EventKind.DRAINING, id.slot, id.generation))
+    later = replace(
+        observed,
+        machines=(*(observed.machines or ()), *ordered),
+        ending=observed.ending.union(end.id for end in decided.terminations),
+    )
+    return later, history.followed_by(events) if events else history
 
 
 class _Part(NamedTuple):
