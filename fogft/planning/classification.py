@@ -98,8 +98,7 @@ def classify(
             machines.lost.append(replica)
         elif why := _unwanted(spec, intent, replica, blocks):
             goes = replica._replace(unwanted=why)
-            never_served = _is_young(goes, health) or _never_served(goes, health)
-            (machines.aborted if never_served else machines.replaced).append(goes)
+            (machines.aborted if _never_served(goes, health) else machines.replaced).append(goes)
         else:
             machines.good.append(replica)
     _supersede(machines, health, size)
@@ -123,9 +122,8 @@ def _supersede(machines: Classification, health: Health, size: Size) -> None:
         for replica in old[: max(0, surplus)]:
             machines.good.remove(replica)
             why = Reason(Cause.SUPERSEDED, replica=f"{replica.slot}.{newest[replica.slot]}")
-            young = _is_young(replica, health)
-            goes = replica._replace(unwanted=why)
-            (machines.aborted if young else machines.replaced).append(goes)
+            kind = machines.aborted if _never_served(replica, health) else machines.replaced
+            kind.append(replica._replace(unwanted=why))
 
 
 def _unwanted(
@@ -151,17 +149,12 @@ def _rank(replica: Assessment) -> int:
     return 2 if why is None else _ORDER.get(why.cause, 2)
 
 
-def _is_young(replica: Assessment, health: Health) -> bool:
+def _never_served(replica: Assessment, health: Health) -> bool:
     """Whether it certainly never served, so that it can be ended at once."""
     if replica.machine.phase is MachinePhase.PROVISIONING:
         return True
-    known = health.links_known and not health.uplink_suspected
-    return known and not replica.ever_ready and not replica.answers
-
-
-def _never_served(replica: Assessment, health: Health) -> bool:
-    """Whether an outdated one answers probes and has never had a service ready: it is no loss."""
-    known = health.links_known and not health.uplink_suspected
-    link = replica.link
-    served = replica.ever_ready or (link is not None and bool(link.ready))
-    return known and not served and replica.is_outdated
+    if health.uplink_suspected or not health.links_known or replica.ever_ready:
+        return False
+    # An outdated one that answers probes and has no service ready is no loss.
+    some_ready = replica.link is not None and bool(replica.link.ready)
+    return not replica.answers or (replica.is_outdated and not some_ready)

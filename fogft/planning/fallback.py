@@ -19,7 +19,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Sequence
 
-from fogft.model.groups import Group, is_stand_in
+from fogft.model.groups import Group
 from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment
 from fogft.planning.observed.history import History
@@ -32,11 +32,6 @@ STAYS_S = 600.0
 # and without one all that are left may go at once.
 OFTEN = 2
 OFTEN_S = 1800.0
-
-
-def stand_ins(machines: Classification) -> list[Assessment]:
-    """Return the stand-ins that are not lost."""
-    return [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
 
 
 def held(
@@ -67,11 +62,6 @@ def surge_of(group: Group, wanted: int, surge: int) -> int:
     return 0 if group.on_demand.standbys >= wanted else surge
 
 
-def is_safe(machines: Classification) -> bool:
-    """Whether a replica serves that cannot be preempted."""
-    return any(s.serving and not s.placement.spot for s in (*machines.good, *machines.replaced))
-
-
 def is_first(slot: int, generation: int, history: History, *, safe: bool) -> bool:
     """Whether a spot machine is the first of its slot, or the first since that last served."""
     return generation == (history.served(slot) if safe else 0) + 1
@@ -91,7 +81,7 @@ def missing(
     Args:
         here: The group's machines, without `standing_in`.
         surge: So many more boot while nobody serves.
-        safe: See `is_safe`.
+        safe: A replica serves that cannot be preempted.
     """
     kept = (*here.good, *here.replaced)
     covered = sum(

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from fogft.model.groups import Group, group_of, replica_hash
+from fogft.model.groups import Group, group_of, is_stand_in, replica_hash
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Observed, ReplicaId
@@ -185,7 +185,7 @@ def plan_once(
     machines = classify(spec, intent, observed, health=health, size=sized)
     counts, excess = _within_cap(sized, machines)
     wanted = sum(counts)
-    standing_in = fallback.stand_ins(machines)
+    standing_in = [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
     others = machines.without(standing_in) if standing_in else machines
     buyer = Buyer(
         spec,
@@ -219,7 +219,8 @@ def plan_once(
         needs = needed_launches(sized.groups, counts, machines, history)
     room = wanted + spec.max_surge - machines.live
     first: Assessment | None = None
-    safe = fallback.is_safe(machines)
+    working = (*machines.good, *machines.replaced)
+    safe = any(s.serving and not s.placement.spot for s in working)
     begun = [
         need
         for need in needs

@@ -167,14 +167,24 @@ class Search:
 
 
 class Rule:
-    """A rule for where the next spot machine is ordered."""
+    """A rule for where the next spot machine is ordered: cheapest first, fewest replicas first."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
-        self._spot = spot
+        self._active = self._spot = spot
+        self._failed: dict[str, int] = {}
 
     def place(self, taken: Sequence[Offer]) -> Offer:
-        """Return the offer to order, given those in use."""
-        raise NotImplementedError
+        """Return the offer to order, given those in use; ties go to the oldest failure."""
+        used = Counter(o.placement.location for o in taken)
+        return min(
+            self._active,
+            key=lambda o: (
+                used[o.placement.location],
+                self._failed.get(o.placement.location, 0),
+                o.usd_per_hour,
+                o.placement,
+            ),
+        )
 
     def lost(self, offer: Offer) -> None:
         """Note that a location preempted a machine or had no capacity."""
@@ -187,6 +197,7 @@ class InTurn(Rule):
     """Round robin: the next location of a list, wherever the others are."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
+        super().__init__(spot)
         self._turns = itertools.cycle(spot)
 
     def place(self, taken: Sequence[Offer]) -> Offer:
@@ -197,27 +208,9 @@ class InTurn(Rule):
 class Naive(Rule):
     """The cheapest location with the fewest replicas, avoiding recent failures."""
 
-    def __init__(self, spot: Sequence[Offer]) -> None:
-        super().__init__(spot)
-        self._failed: dict[str, int] = {}
-        self._failures = itertools.count(1)
-
-    def place(self, taken: Sequence[Offer]) -> Offer:
-        """Return the offer to order; ties go to the oldest failure."""
-        used = Counter(o.placement.location for o in taken)
-        return min(
-            self._spot,
-            key=lambda o: (
-                used[o.placement.location],
-                self._failed.get(o.placement.location, 0),
-                o.usd_per_hour,
-                o.placement,
-            ),
-        )
-
     def lost(self, offer: Offer) -> None:
         """Try that location last."""
-        self._failed[offer.placement.location] = next(self._failures)
+        self._failed[offer.placement.location] = 1 + max(self._failed.values(), default=0)
 
 
 class ActiveZones(Rule):
@@ -231,19 +224,14 @@ class ActiveZones(Rule):
         super().__init__(spot)
         self._preempted: set[str] = set()
 
-    def place(self, taken: Sequence[Offer]) -> Offer:
-        """Return the offer to order."""
-        used = Counter(o.placement.location for o in taken)
-        active = [o for o in self._spot if o.placement.location not in self._preempted]
-        return min(active, key=lambda o: (used[o.placement.location], o.usd_per_hour, o.placement))
-
     def lost(self, offer: Offer) -> None:
         """Make a location inactive."""
         self._preempted.add(offer.placement.location)
-        locations = {o.placement.location for o in self._spot}
-        if len(locations - self._preempted) < 2:
+        if len({o.placement.location for o in self._spot} - self._preempted) < 2:
             self._preempted.clear()
+        self._active = [o for o in self._spot if o.placement.location not in self._preempted]
 
     def ready(self, offer: Offer) -> None:
         """Make a location active."""
         self._preempted.discard(offer.placement.location)
+        self._active = [o for o in self._spot if o.placement.location not in self._preempted]

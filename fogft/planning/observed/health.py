@@ -216,7 +216,8 @@ def _judge_one(
     record: Record | None,
     serving: bool,
 ) -> Assessment:
-    if serving and _is_well(machine, link):  # as nearly all are
+    accused = link is None or link.leaving or link.disagrees or link.at_risk or machine.notice
+    if serving and not accused:  # as nearly all are
         return Assessment(machine, link, record, _READY, _GOOD, True, True)
     verdict, why = _verdict(context, machine, link, record, serving)
     may_serve = serving
@@ -225,13 +226,6 @@ def _judge_one(
         may_serve = not answers and verdict not in (Verdict.UNRESPONSIVE, Verdict.FAILED)
     phase = _phase(machine, verdict, serving)
     return Assessment(machine, link, record, phase, verdict, serving, may_serve, why)
-
-
-def _is_well(machine: Machine, link: LinkReport | None) -> bool:
-    """Whether nobody says a word against one that serves."""
-    if machine.notice or link is None:
-        return False
-    return not (link.leaving or link.disagrees or link.at_risk)
 
 
 def _phase(machine: Machine, verdict: Verdict, serving: bool) -> Phase:
@@ -256,8 +250,8 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
         return Verdict.FAILED, machine.failure or Reason(Cause.ERROR)
     if machine.notice:
         return Verdict.LEAVING, Reason(Cause.NOTICE)
-    ever_ready = record is not None and record.first_ready_at is not None
-    if machine.setting_up and not serving and not ever_ready:
+    ready_at = record.first_ready_at if record is not None else None
+    if machine.setting_up and not serving and ready_at is None:
         if now - _accepted_at(machine, record, now) > SETUP_LIMIT_S:
             return Verdict.FAILED, _timeout(Cause.NOT_SET_UP, SETUP_LIMIT_S)
         return Verdict.GOOD, None
@@ -273,11 +267,10 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
     if link is not None and link.disagrees and context.may_doubt:
         ignores = Cause.IGNORES if link.ignores else Cause.DISAGREES
         return Verdict.DISAGREES, Reason(Cause.MISREAD if link.misread else ignores)
-    if serving and link is not None and link.at_risk and _has_settled(record, now):
+    settled = ready_at is not None and now - ready_at >= HINT_PAUSE_S
+    if serving and link is not None and link.at_risk and settled:
         return Verdict.AT_RISK, Reason(Cause.AT_RISK)
-    if serving or not context.may_doubt:
-        return Verdict.GOOD, None
-    if silent:
+    if serving or silent or not context.may_doubt:
         return Verdict.GOOD, None
     if record is None or record.first_ready_at is None:
         since = machine.launched_at if record is None else record.launched_at
@@ -305,8 +298,3 @@ def _accepted_at(machine: Machine, record: Record | None, now: float) -> float:
     if machine.launched_at > now:
         return record.launched_at
     return max(machine.launched_at, record.launched_at)
-
-
-def _has_settled(record: Record | None, now: float) -> bool:
-    ready_at = record.first_ready_at if record is not None else None
-    return ready_at is not None and now - ready_at >= HINT_PAUSE_S
