@@ -106,15 +106,10 @@ def unavailability_of(assumed: Assumption, *, spot: bool) -> float:
 
 @dataclass(frozen=True)
 class Expected:
-    """The fraction of time, in [0, 1], that at least one replica answers.
+    """The fraction of time, in [0, 1], that at least one replica answers."""
 
-    Attributes:
-        correlated: As `Assumption.correlation` says.
-        independent: If replicas failed independently: the best case, and the paper's.
-    """
-
-    correlated: float
-    independent: float
+    correlated: float  # as `Assumption.correlation` says
+    independent: float  # if replicas failed independently: the best case, and the paper's
 
 
 def expected(

@@ -26,23 +26,18 @@ _DOUBTED = (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES)
 
 @dataclass
 class Classification:
-    """Every machine of the pool, by class.
+    """Every machine of the pool, by class."""
 
-    Attributes:
-        good: Serve or will serve.
-        replaced: Work, but shall be replaced, new before old.
-        lost: Leaving or unresponsive: replaced at once, and not counted as machines.
-        failed: Launches that failed: ended at once, not counted.
-        aborted: Not wanted as they are, and never served: ended at once.
-        ending: Already asked to end.
-    """
-
-    good: list[Assessment] = field(default_factory=list)
+    good: list[Assessment] = field(default_factory=list)  # serve or will serve
+    # Work, but shall be replaced, new before old.
     replaced: list[Assessment] = field(default_factory=list)
+    # Leaving or unresponsive: replaced at once, and not counted as machines.
     lost: list[Assessment] = field(default_factory=list)
+    # Launches that failed: ended at once, not counted.
     failed: list[Assessment] = field(default_factory=list)
+    # Not wanted as they are, and never served: ended at once.
     aborted: list[Assessment] = field(default_factory=list)
-    ending: list[Assessment] = field(default_factory=list)
+    ending: list[Assessment] = field(default_factory=list)  # already asked to end
 
     @property
     def _kinds(self) -> tuple[list[Assessment], ...]:

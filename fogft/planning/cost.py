@@ -24,14 +24,10 @@ UNKNOWN_EGRESS_USD_PER_GB = 0.12
 
 @dataclass(frozen=True)
 class Cost:
-    """US dollars per hour.
-
-    Attributes:
-        egress: For what leaves the clouds; 0 where the file says nothing of traffic.
-    """
+    """US dollars per hour."""
 
     machines: float
-    egress: float
+    egress: float  # for what leaves the clouds; 0 where the file says nothing of traffic
 
     @property
     def usd_per_hour(self) -> float:

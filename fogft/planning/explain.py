@@ -39,48 +39,34 @@ LATELY_S = 4 * 3600.0
 
 @dataclass(frozen=True)
 class Considered:
-    """An offer, the slots that got it, and why it was not chosen.
-
-    Attributes:
-        rtt_s: Round trip to its region in seconds; None for not known.
-        losses: Replicas of this pool lost there in the last hours.
-        losses_per_hour: As the planner reckons with; None on demand.
-        losses_assumed: This pool has asked for no spot machine there: it is the prior.
-    """
+    """An offer, the slots that got it, and why it was not chosen."""
 
     offer: Offer
     slots: tuple[int, ...]
     why_not: Reason | None
-    rtt_s: float | None
-    losses: int
-    losses_per_hour: float | None = None
-    losses_assumed: bool = True
+    rtt_s: float | None  # round trip to its region in seconds; None for not known
+    losses: int  # replicas of this pool lost there in the last hours
+    losses_per_hour: float | None = None  # as the planner reckons with; None on demand
+    losses_assumed: bool = True  # this pool has asked for no spot machine there: it is the prior
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A plan that people can read.
-
-    Attributes:
-        cap: US dollars per hour; None for none.
-        assumed: What the availability rests on.
-        expected: That a request can be answered.
-        single: The cheapest on-demand machine that would do alone, and its cost; None where
-            no price is known.
-        with_fallback: That a request can be answered, and US dollars per hour, did on-demand
-            machines stand in; None where they do, or cannot.
-    """
+    """A plan that people can read."""
 
     considered: tuple[Considered, ...]
     replicas: tuple[PlannedLaunch, ...]
     wanted: int
-    cap: float | None
-    assumed: Assumption
-    expected: Expected
+    cap: float | None  # US dollars per hour; None for none
+    assumed: Assumption  # what the availability rests on
+    expected: Expected  # that a request can be answered
     target: float | None
     cost: Cost
+    # The cheapest on-demand machine that would do alone, and its cost; None without a known price.
     single: tuple[Offer, Cost] | None
     notes: tuple[Reason, ...]
+    # That a request can be answered, and US dollars per hour, did on-demand machines stand in; None
+    # where they do, or cannot.
     with_fallback: tuple[float, float] | None = None
 
     @property

@@ -28,21 +28,13 @@ _WHEREABOUTS = ("infra", "cloud", "region", "zone")
 
 
 class GatewayPlan(NamedTuple):
-    """What to do about the gateway's machine.
+    """What to do about the gateway's machine."""
 
-    Attributes:
-        host: Where it is; empty while nobody knows.
-        ends: Machines to end, with the reason.
-        failed: Those of `ends` whose launch has failed.
-        launch: What to buy; None for nothing.
-        note: Why no replica is launched before it is there.
-    """
-
-    host: str = ""
-    ends: tuple[tuple[ReplicaId, Reason], ...] = ()
-    failed: frozenset[ReplicaId] = frozenset()
-    launch: Offer | None = None
-    note: Reason | None = None
+    host: str = ""  # where it is; empty while nobody knows
+    ends: tuple[tuple[ReplicaId, Reason], ...] = ()  # machines to end, with the reason
+    failed: frozenset[ReplicaId] = frozenset()  # those of `ends` whose launch has failed
+    launch: Offer | None = None  # what to buy; None for nothing
+    note: Reason | None = None  # why no replica is launched before it is there
 
 
 def version(spec: PoolSpec) -> str:

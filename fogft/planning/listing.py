@@ -36,17 +36,12 @@ UNKNOWN_RTT_S = 0.150
 
 @dataclass(frozen=True)
 class Scale:
-    """How offers are compared.
+    """How offers are compared."""
 
-    Attributes:
-        weight: Of round trips.
-        rtt_s: Known ones by ``cloud/region``, in seconds.
-        pool: Whose: what is otherwise equal comes in another order for each.
-    """
-
-    weight: float = 1.0
+    weight: float = 1.0  # of round trips
+    # Known ones by `cloud/region`, in seconds.
     rtt_s: Mapping[str, float] = field(default_factory=dict)
-    pool: str = ""
+    pool: str = ""  # whose: what is otherwise equal comes in another order for each
 
     def latency(self, placement: Placement) -> float | None:
         """Return the round trip to a placement's region in seconds; None if it is not known."""
@@ -66,35 +61,26 @@ without_offer = itemgetter(slice(0, 8))
 
 
 class Row(NamedTuple):
-    """An offer with its rank; fields are in tie-breaking order.
-
-    Attributes:
-        lot: Drawn for the location, so that no name is preferred.
-        supply: See `Placement.supply`.
-    """
+    """An offer with its rank; fields are in tie-breaking order."""
 
     score: float
     usd_per_hour: float
-    lot: int
+    lot: int  # drawn for the location, so that no name is preferred
     cloud: str
     region: str
     location: str
     instance: str
     spot: bool
     offer: Offer
-    supply: str
+    supply: str  # see `Placement.supply`
 
 
 @dataclass(frozen=True)
 class Listing:
-    """The cheapest offer of each supply, best score first; no other is ever chosen.
-
-    Attributes:
-        trouble: Why there is no row; None where there is one.
-    """
+    """The cheapest offer of each supply, best score first; no other is ever chosen."""
 
     rows: tuple[Row, ...]
-    trouble: Reason | None = None
+    trouble: Reason | None = None  # why there is no row; None where there is one
 
     @cached_property
     def supplies(self) -> frozenset[str]:

@@ -45,15 +45,11 @@ def is_quiet(machines: Classification, health: Health) -> bool:
 
 @dataclass(frozen=True)
 class Move:
-    """A replica that should be elsewhere, and why.
-
-    Attributes:
-        urgency: The lowest goes first.
-    """
+    """A replica that should be elsewhere, and why."""
 
     replica: Assessment
     why: Reason
-    urgency: tuple[float, ...]
+    urgency: tuple[float, ...]  # the lowest goes first
 
 
 def restless(buyer: Buyer) -> frozenset[ReplicaId]:

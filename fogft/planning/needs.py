@@ -18,18 +18,13 @@ from fogft.planning.observed.history import History
 
 
 class Need(NamedTuple):
-    """A launch that is needed.
-
-    Attributes:
-        replaces: Whom it replaces; None to fill an empty slot.
-        stands_in: An on-demand machine is to serve until a spot one does.
-    """
+    """A launch that is needed."""
 
     slot: int
     reason: Reason
     group: Group
-    replaces: Assessment | None = None
-    stands_in: bool = False
+    replaces: Assessment | None = None  # whom it replaces; None to fill an empty slot
+    stands_in: bool = False  # an on-demand machine is to serve until a spot one does
 
 
 def needed_launches(

@@ -29,15 +29,12 @@ Rank = tuple[bool, int, int, int]
 
 
 class Choice(NamedTuple):
-    """The chosen offer, or the reason for none.
-
-    Attributes:
-        rank: Of the offer: whether its location is avoided, then how many of our other
-            replicas its cloud, region and zone hold.
-    """
+    """The chosen offer, or the reason for none."""
 
     offer: Offer | None
     why_not: Reason | None = None
+    # Of the offer: whether its location is avoided, then how many of our other replicas its cloud,
+    # region and zone hold.
     rank: Rank = (False, 0, 0, 0)
 
 

@@ -45,26 +45,20 @@ class PlannedEnd(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A plan: launches, endings, marks and notes.
+    """A plan: launches, endings, marks and notes."""
 
-    Attributes:
-        draining: Replicas to mark as draining in the membership; they end a little later.
-        notes: Why the pool is not yet as wanted.
-        wanted: How many replicas should be ready.
-        health: What the plan was based on; None when the cloud could not tell.
-        closed: It is known without trying that planning again while it is under way adds nothing.
-        waits: For a location's backoff to end: a launch that is needed, or a stand-in's return.
-        restless: Who would move if they had stayed long enough and no location backed off.
-    """
-
-    wanted: int
+    wanted: int  # how many replicas should be ready
     launches: tuple[PlannedLaunch, ...] = ()
     terminations: tuple[PlannedEnd, ...] = ()
+    # Replicas to mark as draining in the membership; they end a little later.
     draining: tuple[ReplicaId, ...] = ()
-    notes: tuple[Reason, ...] = ()
-    health: Health | None = None
+    notes: tuple[Reason, ...] = ()  # why the pool is not yet as wanted
+    health: Health | None = None  # what the plan was based on; None when the cloud could not tell
+    # It is known without trying that planning again while it is under way adds nothing.
     closed: bool = False
+    # For a location's backoff to end: a launch that is needed, or a stand-in's return.
     waits: bool = False
+    # Who would move if they had stayed long enough and no location backed off.
     restless: frozenset[ReplicaId] = frozenset()
 
 
@@ -151,20 +145,14 @@ def _under_way(
 
 
 class _Part(NamedTuple):
-    """A group's share of what is wanted and of the machines.
-
-    Attributes:
-        others: Its machines but for `standing_in`.
-        held: So many of those that stand in are kept in place of spot machines.
-        surge: So many more stand-ins boot while nobody serves.
-    """
+    """A group's share of what is wanted and of the machines."""
 
     group: Group
     wanted: int
-    others: Classification
+    others: Classification  # its machines but for `standing_in`
     standing_in: Sequence[Assessment]
-    held: int
-    surge: int
+    held: int  # so many of those that stand in are kept in place of spot machines
+    surge: int  # so many more stand-ins boot while nobody serves
 
 
 def plan_once(

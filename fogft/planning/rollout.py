@@ -55,33 +55,21 @@ _NOTES = {
 
 @dataclass(frozen=True)
 class Trial:
-    """The trial of the last applied file.
+    """The trial of the last applied file."""
 
-    Attributes:
-        file: Its cache: what is remembered holds for no other.
-        began_at: When the manager first saw it, in seconds since the epoch.
-        fault: Why it was given up; None while it is not.
-    """
-
-    file: str = ""
-    began_at: float = 0.0
-    fault: Reason | None = None
+    file: str = ""  # its digest: what is remembered holds for no other
+    began_at: float = 0.0  # when the manager first saw it, in seconds since the epoch
+    fault: Reason | None = None  # why it was given up; None while it is not
 
 
 @dataclass(frozen=True)
 class Update:
-    """An update's progress, for people and programs.
-
-    Attributes:
-        done: Replicas of the version that is wanted now which serve.
-        of: How many are wanted.
-        fault: Why it was given up; None while it was not.
-    """
+    """An update's progress, for people and programs."""
 
     state: UpdateState
-    done: int
-    of: int
-    fault: Reason | None = None
+    done: int  # replicas of the version that is wanted now which serve
+    of: int  # how many are wanted
+    fault: Reason | None = None  # why it was given up; None while it was not
 
     @property
     def reason(self) -> Reason:

@@ -31,19 +31,12 @@ MUCH_THE_SAME = 1.1
 
 
 class Size(NamedTuple):
-    """The wanted number of replicas, and the cap.
+    """The wanted number of replicas, and the cap."""
 
-    Attributes:
-        groups: In the order of their slots.
-        counts: How many of each.
-        max_usd_per_hour: The cap that holds now; None for none.
-        notes: What may surprise.
-    """
-
-    groups: tuple[Group, ...]
-    counts: tuple[int, ...]
-    max_usd_per_hour: float | None
-    notes: tuple[Reason, ...] = ()
+    groups: tuple[Group, ...]  # in the order of their slots
+    counts: tuple[int, ...]  # how many of each
+    max_usd_per_hour: float | None  # the cap that holds now; None for none
+    notes: tuple[Reason, ...] = ()  # what may surprise
 
     @property
     def total(self) -> int:

@@ -38,31 +38,19 @@ _AT = itemgetter(0)
 
 
 class Backoff(NamedTuple):
-    """A supply that is not to be tried yet.
+    """A supply that is not to be tried yet."""
 
-    Attributes:
-        since: Of the last failure, in seconds since the epoch.
-        until: From then on it may be tried again.
-        failures: How many in a row.
-        cause: Of the last one.
-    """
-
-    until: float
-    failures: int
-    cause: Cause
-    since: float = 0.0
+    until: float  # from then on it may be tried again
+    failures: int  # how many in a row
+    cause: Cause  # of the last one
+    since: float = 0.0  # of the last failure, in seconds since the epoch
 
 
 class _Supply(NamedTuple):
-    """What happened at a supply within FORGIVE_S, in order of time.
+    """What happened at a supply within FORGIVE_S, in order of time."""
 
-    Attributes:
-        lately: Its failures.
-        bad: Those since it last proved itself.
-    """
-
-    lately: Sequence[Failure]
-    bad: Sequence[Failure]
+    lately: Sequence[Failure]  # its failures
+    bad: Sequence[Failure]  # those since it last proved itself
 
 
 def backing_off(history: History, now: float) -> Mapping[str, Backoff]:

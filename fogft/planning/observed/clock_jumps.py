@@ -26,30 +26,19 @@ DOUBT_S = 60.0
 
 @dataclass(frozen=True)
 class Reading:
-    """Three clocks at one moment, in seconds.
+    """Three clocks at one moment, in seconds."""
 
-    Attributes:
-        wall_s: Since the epoch; may be set.
-        awake_s: Steady, and stands still while the machine sleeps.
-        steady_s: Steady, and goes on meanwhile.
-    """
-
-    wall_s: float
-    awake_s: float
-    steady_s: float
+    wall_s: float  # since the epoch; may be set
+    awake_s: float  # steady, and stands still while the machine sleeps
+    steady_s: float  # steady, and goes on meanwhile
 
 
 @dataclass(frozen=True)
 class Jump:
-    """How far the wall clock jumped between two readings.
+    """How far the wall clock jumped between two readings."""
 
-    Attributes:
-        set_s: By so much it was set: forward above 0, back below.
-        slept_s: The machine slept for so long.
-    """
-
-    set_s: float = 0.0
-    slept_s: float = 0.0
+    set_s: float = 0.0  # by so much it was set: forward above 0, back below
+    slept_s: float = 0.0  # the machine slept for so long
 
     @property
     def reason(self) -> Reason:

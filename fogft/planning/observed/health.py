@@ -56,25 +56,17 @@ _RUNNING, _READY, _GOOD = MachinePhase.RUNNING, Phase.READY, Verdict.GOOD
 
 
 class Assessment(NamedTuple):
-    """A machine with everything known and decided about it.
-
-    Attributes:
-        record: What is remembered of it; None for nothing.
-        serving: Its link is up and its services are ready: ending it would be felt.
-        may_serve: It served once and nothing proves that it does not serve now.
-        fault: Why the verdict is not good; None when it is.
-        unwanted: Why it is to be replaced although it works; None for no reason.
-    """
+    """A machine with everything known and decided about it."""
 
     machine: Machine
     link: LinkReport | None
-    record: Record | None
+    record: Record | None  # what is remembered of it; None for nothing
     phase: Phase
     verdict: Verdict
-    serving: bool
-    may_serve: bool
-    fault: Reason | None = None
-    unwanted: Reason | None = None
+    serving: bool  # its link is up and its services are ready: ending it would be felt
+    may_serve: bool  # it served once and nothing proves that it does not serve now
+    fault: Reason | None = None  # why the verdict is not good; None when it is
+    unwanted: Reason | None = None  # why it is to be replaced although it works; None for no reason
 
     @property
     def id(self) -> ReplicaId:
@@ -132,16 +124,11 @@ class Assessment(NamedTuple):
 
 
 class Health(NamedTuple):
-    """The health of a pool's replicas, ordered by replica.
-
-    Attributes:
-        uplink_suspected: All links that once answered are silent together.
-        links_known: There is a fresh report; without one nobody is doubted.
-    """
+    """The health of a pool's replicas, ordered by replica."""
 
     replicas: tuple[Assessment, ...]
-    uplink_suspected: bool
-    links_known: bool
+    uplink_suspected: bool  # all links that once answered are silent together
+    links_known: bool  # there is a fresh report; without one nobody is doubted
 
     @property
     def running(self) -> int:

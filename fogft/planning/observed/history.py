@@ -55,28 +55,19 @@ CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
 
 @dataclass(frozen=True)
 class Event:
-    """One event in the history.
-
-    Attributes:
-        at: Seconds since the epoch.
-        location: Where (``cloud/region/zone``); empty in events after the launch.
-        on_demand: Of a launch: not bought on the spot market.
-        reason: Why it happened, where that is known.
-        by_s: Of CLOCK and SLEPT: so much later is all that was remembered before.
-        version: Of a launch: what it runs (`replica_hash`).
-    """
+    """One event in the history."""
 
     omits_defaults: ClassVar = True  # written as plain data
 
-    at: Moment
+    at: Moment  # seconds since the epoch
     kind: EventKind
     slot: int
     generation: int
-    location: str = ""
-    reason: Reason | None = None
-    on_demand: bool = False
-    by_s: float = 0.0
-    version: str = ""
+    location: str = ""  # where (`cloud/region/zone`); empty in events after the launch
+    reason: Reason | None = None  # why it happened, where that is known
+    on_demand: bool = False  # of a launch: not bought on the spot market
+    by_s: float = 0.0  # of CLOCK and SLEPT: so much later is all that was remembered before
+    version: str = ""  # of a launch: what it runs (`replica_hash`)
 
 
 _NO_FAULT = Reason(Cause.ERROR)

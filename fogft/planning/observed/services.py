@@ -23,16 +23,11 @@ from fogft.model.spec import ServiceSpec
 
 @dataclass(frozen=True)
 class Discovered:
-    """The discovered services.
+    """The discovered services."""
 
-    Attributes:
-        spec_hash: Of the replicas that told it.
-        services: Name -> type.
-        voters: How many replicas had told when most of them confirmed all of it; 0 if not known.
-    """
-
-    spec_hash: Line = ""
-    services: Mapping[Line, Line] = field(default_factory=dict)
+    spec_hash: Line = ""  # of the replicas that told it
+    services: Mapping[Line, Line] = field(default_factory=dict)  # name -> type
+    # How many replicas had told when most of them confirmed all of it; 0 if not known.
     voters: Count = 0
 
     def specs(self, namespace: str = "") -> tuple[ServiceSpec, ...]:
@@ -46,17 +41,11 @@ class Discovered:
 
 @dataclass(frozen=True)
 class Claims:
-    """The services that replicas of one hash advertise.
+    """The services that replicas of one hash advertise."""
 
-    Attributes:
-        count: How many offer a service: its name and type.
-        voters: Of how many.
-        heard: How many have told.
-    """
-
-    count: Mapping[tuple[str, str], int]
-    voters: int
-    heard: int = 0
+    count: Mapping[tuple[str, str], int]  # how many offer a service: its name and type
+    voters: int  # of how many
+    heard: int = 0  # how many have told
 
     def agreed(self) -> dict[str, str]:
         """Return name -> type of the services that more than half of the replicas offer."""
