@@ -1,24 +1,8 @@
 """How often a replica, and a whole pool of them, is down. Pure arithmetic.
 
-A replica alternates between up (for `uptime_s` on average) and being replaced (for
-`recovery_s`). A pool is down while all its replicas are, and for replicas that fail
-independently that is the product of their unavailabilities: the best case.
-
-Real preemptions are correlated. Replicas in one zone are preempted together, those of one region
-less often so, those of one cloud less still. A number in [0, 1] says how much for each level, and
-the model is exact for any replicas:
-
-    Each domain has a value, spread evenly over [0, 1]. With a probability of its own a
-    domain takes the value of the wider domain that it lies in, else a fresh one; a replica
-    likewise takes its zone's. A replica is down when its value is below its
-    unavailability.
-
-So each replica is down exactly as often as alone, and two equal ones of one zone are down
-together with correlation `Correlation.zone`, two of one region `region`, two of one cloud
-`cloud`. Different clouds are independent.
-
-A replica that was lost comes back elsewhere, while some location has room. None has for as long as
-all are full together, by the same model of locations. In that time spot machines are down.
+A pool is down while all its replicas are: for replicas that fail independently, for the product
+of their unavailabilities, which is the best case. Real preemptions are correlated, and the model
+is exact for any replicas. docs/design/availability.md describes it.
 
 Source: FogROS2-FT, section III.C. The paper prints the fraction for N upside down; its
 own figures (15 h up, 20 min recovery: 2.17 % for one, 0.047 % for two) agree with this.

@@ -81,10 +81,18 @@ def choose_endings(
     if len(machines.good) > wanted:
         expendable = _by_expendability(machines.good, dear_first=dear_first)
         chooser.end_some(expendable, len(machines.good) - wanted, Cause.NOT_WANTED)
-    if machines.replaced:
-        _end_replaced(chooser, wanted, machines, held, first)
-    elif first is not None:
-        chooser.make_room(first)
+    left = surplus - chooser.counted_out
+    if first is not None:
+        chooser.go(first, Reason(Cause.REPLACED_FIRST, because=because(first.why)))
+        left -= 1
+    ready_slots = {s.slot for s in machines.good if s.serving}
+    replaced = sorted(
+        (s for s in machines.replaced if s is not first and s.id not in held),
+        key=lambda s: (s.may_serve, s.marked_at, s.slot not in ready_slots, s.id),
+    )
+    ended = chooser.out.ids
+    coming = sum(not s.ever_ready for s in machines.good if s.id not in ended)
+    chooser.end_some(replaced, left, Cause.REPLACED, coming=coming)
     if unwanted:
         chooser.end_some(unwanted, len(unwanted), Cause.REPLACED)
         spare -= len(unwanted)
@@ -93,27 +101,6 @@ def choose_endings(
         kept.sort(key=lambda s: (s.ever_ready, s.marked_at, -s.machine.usd_per_hour, -s.slot))
         chooser.end_some(kept, spare, Cause.ENOUGH_SPOT)
     return chooser.out
-
-
-def _end_replaced(
-    chooser: _Chooser,
-    wanted: int,
-    machines: Classification,
-    held: Collection[ReplicaId],
-    first: Assessment | None,
-) -> None:
-    left = len(machines.good) + len(machines.replaced) - chooser.counted_out - wanted
-    ready_slots = {s.slot for s in machines.good if s.serving}
-    if first is not None:
-        chooser.make_room(first)
-        left -= 1
-    replaced = sorted(
-        (s for s in machines.replaced if s is not first and s.id not in held),
-        key=lambda s: (s.may_serve, s.marked_at, s.slot not in ready_slots, s.id),
-    )
-    ended = chooser.out.ids
-    coming = sum(not s.ever_ready for s in machines.good if s.id not in ended)
-    chooser.end_some(replaced, left, Cause.REPLACED, coming=coming)
 
 
 def _by_expendability(replicas: Iterable[Assessment], *, dear_first: bool) -> list[Assessment]:
@@ -152,7 +139,7 @@ class _Chooser:
         later_served = history.served(replica.slot) > replica.id.generation
         superseded = later_served and replica.verdict is Verdict.UNRESPONSIVE
         if enough or superseded or not replica.ever_ready:
-            self._go(replica, replica.why or Reason(Cause.NOT_WANTED))
+            self.go(replica, replica.why or Reason(Cause.NOT_WANTED))
 
     def end_some(
         self, replicas: Iterable[Assessment], count: int, cause: Cause, *, coming: int = 0
@@ -172,13 +159,9 @@ class _Chooser:
                 continue
             count -= 1
             self.counted_out += 1
-            self._go(replica, Reason(cause, because=because(replica.why)))
+            self.go(replica, Reason(cause, because=because(replica.why)))
 
-    def make_room(self, replica: Assessment) -> None:
-        """End one before its successor exists."""
-        self._go(replica, Reason(Cause.REPLACED_FIRST, because=because(replica.why)))
-
-    def _go(self, replica: Assessment, why: Reason) -> None:
+    def go(self, replica: Assessment, why: Reason) -> None:
         self._pillars.discard(replica.id)
         if self._must_drain_first(replica):
             self.out.draining.append(replica)

@@ -185,9 +185,7 @@ class Row:
         def ratio(drawn: Sequence[Sequence[float]]) -> float:
             return sum(day[0] for day in drawn) / max(sum(day[1] for day in drawn), 1e-9) * unit
 
-        chance = random.Random(len(days))
-        found = sorted(ratio(chance.choices(days, k=len(days))) for _ in range(_RESAMPLES))
-        return Estimate(ratio(days), *_middle(found))
+        return estimate(days, ratio)
 
     @property
     def longest_outage_s(self) -> float:
@@ -205,21 +203,15 @@ class Row:
         return out
 
 
-def estimate(values: Sequence[float]) -> Estimate:
-    """Return the mean of some values with its interval, deterministically."""
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def estimate(values: Sequence[Any], of: Callable[[Sequence[Any]], float] = _mean) -> Estimate:
+    """Return a statistic of some values with its interval, deterministically."""
     chance = random.Random(len(values))
-    mean = sum(values) / len(values)
-    if len(values) == 1:
-        return Estimate(mean, mean, mean)
-    means = sorted(
-        sum(chance.choices(values, k=len(values))) / len(values) for _ in range(_RESAMPLES)
-    )
-    return Estimate(mean, *_middle(means))
-
-
-def _middle(means: Sequence[float]) -> tuple[float, float]:
-    """Return the bounds of the 95 % in the middle."""
-    return means[int(0.025 * _RESAMPLES)], means[int(0.975 * _RESAMPLES)]
+    found = sorted(of(chance.choices(values, k=len(values))) for _ in range(_RESAMPLES))
+    return Estimate(of(values), found[int(0.025 * _RESAMPLES)], found[int(0.975 * _RESAMPLES)])
 
 
 Factory = Callable[[World], Policy]

@@ -12,7 +12,6 @@ Not here: reading clocks (`fogft.pool.manager.timekeeping`), moving what is reme
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass
 
 from fogft.model.reason import Cause, Reason
@@ -54,7 +53,7 @@ class Watch:
 
     def __init__(self) -> None:
         self._last: Reading | None = None
-        self._set: deque[tuple[float, float]] = deque()  # when, and by how much
+        self._set: list[tuple[float, float]] = []  # when, and by how much
 
     def look(self, reading: Reading) -> Jump | None:
         """Return the jump since the last look, if there was one."""
@@ -72,8 +71,5 @@ class Watch:
     @property
     def doubt_s(self) -> float:
         """How far the clock was set within the last minute, in which schedules ignore it."""
-        while self._last is not None and self._set:
-            if self._last.awake_s - self._set[0][0] < DOUBT_S:
-                break
-            self._set.popleft()
-        return sum([set_s for _, set_s in self._set], 0.0) if self._set else 0.0
+        now = self._last.awake_s if self._last is not None else 0.0
+        return sum((set_s for at, set_s in self._set if now - at < DOUBT_S), 0.0)

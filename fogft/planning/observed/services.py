@@ -62,11 +62,10 @@ class Claims:
         """
         if self.heard <= known.voters:
             return frozenset()
-        said = {
-            (name, kind): self.count.get((name, kind), 0) for name, kind in known.services.items()
-        }
         return frozenset(
-            name for (name, _), n in said.items() if 2 * (self.heard - n) > self.voters
+            name
+            for name, kind in known.services.items()
+            if 2 * (self.heard - self.count.get((name, kind), 0)) > self.voters
         )
 
 
