@@ -51,22 +51,16 @@ class PlannedLaunch(NamedTuple):
 
 @dataclass
 class Buyer:
-    """Plans launches one by one.
-
-    Args:
-        groups: The pool's, as they are sized.
-        cap: On the price of all machines together; None for none.
-        standing_in: On-demand machines that serve until spot ones do.
-    """
+    """Plans launches one by one."""
 
     spec: PoolSpec
     intent: Intent
     observed: Observed
     history: History
     machines: Classification
-    groups: Sequence[Group]
-    cap: float | None
-    standing_in: Sequence[Assessment] = ()
+    groups: Sequence[Group]  # as they are sized
+    cap: float | None  # on the price of all machines together; None for none
+    standing_in: Sequence[Assessment] = ()  # on-demand machines that serve until spot ones do
     launches: list[PlannedLaunch] = field(default_factory=list)
     notes: list[Reason] = field(default_factory=list)
     ended_for_room: list[tuple[Assessment, Reason]] = field(default_factory=list)
@@ -142,8 +136,7 @@ class Buyer:
     def market(self, group: Group, spot: bool | None, *, at_leisure: bool = False) -> Market:
         """Return the offers for a group, spot or on-demand only unless `spot` is None.
 
-        Args:
-            at_leisure: For one that need not be launched: nothing that refused lately is in it.
+        Nothing that refused lately is in it for one that need not be launched (`at_leisure`).
         """
         full = self._full(group) if spot else frozenset()
         key = (group.name, spot, at_leisure, full)
@@ -227,10 +220,7 @@ class Buyer:
         return self._market(group, spot, backing_off, self._full(group) if spot else ())
 
     def kind(self, group: Group, without: Assessment | None) -> bool | None:
-        """Return whether a group's next machine is spot (True); None if either will do.
-
-        One that goes does not count.
-        """
+        """Return whether a group's next machine is spot; None if either will do."""
         if not group.on_demand.base and not group.on_demand.fallback:
             return None
         on_demand = sum(
@@ -247,11 +237,7 @@ class Buyer:
         return placed + [(launch.slot, launch.offer.placement) for launch in self.launches]
 
     def places(self, without: Assessment | None, *, lasting: bool = False) -> list[Placement]:
-        """Return the current and planned placements of the replicas.
-
-        Args:
-            lasting: Not of those that stand in, which go again.
-        """
+        """Return current and planned placements; `lasting`: not of stand-ins, which go again."""
         placed = self._placed(without)
         return [place for slot, place in placed if not (lasting and is_stand_in(slot))]
 

@@ -81,10 +81,7 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
 
 
 def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | None:
-    """Return the replica that should move, the one that gains most first; None if none should.
-
-    The pool is quiet.
-    """
+    """Return the replica of a quiet pool that gains most by a move; None if none should move."""
     rules = buyer.spec.migration
     if rules is None:
         return None
@@ -100,8 +97,7 @@ def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | N
 def _move(buyer: Buyer, rules: MigrationSpec, replica: Assessment, *, at_most: bool) -> Move | None:
     """Return the move to the best place if that is so much better.
 
-    Args:
-        at_most: If no location backed off: could that place, or a worse one, be worth a move?
+    `at_most`: could it, or a worse one, be worth a move if no location backed off?
     """
     group, placement = group_of(buyer.groups, replica.slot), replica.placement
     kind = buyer.kind(group, replica)

@@ -35,11 +35,7 @@ def needed_launches(
     *,
     settling: bool = False,
 ) -> list[Need]:
-    """Return the launches needed, over all groups.
-
-    Args:
-        settling: A newcomer has yet to prove itself: no further one is replaced meanwhile.
-    """
+    """Return the launches needed; none is replaced while a newcomer proves itself (`settling`)."""
     needs: list[Need] = []
     for group, wanted in zip(groups, counts, strict=True):
         here = machines.part(groups, group)

@@ -98,12 +98,7 @@ class Market:
         avoid: Collection[str] = (),
         budget_usd_per_hour: float | None = None,
     ) -> Choice:
-        """Choose an offer, given the placements of the other replicas.
-
-        Args:
-            taken: Where the replicas that stay are, or how many are where.
-            budget_usd_per_hour: The most that the new machine may cost; None for no limit.
-        """
+        """Choose an offer, given where the replicas that stay are, or how many are where."""
         if self._nothing:
             return Choice(None, self._nothing)
         count = (taken if isinstance(taken, Counter) else crowding(taken)).get

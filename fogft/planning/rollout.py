@@ -164,11 +164,7 @@ def _launches_fail(history: History, began_at: float) -> Reason | None:
 def is_whole(
     spec: PoolSpec, health: Health, history: History, *, wanted: int, now: float, settle_s: float
 ) -> bool:
-    """Whether exactly the wanted replicas run this file's version and serve.
-
-    Args:
-        settle_s: Each must have come to serve so long ago.
-    """
+    """Whether exactly the wanted replicas run this file's version and have served for so long."""
     if not health.links_known or health.uplink_suspected:
         return False
     stay = [judged for judged in health.replicas if judged.verdict is not Verdict.FAILED]
@@ -239,11 +235,6 @@ def may_go_first(replica: Assessment, machines: Classification, wanted: int) -> 
 
 
 def has_room(spec: PoolSpec, usd_per_hour: float, cheapest: float) -> bool:
-    """Whether one more replica may exist during a replacement.
-
-    Args:
-        usd_per_hour: What the pool costs when it is whole.
-        cheapest: What the cheapest further replica costs.
-    """
+    """Whether a pool of this price may have its `cheapest` further replica in a replacement."""
     cap = spec.max_usd_per_hour
     return spec.max_surge > 0 and (cap is None or usd_per_hour + cheapest <= cap + 1e-9)

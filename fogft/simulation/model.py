@@ -180,10 +180,8 @@ def generate(
 ) -> Mapping[str, Timeline]:
     """Return a timeline for each ``cloud/region/zone``, with capacity for all or for none.
 
-    The market is stationary: it has run for a while before it is looked at.
-
-    Args:
-        zones: Location -> its own MTTF and MTTR, where they are not the model's.
+    The market is stationary: it has run for a while before it is looked at. `zones` have an MTTF
+    and an MTTR of their own.
     """
     own = {
         place: replace(model, mttf_s=mttf_s, mttr_s=mttr_s)

@@ -55,8 +55,7 @@ class _Written:
 def read(folder: Path, per_unit: int = 1) -> list[Trace]:
     """Read every ``.json`` file in and below a folder; an invalid trace is an error.
 
-    Args:
-        per_unit: What one of what was sampled counts: 1 for machines, `PER_USD` for prices.
+    `per_unit` is what one of what was sampled counts: 1 for machines, `PER_USD` for prices.
     """
     if not folder.is_dir():
         raise FogftError(f"{folder}: is not a folder of traces", FORMAT)

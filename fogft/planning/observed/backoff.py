@@ -151,9 +151,7 @@ def lost_lately(history: History, now: float) -> Mapping[str, float]:
 def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:
     """Return when, without new events, another location may be chosen; infinity for never.
 
-    Args:
-        waits: For the end of a pause; see `Plan`.
-        restless: Somebody could be better off elsewhere.
+    `waits` and `restless`: see `Plan`.
     """
     supplies = _supplies(history, now)
     everywhere = _everywhere(history, supplies, now)

@@ -322,10 +322,7 @@ class History:
     ) -> Mapping[str, float]:
         """Return the cached summary of spot machines' lives and failures at each location.
 
-        Args:
-            work_out: Pure, and always the same. It is asked again for another time, and after a
-                machine has ended there.
-            at: Seconds since the epoch.
+        `work_out` is asked again for another time, and after a machine has ended there.
         """
         for location, lives in self._lives.items():
             if self._of_lives.get(location, (None, 0.0))[0] != at:
@@ -344,10 +341,7 @@ def compacted(
     launches of a version, and one that was ready, so that it is known what was given up. Of a
     kept launch's comings and goings of readiness the first READY and the last two stay. That the
     clock was set is never forgotten, that the machine slept only with all that was before. What
-    no decision reads (`TOLD_ONLY`) stays for `KEPT_S`.
-
-    Args:
-        history: What follows from these very events, where that is known already.
+    no decision reads (`TOLD_ONLY`) stays for `KEPT_S`. `history` is what follows from the events.
     """
     events = list(events)
     history = history or History(events)
