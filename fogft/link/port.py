@@ -61,7 +61,10 @@ class Probe:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplicaWord:
-    """A replica's own state, as reported in probe answers and by gateways."""
+    """A replica's own state, as reported in probe answers and by gateways.
+
+    What changes all the time, durations and counts, makes no two of them differ.
+    """
 
     slot: Count
     generation: Count
@@ -71,8 +74,9 @@ class ReplicaWord:
     restarts: Count = 0  # of the user's `run` command
     detail: Line = ""  # why it is not ready, in words; empty when it is
     version: Line = ""  # of fogft on the replica; empty before 0.2.0
-    lease_age_s: Seconds | None = None  # since it last heard of the pool's manager; None for never
-    lease_left_s: Seconds | None = None  # until it shuts down unless it hears of it again
+    # Since it last heard of the pool's manager, and until it shuts down unless it hears again.
+    lease_age_s: Seconds | None = field(default=None, compare=False)
+    lease_left_s: Seconds | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +84,8 @@ class GatewayView(ReplicaWord):
     """A gateway's link to one replica behind it. Durations in seconds."""
 
     state: LinkState
-    silent_for_s: Seconds = 0.0
-    rtt_s: Seconds | None = None
+    silent_for_s: Seconds = field(default=0.0, compare=False)
+    rtt_s: Seconds | None = field(default=None, compare=False)
     through: Line = ""  # the further gateways on the way: ``lab`` or ``lab/edge``; empty for none
 
     @classmethod
@@ -100,8 +104,8 @@ class ProbeAnswer(ReplicaWord):
     # Random text made when the server proxy started. A new one at the same id means that it forgot
     # every request.
     incarnation: Line
-    in_flight: Count = 0
-    work: Mapping[Line, Seconds] = field(default_factory=dict)  # since its start, by name
+    in_flight: Count = field(default=0, compare=False)
+    work: Mapping[Line, Seconds] = field(default_factory=dict, compare=False)  # since its start
     # Service name -> type of what `run` offers, where it is to be found out or not the configured.
     offered: Mapping[Line, Line] = field(default_factory=dict)
     types: Mapping[Line, Definition] = field(default_factory=dict)  # by name, where a probe asks
@@ -109,7 +113,8 @@ class ProbeAnswer(ReplicaWord):
     accepts: frozenset[Line] = frozenset()  # names of compressions; since 0.2.0 all of them
     # Services that have work, and have answered nothing for far longer than they take.
     hanging: frozenset[Line] = frozenset()
-    strangers: Count = 0  # connections turned away: nobody with a certificate spoke
+    # Connections turned away: nobody with a certificate spoke.
+    strangers: Count = field(default=0, compare=False)
 
 
 class Answer(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import lru_cache
 from typing import TypeVar
 
 from fogft.errors import FrameError
@@ -23,11 +24,13 @@ BEHIND_LIMIT = 128
 BEHIND_DETAIL_LIMIT = 100
 
 
+@lru_cache(maxsize=16)  # a robot says the same in each
 def encode_probe(probe: Probe) -> bytes:
     """Return a probe as compact JSON."""
     return _encoded(probe)
 
 
+@lru_cache(maxsize=128)
 def decode_probe(frame: bytes) -> Probe:
     """Read a probe. Raises FrameError: it is not one."""
     return _decoded(Probe, frame, PROBE_LIMIT)

@@ -100,6 +100,8 @@ class PendingRequests:
         """Add a request; return the replicas it goes to at once. Raises ValueError: it is there."""
         if request in self._pending:
             raise ValueError("a request with this id is under way already")
+        if not self._pending:
+            self.choose.look_at = NEVER  # that was for those that have ended
         chosen = self.choose.first(request, able, now)
         if len(chosen) == len(able) > 1 and now < self._cautious_until:
             *chosen, spared = chosen

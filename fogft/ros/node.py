@@ -137,16 +137,22 @@ class SerialisedNode:
 
     def client(self, name: str, type_name: str) -> Client:
         """Create a client of a service."""
-        # ROS 2 Humble cannot count: there, whether one is available must do.
-        count: Any = getattr(self._node, "count_services", lambda _: 0)
         service_type = load_service_type(type_name)
 
         def create() -> Client:
             client: Any = self._node.create_client(service_type, name, qos_profile=self._quality)
             end, mismatch = ClientEnd(client, service_type), self._servers_mismatch
-            return Client(client, end, self._withdraw, count, partial(mismatch, name))
+            return Client(client, end, self._withdraw, self._count_servers, partial(mismatch, name))
 
         return self._add(name, create)
+
+    def _count_servers(self, service: str) -> int:
+        """Count the servers of an absolute name: rclpy's own way takes twice as long."""
+        handle = self._node.handle
+        # ROS 2 Humble cannot count: there, whether one is available must do.
+        count: Any = getattr(handle, "get_count_services", lambda _: 0)
+        with handle:
+            return int(count(service))
 
     def publisher(self, topic: TopicSpec) -> Publisher:
         """Create a publisher of a topic. Raises RosError: the type cannot be loaded."""

@@ -23,7 +23,7 @@ from fogft.ros.port import Status
 log = logging.getLogger(__name__)
 
 TOPIC = "/diagnostics"
-_LOOK_EVERY_S = 1.0
+_LOOK_EVERY_S = 5.0  # what there is to do wakes it
 _CLOSE_LIMIT_S = 5.0
 
 

@@ -78,11 +78,10 @@ class ClientProxy:
         self._membership: Membership | None = None
         self._through_gateways = False
         self._topics = TopicsOnRobot(self._wake, merge, clock)
-        # When services are to be looked at next; who brings it forward tells the waiting thread.
-        self._next_look = NEVER
-        self._look_lock = threading.Lock()
+        # Until when the thread of `run_once` sleeps; it is woken by who wants a look sooner.
+        self._sleeps_until = NEVER
         self._sooner: SimpleQueue[None] = SimpleQueue()
-        self._changed = False
+        self._look_now = self._changed = False
 
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
         """Proxy exactly these services. Requests under way continue."""
@@ -215,12 +214,11 @@ class ClientProxy:
         self._wake()
 
     def _wake(self, at: float = -NEVER, /) -> None:
-        """Have services looked at then, if not sooner. Any thread."""
-        with self._look_lock:
-            sooner = at < self._next_look
-            if sooner:
-                self._next_look = at
-        if sooner:
+        """Have services looked at now, or at their `look_at` if that is later. Any thread."""
+        if at == -NEVER:
+            self._look_now = True
+        if at < self._sleeps_until:
+            self._sleeps_until = at  # once is enough
             self._sooner.put(None)
 
     # -- the proxy's own thread -----------------------------------------------------------
@@ -240,24 +238,32 @@ class ClientProxy:
             for link in self.links:
                 link.flush()
             self._topics.tick()
-            looks = [service.dispatcher.tick() for service in self._services.values()]
+            for service in self._services.values():
+                service.dispatcher.tick()
             now = self._clock()
             if self._node is not None:
                 for service in self._services.values():
                     service.advertise(self._node, now)
-        looks.append(now + _TICK_S if len(self._topics) else NEVER)
-        with self._look_lock:
-            self._next_look = min(self._next_look, *looks)
         return changed
 
     def _await_look(self, timeout_s: float) -> None:
-        """Wait until it is time to look, at most so long. What comes after that is for the next."""
-        until = self._clock() + timeout_s
-        with contextlib.suppress(Empty):
-            while (left_s := min(until, self._next_look) - self._clock()) > 0:
-                self._sooner.get(timeout=left_s)  # then it is to be sooner
-        with self._look_lock:
-            self._next_look = NEVER
+        """Wait until it is time to look, at most so long. What comes after that is for the next.
+
+        While requests come, it sleeps no longer than the next one could, so none has to wake it.
+        """
+        now = self._clock()
+        until = now + (min(timeout_s, _TICK_S) if len(self._topics) else timeout_s)
+        while not self._look_now:
+            self._sleeps_until = NEVER  # before looking: what comes after that wakes us
+            waiting = [service.dispatcher for service in list(self._services.values())]
+            look_at = min([until, *[one.look_at for one in waiting]])
+            if look_at <= now or self._look_now:
+                break
+            self._sleeps_until = min([look_at, *[now + one.rest_s(now) for one in waiting]])
+            with contextlib.suppress(Empty):
+                self._sooner.get(timeout=max(0.0, self._sleeps_until - now))
+            now = self._clock()
+        self._look_now = False
 
     def _differences(self, link: Link) -> Mapping[str, str]:
         return self._type_check.differences(link, [s.spec for s in self._services.values()])

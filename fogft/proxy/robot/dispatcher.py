@@ -42,6 +42,7 @@ log = logging.getLogger(__name__)
 MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
 _SHORTEST_S = 0.002
 _TICK_S = 0.02  # until losers are told, at the latest
+_PAUSE_S = 1.0  # without requests: the next one need not be expected
 
 
 # Has `Dispatcher.tick` called at a moment, if not sooner; without one, at once. Any thread.
@@ -84,6 +85,8 @@ class Dispatcher:
         self._malformed: Counter[int] = Counter()
         self._ok_of = ok_of
         self._wake = wake
+        self._asked_at = self._tell_at = self._next_look = NEVER
+        self._usual_s = NEVER  # how soon after it began a request wants a look
         self._clock = clock
         self.max_pending_bytes = max_pending_bytes
         self.max_pending = max_pending
@@ -150,6 +153,9 @@ class Dispatcher:
             soon = min(requests.choose.look_at, deadline)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
+            if len(requests) == 1:
+                self._next_look, self._usual_s = soon, soon - now
+            self._next_look, self._asked_at = min(self._next_look, soon), now
         self._sender.first(request, payload, links, chosen, timeout_s)
         if self._decide.replicates:
             self._sender.replicate()
@@ -219,6 +225,7 @@ class Dispatcher:
             self._delivery.give(pending, payload)  # first: what is counted can wait
             if losers:
                 self._sender.forget(request, losers)
+                self._tell_at = min(self._tell_at, now + _TICK_S)
                 self._wake(now + _TICK_S)
             with self._lock:
                 outcomes.won(replica, now - pending.arrived, len(payload))
@@ -342,7 +349,9 @@ class Dispatcher:
 
     def tick(self) -> float:
         """Expire requests, offer others to more replicas; return when to call again, at latest."""
-        now = self._clock()
+        now, self._next_look = self._clock(), NEVER
+        if now >= self._tell_at:  # its owner has told the links
+            self._tell_at = NEVER
         with self._lock:
             expired = self._requests.expire(now)
         for request, pending in expired:
@@ -356,7 +365,21 @@ class Dispatcher:
             self._settle(request)
         look_at = min(look_at, self._delivery.tick(now, able=self.able))
         look_at = max(min(look_at, self._requests.soonest_deadline), now + _SHORTEST_S)
-        return min(look_at, now + _TICK_S) if self._decide.replicates else look_at
+        if self._decide.replicates:
+            look_at = min(look_at, now + _TICK_S)
+        with self._lock:
+            self._next_look = min(self._next_look, look_at)
+        return look_at
+
+    @property
+    def look_at(self) -> float:
+        """When `tick` is wanted at the latest."""
+        waits = self._requests or self._requests.fallback or self._decide.replicates
+        return min(self._tell_at, self._next_look if waits else NEVER)
+
+    def rest_s(self, now: float) -> float:
+        """Return how soon a request that begins now may want a `tick`; NEVER while none comes."""
+        return self._usual_s if now < self._asked_at + _PAUSE_S else NEVER
 
     def close(self) -> None:
         """Release external resources."""

@@ -58,7 +58,7 @@ TRACE_NAME = "trace.jsonl"
 _TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 1.0
 _REPORT_AFTER_CHANGE_S = 0.05
-_LOOK_EVERY_S = 0.1  # at files, and what else needs no haste
+_LOOK_EVERY_S = 0.2  # at files, and what else needs no haste
 
 
 def run(
@@ -266,7 +266,7 @@ class _Running:
         changed = False  # since the last report
         participant, pauses, renew_at = b"", Pauses(), math.inf
         while not stop.is_set():
-            changed = proxy.run_once() or changed
+            changed = proxy.run_once(_LOOK_EVERY_S) or changed
             now = time.monotonic()
             if now - looked < _LOOK_EVERY_S:  # requests' own deadlines are seen to by `run_once`
                 continue

@@ -1,7 +1,7 @@
 """Close connections at a replica's port that belong to no admitted robot or are stuck.
 
 Zenoh has room for 32 connections that do not say who they are, lets those stand for ever, and lets
-nobody else in meanwhile. So we look at this process's own sockets, twice a second and whenever
+nobody else in meanwhile. So we look at this process's own sockets, now and then and whenever
 somebody comes: strangers are ended or kept out as `door` says, a link of a revoked holder is ended
 at once, as are those of one holder beyond `LINKS_LIMIT`, and one that delivers nothing of what it
 holds after a while. All are counted. Where strangers hold all descriptors that the process may
@@ -30,6 +30,7 @@ from fogft.link.zenoh.sockets import Address
 log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.5
+_QUIET_EVERY_S = 1.0  # where nobody is a stranger
 _LOOK_AGAIN_S = 0.01  # while somebody comes, or is kept out
 RUSH_LIMIT = 2  # so many new ones since the last look
 # Of one holder, the newest: a robot has one an uplink, and another while it takes a new certificate
@@ -82,7 +83,7 @@ class ConnectionReaper:
         self._door = Door()
         self._reserve: list[int] = []
         self._fill_reserve()
-        self._shut = False
+        self._shut = self._strange = False
         self._descriptors = sockets.count()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="fogft-reaper", daemon=True)
@@ -122,7 +123,8 @@ class ConnectionReaper:
     def _await_look(self) -> None:
         """Wait until it is time to look: soon after somebody came, at once where many do."""
         began = time.monotonic()
-        until = began + (_LOOK_AGAIN_S if self._shut else LOOK_EVERY_S)
+        every_s = LOOK_EVERY_S if self._strange else _QUIET_EVERY_S
+        until = began + (_LOOK_AGAIN_S if self._shut else every_s)
         while (left_s := until - time.monotonic()) > 0 and self._filter.wait(left_s):
             if sockets.count() >= self._descriptors + RUSH_LIMIT:
                 self._filter.drop(None)  # until it is known whose they are
@@ -154,6 +156,7 @@ class ConnectionReaper:
                     self._end(found[peer], peer, "surplus_links", links[peer])
             self._watch(links, found, now)
             strangers = found.keys() - links.keys()
+            self._strange = bool(strangers)
             gone = self._door.look(strangers, links.keys(), now)
             for stranger in strangers if short else () if gone is None else (gone,):
                 self._end(found[stranger], stranger, "unauthenticated", "")

@@ -82,7 +82,7 @@ def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
 
 REPLIES_LIMIT = 1024
 BYTES_LIMIT = 64 << 20
-_END_LOOK_S = 0.2  # nobody waits for an end
+_END_LOOK_S = 1.0  # nobody waits for an end
 
 
 class ReplyQueue:

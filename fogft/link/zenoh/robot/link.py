@@ -39,6 +39,7 @@ _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
 _RENEW_AGAIN_S = 5.0
 _TELL_AGAIN_S = 10.0
 _LOOK_EVERY_S = 0.1  # while something large is sent
+_LOOK_AGAIN_S = 0.05  # at the earliest
 
 
 class ZenohLink:
@@ -81,6 +82,7 @@ class ZenohLink:
         self._opening = Opening(peer, shared.settings)
         self._opened = 0
         self._ignores = False
+        self._looked_at = 0.0
         self._renew_at = NEVER
         self._retiring: list[Connection] = []  # succeeded, with requests under way
         self._thread = threading.Thread(
@@ -283,6 +285,9 @@ class ZenohLink:
 
     def _flows(self, connection: Connection, now: float) -> bool:
         """See whether what is large moves: then nobody is silent. False where it stands still."""
+        if now - self._looked_at < _LOOK_AGAIN_S:
+            return not connection.lost_because
+        self._looked_at = now
         moved_s = connection.flow.look(now, connection.attempts.look(now))
         self._probing.excuse(moved_s, now)
         longest_s, shortest_s = self._suspect_after_s, self._shared.settings.stall_after_s
