@@ -199,8 +199,8 @@ class DeadlineFilter:
         before: Callable[[str], Iterable[OpenAttempt]] = lambda service: (),
     ) -> bool:
         """Whether an attempt may arrive in time behind what leaves `before` it."""
-        rate = self._carries(now)
-        if rate is None or attempt.service not in self._timed:
+        rate = self._carries(now) if attempt.service in self._timed else None
+        if rate is None:
             return True
         size = self._left(now, rate) + sum(
             map(self._on_the_way, (attempt, *before(attempt.service)))

@@ -17,6 +17,7 @@ from struct import Struct
 from fogft.model.type_definition import Fields
 
 HEADER_BYTES = 4
+_KEPT_BYTES = 16 << 10
 _BYTE_ORDERS = {b"\x00\x00": Struct(">I"), b"\x00\x01": Struct("<I")}
 # A middleware may fill a message's end up to a multiple of its widest field. Fast DDS also leaves
 # what it reserved for gaps between fields and did not need: less than the message is long.
@@ -90,6 +91,8 @@ class Shape:
     def __init__(self, root: str, fields: Mapping[str, Fields]) -> None:
         self._fields = fields
         self._kinds: dict[str, _Kind] = {}
+        # The last that was well-formed, if small: it is asked about again before it is sent.
+        self._good: bytes | None = None
         try:
             self._root: _Kind | None = self._message(root, ())
         except _Uncheckable:
@@ -97,6 +100,8 @@ class Shape:
 
     def fault(self, payload: bytes) -> str:
         """Return the problem with a message's bytes, in words; empty if they are well-formed."""
+        if payload is self._good:
+            return ""
         length_at = _BYTE_ORDERS.get(payload[:2])
         if len(payload) < HEADER_BYTES or length_at is None:
             return f"{len(payload)} bytes without the header of a ROS 2 message"
@@ -107,8 +112,11 @@ class Shape:
         except _Malformed as error:
             return str(error)
         left = len(payload) - end
-        is_padding = left <= _MOST_PADDING + end - HEADER_BYTES
-        return "" if is_padding else f"{left} bytes are left over"
+        if left > _MOST_PADDING + end - HEADER_BYTES:
+            return f"{left} bytes are left over"
+        if len(payload) <= _KEPT_BYTES:
+            self._good = payload
+        return ""
 
     def _message(self, name: str, within: tuple[str, ...]) -> _Kind:
         known = self._kinds.get(name)

@@ -122,9 +122,12 @@ def join(
 
 def fault_of(type_name: str, part: str) -> Callable[[bytes], str]:
     """Return a check of a type's serialised requests or responses; without the type, of headers."""
-    from fogft.ros.types import definition
+    from fogft.ros.types import load_service_type, shape
 
-    return Shape(part, definition(type_name).fields).fault
+    try:  # the shape that is asked again where a message is sent
+        return shape(getattr(load_service_type(type_name), part.capitalize())).fault
+    except RosError:
+        return Shape(part, {}).fault
 
 
 def empty_response(speaks: Speaks, type_name: str, *, needed: bool) -> bytes | None:

@@ -165,12 +165,13 @@ class Auto(Learning):
             return able[0]
         chance = request[-1] if request else 0
         known = [self._replicas[replica] for replica in able]
-        times_s = sorted(one.service_s for one in known)
+        times_s = sorted([one.service_s for one in known])
         typical_s = times_s[len(times_s) // 2]
-        return min(
+        ranks = [  # no generator: it would be entered anew for each
             (one.avoided(now), one.expected_s(now, typical_s), (i * 167 ^ chance) & 0xFF, replica)
             for i, (replica, one) in enumerate(zip(able, known, strict=True))
-        )[-1]
+        ]
+        return min(ranks)[-1]
 
     def is_spare(self, request: bytes, replica: int) -> bool:
         """Whether the replica should drop it unless idle."""

@@ -16,6 +16,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -176,6 +177,7 @@ def definition(type_name: str) -> Definition:
     )
 
 
+@lru_cache(maxsize=256)
 def shape(message_type: Any) -> Shape:
     """Return the shape of a message's bytes; None if its fields cannot be read."""
     fields: dict[str, Fields] = {}

@@ -250,13 +250,16 @@ class Attempts:
     def _end(self, attempt: OpenAttempt, refusal: Refusal) -> None:
         self._close(attempt, Answer(attempt.request_id, refusal=refusal))
 
-    def _close(self, attempt: OpenAttempt, answer: Answer) -> None:
-        if self.window.remove(attempt):
-            attempt.payload = None
-            id, payload, refusal, _, detail, load = answer
-            self._answered(Answer(id, payload, refusal, attempt.service, detail, load))
-            if self.window.regained_room():
-                self._room()
+    def _close(self, attempt: OpenAttempt, answer: Answer) -> bool:
+        """Tell the end of an open attempt; False where it has ended before."""
+        if not self.window.remove(attempt):
+            return False
+        attempt.payload = None
+        id, payload, refusal, _, detail, load = answer
+        self._answered(Answer(id, payload, refusal, attempt.service, detail, load))
+        if self.window.regained_room():
+            self._room()
+        return True
 
     # -- the sender thread ----------------------------------------------------------------
 
@@ -364,10 +367,10 @@ class Attempts:
 
     def _take_answer(self, answer: Answer, *, packed: bool) -> None:
         attempt = self._unanswered.answered(answer.request_id)
-        if self._unanswered.owed < 0:
-            self._outlet.lose("it sends more answers than it received requests")
-        if attempt is None:
-            return  # it was answered before
+        if attempt is None:  # it was answered before
+            if self._unanswered.owed < 0:
+                self._outlet.lose("it sends more answers than it received requests")
+            return
         if answer.payload is not None:
             self._credit.heard(attempt.mark)  # requests of one connection arrive in order
         if packed and self.window.holds(attempt):
@@ -387,8 +390,7 @@ class Attempts:
             done(None)
 
     def _take_plain(self, attempt: OpenAttempt, answer: Answer) -> None:
-        if self.window.holds(attempt):
-            self._close(attempt, answer)
+        if self._close(attempt, answer):
             return
         if self._cancellations is not None:  # it was forgotten, or has ended
             self._cancellations.answered(answer.request_id)
