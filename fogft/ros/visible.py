@@ -63,8 +63,8 @@ class VisibleNode:
     # -- any thread -----------------------------------------------------------------------
 
     def diagnose(self, statuses: Sequence[Status]) -> None:
-        """Publish statuses on `/diagnostics`, if possible."""
-        if self._diagnostics is not None:
+        """Publish statuses on `/diagnostics`, if possible and heard by anybody."""
+        if self._diagnostics is not None and self._diagnostics.get_subscription_count():
             self._put(lambda: self._publish(statuses))
 
     def show(self, values: Mapping[str, Any]) -> None:

@@ -41,7 +41,7 @@ from fogft.ros.state_bytes import StateBytes
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.05
-_IDLE_TICK_S = 0.2  # while all is ready, and no order, goal or topic waits
+_IDLE_TICK_S = 0.25  # while all is ready, and no order, goal or topic waits
 _LEAVE_S = 4.0
 """From a SIGTERM to the end: robots probe each second, and some clouds kill after five."""
 

@@ -58,7 +58,7 @@ TRACE_NAME = "trace.jsonl"
 _TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 1.0
 _REPORT_AFTER_CHANGE_S = 0.05
-_LOOK_EVERY_S = 0.2  # at files, and what else needs no haste
+_LOOK_EVERY_S = 0.25  # at files, and what else needs no haste
 
 
 def run(
