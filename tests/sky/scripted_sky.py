@@ -116,8 +116,7 @@ class ScriptedSky:
         self.sold = [Offer(EAST, 0.02, "catalogue"), Offer(WEST, 0.03, "catalogue")]
         self.asked_for: Mapping[str, Any] = {}
         self.left_out: dict[str, str] = {}
-        self.vcpus: dict[str, float] = {}
-        self.quotas: dict[tuple[str, bool], str] = {}
+        self.quotas: dict[tuple[str, bool], tuple[str, float]] = {}
         self.boots = boots  # whether a launch ends by itself when it is looked at
         self.full: set[str] = set()  # locations and types without capacity, for such launches
         self.unreachable = False
@@ -209,7 +208,7 @@ class ScriptedSky:
         self._meet("offers", "")
         self.asked_for = resources
         found = [o for o in self.sold if resources.get("region") in (None, o.placement.region)]
-        return Sale(found, self.left_out, self.vcpus, self.quotas)
+        return Sale(found, self.left_out, self.quotas)
 
     def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
         self._meet("lacking", "")

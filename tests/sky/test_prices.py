@@ -166,8 +166,10 @@ def test_what_the_accounts_quota_forbids_is_not_offered_and_the_quota_is_named(m
     """A new account has none for spot GPUs; what cannot be read forbids nothing."""
     gpu = replace(EAST, instance="g4dn.xlarge")
     market.sky.sold.append(Offer(gpu, 0.2, "catalogue"))
-    market.sky.vcpus = {"g4dn.xlarge": 4.0, "m6i.large": 2.0}
-    market.sky.quotas = {("g4dn.xlarge", True): "L-3819A6DF", ("m6i.large", True): "L-34B43A08"}
+    market.sky.quotas = {
+        ("g4dn.xlarge", True): ("L-3819A6DF", 4.0),
+        ("m6i.large", True): ("L-34B43A08", 2.0),
+    }
     market.provider.quotas = {("us-east-1", "L-3819A6DF"): 0.0, ("us-east-1", "L-34B43A08"): 64.0}
     assert {o.placement.instance for o in market.offers()} == {"m6i.large"}
     [said] = market.prices.left_out()
@@ -185,8 +187,7 @@ def test_what_the_accounts_quota_forbids_is_not_offered_and_the_quota_is_named(m
 
 def test_quotas_that_may_not_be_read_are_told_and_forbid_nothing(market: Market):
     market.sky.sold = [Offer(EAST, 0.02, "catalogue")]
-    market.sky.quotas = {("m6i.large", EAST.spot): "L-34B43A08"}
-    market.sky.vcpus = {"m6i.large": 2.0}
+    market.sky.quotas = {("m6i.large", EAST.spot): ("L-34B43A08", 2.0)}
     market.provider.allowed = False
     assert len(market.prices.offers({"infra": "aws"})) == 1
     (said,) = market.prices.left_out()

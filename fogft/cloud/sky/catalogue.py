@@ -39,8 +39,7 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
     """Return what is sold for SkyPilot's `Resources`; `enabled` is for those that name no cloud."""
     prices: dict[Placement, float] = {}
     left_out: dict[str, str] = {}
-    vcpus: dict[str, float] = {}
-    quotas: dict[tuple[str, bool], str] = {}
+    quotas: dict[tuple[str, bool], tuple[str, float]] = {}
     for one in asked:
         for cloud in enabled if one.cloud is None else [one.cloud]:
             name, wanted = str(cloud).lower(), one.copy(cloud=cloud)
@@ -51,15 +50,14 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
                     prices[place] = min(prices.get(place, price), price)
                     key = place.instance, place.spot
                     if key not in quotas:
-                        quotas[key] = _quota_code(name, *key)
                         has = cloud.get_vcpus_mem_from_instance_type(machine.instance_type)
-                        vcpus[place.instance] = float(has[0] or 0.0)
+                        quotas[key] = _quota_code(name, *key), float(has[0] or 0.0)
     fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in prices}}
     offers = [Offer(p, price, "catalogue", fetched[p.cloud]) for p, price in prices.items()]
     offers.sort(key=lambda o: (o.usd_per_hour, o.placement))
     sold = {place.cloud for place in prices}
     left_out = {name: why for name, why in left_out.items() if name not in sold}
-    return Sale(offers, left_out, vcpus, {key: code for key, code in quotas.items() if code})
+    return Sale(offers, left_out, {key: quota for key, quota in quotas.items() if quota[0]})
 
 
 def missing(cloud: Any, resources: Any) -> str:

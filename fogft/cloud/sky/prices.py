@@ -119,28 +119,28 @@ class Prices:
     def _within_quotas(self, sale: Sale, left_out: list[str]) -> Sequence[Offer]:
         """Return the offers that the account's quotas have room for, were nothing else running."""
 
-        def asked(offer: Offer) -> tuple[str, str, str]:
-            place = offer.placement
-            return place.cloud, place.region, sale.quotas.get((place.instance, place.spot), "")
+        def asked(place: Placement) -> tuple[str, str, str]:
+            code, _ = sale.quotas.get((place.instance, place.spot), ("", 0.0))
+            return place.cloud, place.region, code
 
-        wanted = {asked(o) for o in sale.offers if o.placement.cloud in self.providers}
-        wanted = {one for one in wanted if one[2]}
+        places = (o.placement for o in sale.offers if o.placement.cloud in self.providers)
+        wanted = {quota for quota in map(asked, places) if quota[2]}
         if not wanted:
             return sale.offers
         limits = _side_by_side(wanted, self._quota)
         left_out += self._unread.values()
         kept = []
         for offer in sale.offers:
-            limit, place = limits.get(asked(offer)), offer.placement
-            if limit is None or limit >= sale.vcpus.get(place.instance, 0.0):
+            place, limit = offer.placement, limits.get(asked(offer.placement))
+            code, needs = sale.quotas.get((place.instance, place.spot), ("", 0.0))
+            if limit is None or limit >= needs:
                 kept.append(offer)
                 continue
             kind = "spot" if place.spot else "on demand"
             where = f"{place.cloud}/{place.region}"
             said = (
-                f"`{place.instance}` {kind} in `{where}` is left out: the quota {asked(offer)[2]} "
-                f"allows {limit:g} vCPUs, but it needs {sale.vcpus[place.instance]:g}; request an "
-                "increase"
+                f"`{place.instance}` {kind} in `{where}` is left out: the quota {code} "
+                f"allows {limit:g} vCPUs, but it needs {needs:g}; request an increase"
             )
             if said not in left_out:  # once for all its zones
                 left_out.append(said)

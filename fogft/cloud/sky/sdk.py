@@ -66,14 +66,12 @@ class Sale:
     Attributes:
         offers: Of each location several machines that would do, at the catalogue's prices.
         left_out: Cloud -> why no such machine can be launched there.
-        vcpus: Instance type -> how many it has, which quotas are about.
-        quotas: Instance type and whether spot -> the provider's code of the quota.
+        quotas: Instance type and whether spot -> the quota's code, and how many vCPUs it needs.
     """
 
     offers: Sequence[Offer]
     left_out: Mapping[str, str] = field(default_factory=dict)
-    vcpus: Mapping[str, float] = field(default_factory=dict)
-    quotas: Mapping[tuple[str, bool], str] = field(default_factory=dict)
+    quotas: Mapping[tuple[str, bool], tuple[str, float]] = field(default_factory=dict)
 
 
 class JobState(Enum):

@@ -31,9 +31,7 @@ _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
 class Row:
     """A machine in a place. Prices are NaN where it is not sold in that way."""
 
-    cloud: str
-    region: str
-    zone: str
+    place: tuple[str, str, str]  # cloud, region, zone
     instance: Instance
     as_of: float  # when the prices were true, in seconds since the epoch; 0 for not known
     source: str  # who says so
@@ -45,7 +43,7 @@ class PriceTable:
     def __init__(self, file: Path) -> None:
         self._file = file
         self._rows = list(_rows(file))
-        self._places = {(row.cloud, row.region, row.zone) for row in self._rows}
+        self._places = {row.place for row in self._rows}
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """List of each place the cheapest machine that suits, the cheapest first."""
@@ -55,16 +53,14 @@ class PriceTable:
             named = {place for place in self._places if sells(entry, *place)}
             for row in self._rows:
                 price = row.instance.spot_usd_per_hour if spot else row.instance.usd_per_hour
-                place = row.cloud, row.region, row.zone
-                if math.isnan(price) or place not in named:
+                if math.isnan(price) or row.place not in named:
                     continue
-                known = best.get((place, spot))
+                known = best.get((row.place, spot))
                 if (known and price > known.usd_per_hour) or not _suits(where, row, entry):
                     continue
-                offer = Offer(
-                    Placement(*place, row.instance.name, spot), price, row.source, row.as_of
-                )
-                best[place, spot] = min(known or offer, offer, key=_order)
+                placement = Placement(*row.place, row.instance.name, spot)
+                offer = Offer(placement, price, row.source, row.as_of)
+                best[row.place, spot] = min(known or offer, offer, key=_order)
         if not best:
             raise SpecError.of_key(
                 "resources",
@@ -117,10 +113,12 @@ def _row(file: Path, number: int, raw: Mapping[str, str | None], usual: str) -> 
     name = (raw.get("InstanceType") or "").strip()
     devices = (raw.get("AcceleratorName") or "").strip()
     return Row(
-        cloud=(raw.get("Cloud") or usual).strip().lower(),
-        region=(raw.get("Region") or "").strip().lower(),
-        zone=(raw.get("AvailabilityZone") or "").strip().lower(),
-        instance=Instance(
+        (
+            (raw.get("Cloud") or usual).strip().lower(),
+            (raw.get("Region") or "").strip().lower(),
+            (raw.get("AvailabilityZone") or "").strip().lower(),
+        ),
+        Instance(
             name,
             int(number_in("vCPUs", 0)),
             int(number_in("MemoryGiB", 0)),
