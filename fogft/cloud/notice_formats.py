@@ -1,13 +1,10 @@
-"""Preemption notices of different clouds, read into one form. Pure.
+"""Preemption notices of different clouds, read into one form. Pure. By the clouds' own pages.
 
 | cloud | what is asked | how long before |
 |---|---|---|
 | AWS | ``spot/instance-action``, ``events/recommendations/rebalance`` | 2 min; earlier, or not |
 | GCP | ``instance/preempted`` | 30 s at most |
 | Azure | ``scheduledevents``, of type ``Preempt`` or ``Terminate`` | 30 s at least |
-
-Sources: the clouds' own pages on spot interruption notices, on the metadata values
-``instance/preempted``, and on Scheduled Events.
 """
 
 from __future__ import annotations

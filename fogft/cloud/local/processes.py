@@ -71,10 +71,7 @@ def end(pids: Iterable[int], limit_s: float = _LIMIT_S) -> None:
 
 
 def end_machine(machine: str, *, spare: Collection[int] = ()) -> bool:
-    """End all processes of a machine but those to spare. Returns whether there were any.
-
-    Looks again until a look finds nothing, since what it kills may just have forked.
-    """
+    """End a machine's processes but some, until a look finds none; return if there were any."""
     ended = False
     while pids := set(find(machine=machine)) - set(spare):
         end(pids)

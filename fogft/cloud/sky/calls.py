@@ -26,10 +26,7 @@ class Calls:
         self._given_up: dict[str, Future[Any]] = {}
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
-        """Run a call on its own thread with a time limit; translate its errors.
-
-        `subject` says what it is about: the same words are the same question.
-        """
+        """Run a call on its own thread within a limit; `subject` tells which question it is."""
         ends_at = time.monotonic() + limit_s
         running = self._given_up.get(subject)
         if running is not None:

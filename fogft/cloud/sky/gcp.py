@@ -1,7 +1,6 @@
 """GCP through its own API (REST, with google-auth, which comes with SkyPilot's GCP support).
 
 Lists machines by our labels, and deletes those that were just listed; no more of `provider`.
-Project and credentials come from the same places as SkyPilot's.
 """
 
 from __future__ import annotations

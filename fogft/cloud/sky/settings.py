@@ -49,10 +49,7 @@ class Settings:
         self._launched: set[str] = set()
 
     def apply(self, clouds: Iterable[str], id: ReplicaId | None = None, group: str = "") -> None:
-        """Set what a launch on some clouds is to have; the user's own commands come first.
-
-        `group` is the security group of the pool's machines; empty for SkyPilot's own.
-        """
+        """Set what a launch is to have, beside the user's own; `group`: its security group."""
         config = importlib.import_module("sky.skypilot_config")
         with self._lock:
             self._launched |= ENDED_BY_FILES.intersection(clouds)
