@@ -39,8 +39,9 @@ def announce(
     for name, problem in preview.accounts.items():
         output.say(f"`{name}` " + (f"cannot be used: {problem}" if problem else "can be used"))
     if preview.is_new:
-        count = _count(preview.wanted or spec.replicas, "replica")
-        output.say(f"pool `{spec.name}`: {count} on `{preview.cloud}`")
+        count = preview.wanted or spec.replicas
+        replicas = f"{count} replica{'' if count == 1 else 's'}"
+        output.say(f"pool `{spec.name}`: {replicas} on `{preview.cloud}`")
         _show_launches(preview)
     elif preview.changes:
         output.say(f"pool `{spec.name}` changes:")
@@ -54,8 +55,8 @@ def announce(
         if preview.costs_money and preview.launches:
             output.say(f"  at current prices the pool costs ${preview.usd_per_hour:.3f}/h")
     elif joined is not None:
-        count = f"{joined.done} of {joined.of} replicas run it"
-        output.say(f"pool `{spec.name}` is already being updated to this file: {count}; waiting")
+        done = f"{joined.done} of {joined.of} replicas run it"
+        output.say(f"pool `{spec.name}` is already being updated to this file: {done}; waiting")
     elif not preview.rolled_back and upgrade_from in ("", __version__):
         output.say(f"pool `{spec.name}` already matches its file")
     if upgrade_from not in ("", __version__):
@@ -174,7 +175,3 @@ def _phase_lines() -> Callable[[Seen], None]:
                 output.say(f"note: {note}")
 
     return say
-
-
-def _count(count: int, word: str) -> str:
-    return f"{count} {word}{'' if count == 1 else 's'}"

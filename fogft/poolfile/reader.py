@@ -48,8 +48,7 @@ class Reader:
         rule = self._rules.get(cls)
         return made if rule is None else rule(section, made)
 
-    def maps(self, form: keys.Maps, key: str, section: Section) -> tuple[Any, ...]:
-        """Return the dataclasses that a list of uniquely named maps describes."""
+    def _maps(self, form: keys.Maps, section: Section, key: str) -> tuple[Any, ...]:
         found: list[Any] = []
         lines: dict[str, int] = {}
         sections = section.sections(key, form.hint)
@@ -88,7 +87,7 @@ class Reader:
             case keys.Map() as form:
                 return self._map(form, section, name)
             case keys.Maps() as form:
-                return self.maps(form, name, section)
+                return self._maps(form, section, name)
             case keys.Free() as form:
                 return plain(section.section(name, form.hint).node)
             case keys.Special() as form:
