@@ -254,11 +254,7 @@ def _clock(written: Any) -> int:
 
 
 _CLOCK_FORM = Special("hours:minutes", _clock, {"type": ["string", "integer"]})
-_DAYS_FORM = Special(
-    "days of the week",
-    _days,
-    {"type": ["string", "array"]},
-)
+_DAYS_FORM = Special("days of the week", _days, {"type": ["string", "array"]})
 
 
 @dataclass(frozen=True)

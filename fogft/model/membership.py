@@ -42,9 +42,14 @@ def members_of(
     ending: Collection[ReplicaId] = (),
     revoked: Collection[str] = (),
     found: Found = Found.BY_CLOUD,
+    by_hand: Iterable[ReplicaId] = (),
 ) -> tuple[Member, ...]:
-    """Return the members to hold links to: ours, not ending, not revoked, and can be found."""
-    return tuple(
+    """Return the members to hold links to: ours, not ending, not revoked, and can be found.
+
+    Those started by hand, which no cloud lists, come last: the highest generation of each slot
+    that no machine has.
+    """
+    members = tuple(
         Member(
             machine.id,
             "" if found is Found.BY_DOOR else machine.endpoint or "",
@@ -58,13 +63,6 @@ def members_of(
         and machine.id not in ending
         and machine.id.certificate_name not in revoked
     )
-
-
-def with_by_hand(members: tuple[Member, ...], by_hand: Iterable[ReplicaId]) -> tuple[Member, ...]:
-    """Return members plus manually started replicas, which no cloud lists.
-
-    Of several generations of a slot the highest is meant; a slot that a machine has is its own.
-    """
     taken = {member.id.slot for member in members}
     latest = {id.slot: id for id in sorted(by_hand) if id.slot not in taken}
     return (*members, *(Member(latest[slot], "") for slot in sorted(latest)))

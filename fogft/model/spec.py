@@ -180,8 +180,7 @@ class ServiceSpec:
     freshness: Freshness = key(
         OneOf(Freshness),
         "Which of several waiting requests goes first: the one with the nearest deadline "
-        "(`every`), "
-        "or the newest (`latest`), for services whose older requests are worth less.",
+        "(`every`), or the newest (`latest`), for services whose older requests are worth less.",
         default=Freshness.EVERY,
     )
     trace: bool = key(

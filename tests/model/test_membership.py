@@ -163,7 +163,8 @@ def test_a_name_of_nobody_in_the_pool_cannot_be_revoked(name: object) -> None:
 
 def test_replicas_started_by_hand_are_members_that_say_where_they_are() -> None:
     """The highest generation of each slot, and never in the place of a machine."""
-    machine = Member(ReplicaId(UID, 100, 1), "10.0.0.1:1")
+    machine = replica(100).machine
     by_hand = [ReplicaId(UID, 101, 1), ReplicaId(UID, 101, 3), ReplicaId(UID, 100, 9)]
-    found = memberships.with_by_hand((machine,), by_hand)
-    assert found == (machine, Member(ReplicaId(UID, 101, 3), ""))
+    found = memberships.members_of([machine], pool_uid=UID, by_hand=by_hand)
+    assert [member.id for member in found] == [machine.id, ReplicaId(UID, 101, 3)]
+    assert found[1] == Member(ReplicaId(UID, 101, 3), "")

@@ -21,7 +21,7 @@ from fogft.cloud.port import Cloud, Launch, RealCloud, Refreshing
 from fogft.errors import CloudError, CloudUnreachable, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.model.groups import GATEWAY_SLOT, replica_hash, sales, task_at
 from fogft.model.intent import Intent
-from fogft.model.membership import Found, members_of, successor, with_by_hand
+from fogft.model.membership import Found, members_of, successor
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
     LinkReport,
@@ -360,8 +360,8 @@ class Reconciler:
             ending=ending,
             revoked=revoked,
             found=found,
+            by_hand=by_hand,
         )
-        members = with_by_hand(members, by_hand)
         membership = successor(
             self._membership,
             pool=identity.name,
