@@ -13,7 +13,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.ros import spdp
-from fogft.ros.shared_memory import make_private
+from fogft.ros.shared_memory import dead_ports_held, make_private
 
 log = logging.getLogger(__name__)
 
@@ -45,14 +45,15 @@ def bare_node(name: str, context: Any) -> Any:
     import rclpy
     from rclpy.parameter import Parameter
 
-    node = rclpy.create_node(
-        name,
-        context=context,
-        use_global_arguments=False,
-        enable_rosout=False,
-        start_parameter_services=False,
-        parameter_overrides=[Parameter("start_type_description_service", value=False)],
-    )
+    with dead_ports_held(context.get_domain_id()):
+        node = rclpy.create_node(
+            name,
+            context=context,
+            use_global_arguments=False,
+            enable_rosout=False,
+            start_parameter_services=False,
+            parameter_overrides=[Parameter("start_type_description_service", value=False)],
+        )
     make_private()
     return node
 

@@ -27,16 +27,20 @@ import ctypes
 import fcntl
 import os
 import re
+import socket
 import struct
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from fogft.ros import spdp
+
 SETTLED_S = 2.0
 FOLDER = Path("/dev/shm")
 
 _TURN_LIMIT_S = 5.0
+_HELD_IDS = 24  # of a machine's participants: on `LOCALHOST` ROS finds those below 32
 _IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
 _PORT_EVENT = re.compile(rb"\0fast(?:dds|rtps)_port\d+\0")
 _REMOVED = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+) \(deleted\)")
@@ -130,6 +134,24 @@ def make_private() -> None:
         if _SEGMENT.fullmatch(name):
             with contextlib.suppress(OSError):  # another user's, or gone
                 (FOLDER / name).chmod(0o600)
+
+
+@contextlib.contextmanager
+def dead_ports_held(domain_id: int) -> Iterator[None]:
+    """Have a participant that is made meanwhile take no port of a process that has died.
+
+    A client that wrote to the dead one would write to its memory for seconds more. A participant
+    takes the first number of which it can bind both UDP ports; its shared memory has the second's.
+    """
+    first = spdp.first_port(domain_id)
+    with contextlib.ExitStack() as held:
+        for port in range(first, first + 2 * _HELD_IDS, 2):
+            if any(FOLDER.glob(f"fast*_port{port + 1}")):
+                for number in (port, port + 1):
+                    sock = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+                    with contextlib.suppress(OSError):  # it is alive
+                        sock.bind(("", number))
+        yield
 
 
 class PortWatch:

@@ -71,21 +71,24 @@ def _here(prefix: bytes, port: int) -> bytes:
     return _message(prefix, 1, _DATA, b"\x00\x03\x00\x00" + told)
 
 
+def first_port(domain_id: int) -> int:
+    """Return the UDP port at which a machine's first participant of a domain hears of others."""
+    return _BASE_PORT + _DOMAIN_GAIN * domain_id + _UNICAST_OFFSET
+
+
 def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.environ) -> None:
-    port = _BASE_PORT + _DOMAIN_GAIN * domain_id
     peers = re.split(r"[;\s]+", environ.get("ROS_STATIC_PEERS", ""))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
         for host in filter(None, [_LOOPBACK, *peers]):
             for id in range(_IDS):
                 with contextlib.suppress(OSError):
-                    to = port + _UNICAST_OFFSET + _ID_GAIN * id
-                    sending.sendto(message, (host, to))
+                    sending.sendto(message, (host, first_port(domain_id) + _ID_GAIN * id))
         with contextlib.suppress(OSError):
             for index, _ in socket.if_nameindex():
                 with contextlib.suppress(OSError):
                     through = struct.pack("=4s4si", b"", b"", index)
                     sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, through)
-                    sending.sendto(message, (_GROUP, port))
+                    sending.sendto(message, (_GROUP, _BASE_PORT + _DOMAIN_GAIN * domain_id))
 
 
 def declare_gone(
@@ -126,7 +129,7 @@ class Introduction:
         ):
             sock.bind((_LOOPBACK, 0))
             sock.settimeout(_LOOK_S)
-            ours = _own_ports(_BASE_PORT + _DOMAIN_GAIN * self._domain_id)
+            ours = _own_ports(self._domain_id)
             _send(_here(prefix, sock.getsockname()[1]), self._domain_id)
             end = time.monotonic() + _ANSWERED_WITHIN_S
             while not self._closed and time.monotonic() < end:
@@ -137,14 +140,14 @@ class Introduction:
             _send(gone(prefix), self._domain_id)
 
 
-def _own_ports(domain_port: int) -> list[int]:
+def _own_ports(domain_id: int) -> list[int]:
     """Return the ports at which this process's participants of a domain hear of others."""
     sockets = set()
     for descriptor in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
             sockets.add(os.readlink(f"/proc/self/fd/{descriptor}"))
-    first = domain_port + _UNICAST_OFFSET
-    discovery = range(first, domain_port + _DOMAIN_GAIN, _ID_GAIN)
+    first = first_port(domain_id)
+    discovery = range(first, first + _DOMAIN_GAIN - _UNICAST_OFFSET, _ID_GAIN)
     with open("/proc/self/net/udp") as table:
         lines = [line.split() for line in table][1:]
     ours = [line[1] for line in lines if f"socket:[{line[9]}]" in sockets]

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from fogft.ros import shared_memory
+from fogft.ros import shared_memory, spdp
 from tests.needs import needs
 
 from .conftest import LIMIT_S, SET_BOOL, wait_for
@@ -265,6 +265,35 @@ def _other_node(domain: int) -> subprocess.Popen[str]:
     assert process.stdout is not None
     assert process.stdout.readline() == "up\n"
     return process
+
+
+@pytest.mark.ros
+@needs("fastdds")
+def test_a_new_participant_takes_no_port_of_one_that_was_killed(
+    make_node: Callable[[int], Any], ros_domain: int
+) -> None:
+    """A client of the killed one would write to its memory for seconds more."""
+    first = spdp.first_port(ros_domain)
+    killed = _other_node(ros_domain)
+    left = _ports_of(killed.pid, first)
+    killed.kill()
+    killed.wait()
+    assert left
+    assert left <= set(os.listdir(shared_memory.FOLDER))
+    node = make_node(ros_domain)
+    assert node.alive
+    own = _ports_of(os.getpid(), first)
+    assert own
+    assert not left & own
+
+
+def _ports_of(pid: int, first: int) -> set[str]:
+    names = {
+        f"{begin}_port{number}"
+        for begin in ("fastdds", "fastrtps")
+        for number in range(first, first + 240)
+    }
+    return _names_of(pid) & names
 
 
 CALLER = """
