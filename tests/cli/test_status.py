@@ -310,7 +310,7 @@ def test_a_terminal_gets_colour_unless_it_wants_none(home):
     with alive(paths):
         assert "\033[32mready" in on_a_terminal(home)
         for environ in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
-            lay_down(home, age_s=0.0)  # anew: on a busy machine each start takes seconds
+            report(paths)  # anew: on a busy machine each start takes seconds
             plain = on_a_terminal(home, **environ)
             assert "\033" not in plain
             assert "0.1      ready" in plain
