@@ -16,7 +16,7 @@ import select
 import socket
 import threading
 import time
-from collections import deque
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 
 from fogft.counters import Counters
@@ -42,7 +42,8 @@ _PATIENCE_S = 1.0
 
 
 class _Waiting:
-    def __init__(self, link: socket.socket) -> None:
+    def __init__(self, id: ReplicaId, link: socket.socket) -> None:
+        self.id = id
         self.link = link
         self.lock = threading.Lock()  # held by whoever talks on it; the taker keeps it
         self.taken = False
@@ -69,7 +70,7 @@ class DialIn:
         self._counters = Counters()
         self.counters = self._counters.snapshot
         self._lock = threading.Condition()
-        self._waiting: dict[ReplicaId, deque[_Waiting]] = {}
+        self._waiting: list[_Waiting] = []  # oldest first
         self._local: dict[ReplicaId, socket.socket] = {}
         self._tunnels = Tunnels()
         self._greeting: dict[socket.socket, str] = {}  # oldest first, with their hosts
@@ -116,7 +117,7 @@ class DialIn:
             self._count("greeting_failed", f"{host}: {error}")
             hang_up(link)
         else:
-            self._wait(id, _Waiting(link))
+            self._wait(_Waiting(id, link))
 
     def _greet(self, link: socket.socket, host: str) -> ReplicaId:
         keep_alive(link)
@@ -139,24 +140,23 @@ class DialIn:
             raise RecordError("revoked", f"`{writer.common_name}` is revoked")
         return ReplicaId(self._pool_uid, int(holder.name), holder.generation)
 
-    def _wait(self, id: ReplicaId, one: _Waiting) -> None:
+    def _wait(self, one: _Waiting) -> None:
         with self._lock:
-            queue = self._waiting.setdefault(id, deque())
-            too_many = len(queue) >= WAITING_LIMIT or len(self._waiting) > REPLICAS_LIMIT
+            of_each = Counter(other.id for other in (*self._waiting, one))
+            too_many = of_each[one.id] > WAITING_LIMIT or len(of_each) > REPLICAS_LIMIT
             if too_many or self._closed:
-                if not queue:
-                    del self._waiting[id]
                 hang_up(one.link)
                 self._counters.add("refused_full")
                 return
-            queue.append(one)
+            self._waiting.append(one)
             self._lock.notify_all()
         self._counters.add("admitted")
-        log.info("replica_dialled_in replica=%s", id.short)
+        log.info("replica_dialled_in replica=%s", one.id.short)
         why = self._tend(one)
         if why:
-            log.info("replica_left_door replica=%s reason=%s", id.short, why)
-            self._forget(id, one)
+            log.info("replica_left_door replica=%s reason=%s", one.id.short, why)
+            with self._lock, contextlib.suppress(ValueError):  # it was taken just now
+                self._waiting.remove(one)
             hang_up(one.link)
 
     def _tend(self, one: _Waiting) -> str:
@@ -185,15 +185,6 @@ class DialIn:
                 return "the port is closed"
             if time.monotonic() - heard_at > SILENCE_S:
                 return "it sends nothing"
-
-    def _forget(self, id: ReplicaId, one: _Waiting) -> None:
-        with self._lock:
-            queue = self._waiting.get(id)
-            if queue is not None:
-                with contextlib.suppress(ValueError):
-                    queue.remove(one)
-                if not queue:
-                    del self._waiting[id]
 
     # -- links go out -------------------------------------------------------------------------
 
@@ -234,12 +225,11 @@ class DialIn:
         until = time.monotonic() + _PATIENCE_S
         while True:
             with self._lock:
-                while not self._waiting.get(id):
+                while not (found := [one for one in self._waiting if one.id == id]):
                     if not self._lock.wait(until - time.monotonic()) or self._closed:
                         return None
-                one = self._waiting[id].pop()  # the latest is the likeliest to live
-                if not self._waiting[id]:
-                    del self._waiting[id]
+                one = found[-1]  # the latest is the likeliest to live
+                self._waiting.remove(one)
             with one.lock:
                 one.taken = True
                 try:
@@ -257,7 +247,7 @@ class DialIn:
     def waiting(self) -> Mapping[ReplicaId, int]:
         """Return how many connections of each replica are waiting."""
         with self._lock:
-            return {id: len(queue) for id, queue in self._waiting.items()}
+            return Counter(one.id for one in self._waiting)
 
     def _count(self, event: str, detail: str) -> None:
         self._counters.warn(log, event, "dial_in_refused event=%s detail=%r", event, detail[:200])
@@ -268,7 +258,7 @@ class DialIn:
         hang_up(self._door)
         self.keep(())
         with self._lock:
-            waiting = [one for queue in self._waiting.values() for one in queue]
+            waiting = list(self._waiting)
             self._lock.notify_all()
         for one in waiting:
             with contextlib.suppress(OSError):
