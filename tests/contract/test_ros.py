@@ -265,12 +265,12 @@ def test_a_service_can_be_offered_again(world: World) -> None:
 def test_closing_is_repeatable_and_final(world: World) -> None:
     """What is closed stays closed, says so, and does not mind being closed again."""
     server, client = world.pair(lambda _: _response(1))
-    held: list[Any] = []
+    handle = bytes(24)
     for closing in (server, client, *world.nodes):
         closing.close()
         closing.close()
     assert not client.available()
-    server.respond(held, _response(1))
+    server.respond(handle, _response(1))
     with pytest.raises(RosError, match="closed"):
         client.call(TRUE, lambda _: None)
     with pytest.raises(RosError, match="closed"):
