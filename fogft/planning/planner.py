@@ -171,8 +171,6 @@ def plan_once(
 
     sized = size(spec, intent, observed, health.running if spec.availability else 0)
     machines = classify(spec, intent, observed, health=health, size=sized)
-    counts, excess = _within_cap(sized, machines)
-    wanted = sum(counts)
     standing_in = [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
     others = machines.without(standing_in) if standing_in else machines
     buyer = Buyer(
@@ -185,6 +183,8 @@ def plan_once(
         sized.max_usd_per_hour,
         standing_in=standing_in,
     )
+    counts, excess = _within_cap(sized, buyer)
+    wanted = sum(counts)
     settling = bool(others.replaced) and rollout.is_settling(others, observed.now)
     of_groups = [
         [s for s in standing_in if group_of(sized.groups, s.slot) is group]
@@ -369,16 +369,19 @@ def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessm
     return None
 
 
-def _within_cap(sized: Size, machines: Classification) -> tuple[Sequence[int], list[Reason]]:
+def _within_cap(sized: Size, buyer: Buyer) -> tuple[Sequence[int], list[Reason]]:
     """Return how many are wanted of each group: one fewer while those at hand exceed the cap.
 
     No launch exceeds the cap: this is for one that was lowered, by a schedule or in the file.
-    The last group gives first, one at a time, and one replica always stays.
+    So a price that has risen since the order counts for nothing here, and one that has fallen
+    does: with it more were launched. The last group gives first, one at a time, and one replica
+    always stays.
     """
+    machines = buyer.machines
     cap, counts, groups = sized.max_usd_per_hour, list(sized.counts), sized.groups
     if cap is None or len(machines.good) < 2:
         return counts, []
-    cost = sum(s.machine.usd_per_hour for s in machines.good)
+    cost = sum(min(s.machine.usd_per_hour, buyer.price(s)) for s in machines.good)
     if cost <= cap + EPSILON_USD:
         return counts, []
     if machines.replaced or machines.ending or len(machines.good) > sum(counts):

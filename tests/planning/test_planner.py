@@ -12,7 +12,7 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkState, Offer
 from fogft.planning.observed.backoff import NO_ROOM_S
 from fogft.planning.observed.history import Event, EventKind
-from tests.planning.pool_worlds import NOW, OFFERS, PLACES, World, replica, shorts, spec
+from tests.planning.pool_worlds import NOW, OFFERS, PLACES, World, applied, replica, shorts, spec
 
 A, B, C, D = PLACES
 
@@ -63,8 +63,12 @@ def test_the_price_of_today_counts_against_the_budget() -> None:
     assert planned.launches == ()
     [left] = planned.notes[0].because
     assert (left.cause, left.limit_usd_per_hour) == (Cause.OVER_BUDGET, pytest.approx(0.05))
-    fallen = World(spec(2, max_usd_per_hour=0.35)).having(replica(0, at=A, price=0.3))
+    fallen = World(spec(2, max_usd_per_hour=0.35)).having(
+        replica(0, state="starting", at=A, age_s=10.0, price=0.3)
+    )
     assert launches(fallen) == ["1.1"]
+    again = applied(fallen, fallen.plan()).plan()
+    assert (again.launches, again.terminations, again.draining) == ((), (), ())
 
 
 def test_a_rebalance_is_an_early_hint() -> None:
