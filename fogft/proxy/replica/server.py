@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _STRANGERS = ("handshakes_refused", "unauthenticated", "kept_out")
-_LOOK_EVERY_S = 0.25  # at services, while all are ready
+_LOOK_EVERY_S = 0.15  # at services, while all are ready
 
 
 class ServerProxy:
