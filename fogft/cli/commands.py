@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import keyword
 import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections import UserDict
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -67,15 +68,9 @@ _WHOLE = 1000  # of a description: it is folded, not cut
 _COMMANDS = {name: row for names in SECTIONS.values() for name, row in names.items()}
 
 
-class _Loaded(Mapping[str, Any]):
+class _Loaded(UserDict[str, Any]):
     def __getitem__(self, name: str) -> Any:
-        return _load(name, *_COMMANDS[name])
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(_COMMANDS)
-
-    def __len__(self) -> int:
-        return len(_COMMANDS)
+        return _load(name, *self.data[name])
 
 
 @cache
@@ -130,7 +125,7 @@ class Commands(Group):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.commands: Any = _Loaded()
+        self.commands: Any = _Loaded(_COMMANDS)
 
     def sections(self) -> Iterable[tuple[str, Iterable[str]]]:
         """Return the sections by what people want to do."""

@@ -22,27 +22,24 @@ def _offer(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     return offer
 
 
-def _pools() -> list[str]:
-    return composition.pools()
-
-
 def _slots() -> list[str]:
     from fogft.pool.commands import status
 
-    every = {slot for pool in _pools() for slot in status.slots(PoolPaths.of(pool))}
+    every = {slot for pool in composition.pools() for slot in status.slots(PoolPaths.of(pool))}
     return [str(slot) for slot in sorted(every)]
 
 
 def _locations() -> list[str]:
     from fogft.pool.commands import status
 
-    seen = [status.read(PoolPaths.of(pool), 0.0).status for pool in _pools()]
+    seen = [status.read(PoolPaths.of(pool), 0.0).status for pool in composition.pools()]
     zones = {replica.location for one in seen for replica in one.replicas}
     return sorted(zones | {zone.rsplit("/", 1)[0] for zone in zones})
 
 
 def _excluded() -> list[str]:
-    return sorted({x for p in _pools() for x in composition.make_store(p).intent().excluded})
+    stores = map(composition.make_store, composition.pools())
+    return sorted({location for store in stores for location in store.intent().excluded})
 
 
 def _examples() -> Iterable[str]:
@@ -51,7 +48,7 @@ def _examples() -> Iterable[str]:
     return init.examples()
 
 
-pools, slots, examples = _offer(_pools), _offer(_slots), _offer(_examples)
+pools, slots, examples = _offer(composition.pools), _offer(_slots), _offer(_examples)
 locations, excluded = _offer(_locations), _offer(_excluded)
 
 PoolOption = Annotated[

@@ -47,9 +47,7 @@ def histogram(
 ) -> Metric:
     """Return histograms of one name, which ends in its unit.
 
-    Args:
-        bounds: Upper bounds of the buckets, rising; one more is without bound.
-        counted: How many values fell into each bucket; their sum; labels.
+    `bounds` rise; one more bucket is without. `counted`: values by bucket, their sum, labels.
     """
     family = _family(name, "histogram", help, ())
     for counts, total, labels in counted:
