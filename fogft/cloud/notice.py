@@ -1,11 +1,7 @@
 """Watch for the preemption notice of the machine that this process runs on.
 
-A thread asks the cloud's metadata server (AWS, GCP, Azure: a link-local address that only the
-machine itself reaches) or looks at a file. A source says whether it exists here (`is_here`), and
-yields the notices in force (`ask`), again each time; OSError where it does not answer, which is
-no news: on most machines there is no metadata server.
-
-Not here: reading the answers (`notice_formats`) and what a replica does about it.
+A thread asks the cloud's metadata server (AWS, GCP, Azure) or looks at a file. A source yields the
+notices in force again each time it is asked; where it does not answer, that is no news.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from fogft.cloud.sky.calls import Calls
+from fogft.cloud.sky.installed import Calls
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudError, CloudUnreachable
 

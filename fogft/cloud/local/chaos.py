@@ -25,13 +25,14 @@ OUTAGE_KILL_AFTER_S = 1.0
 
 
 class Chaos:
-    """Faults in one local cloud, and all its pools."""
+    """Faults in one local cloud, and all its pools. CloudError: no such machine, or location.
+
+    A location is `region` or `region/zone`, with or without `local/` before it.
+    """
 
     def __init__(self, root: Path) -> None:
         self._cloud = LocalCloud(root)
         self._root = self._cloud.root
-
-    # -- one machine; all raise CloudError if it does not exist ------------------------------
 
     def preempt(self, id: ReplicaId, notice_s: float | None = None) -> float:
         """Preempt a machine with notice (None: its zone's); return the seconds until it ends."""
@@ -79,8 +80,6 @@ class Chaos:
         """Drop all traffic to and from a machine; connections stay open. None: until `clear`."""
         self._change_link(id, blackhole=True, blackhole_until=_deadline(for_s))
 
-    # -- locations; `region`, `region/zone`, with or without `local/` before -----------------
-
     def outage(self, location: str, for_s: float | None = None) -> list[ReplicaId]:
         """Cut off, then end all machines in a location, and refuse launches there meanwhile."""
         place = self._location(location)
@@ -110,8 +109,6 @@ class Chaos:
             with contextlib.suppress(CloudError):  # it has just ended, or has no relay
                 self.thaw(folder.id)
                 self._change_link(folder.id, **asdict(LinkFaults()))
-
-    # -- inside -----------------------------------------------------------------------------
 
     def _living(self, id: ReplicaId) -> MachineFolder:
         folder = MachineFolder.under(self._cloud.machines_folder, id)

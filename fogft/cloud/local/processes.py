@@ -26,9 +26,13 @@ from fogft.errors import CloudUnreachable, FogftError
 MACHINE = "FOGFT_MACHINE"
 POOL = "FOGFT_POOL_UID"
 
+log = logging.getLogger(__name__)
+
 _PROC = Path("/proc")
 _LIMIT_S = 10.0
 _POLL_S = 0.005
+_PR_SET_CHILD_SUBREAPER = 36
+_libc = ctypes.CDLL(None, use_errno=True)
 
 
 def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
@@ -111,12 +115,6 @@ def _parent(pid: str) -> int | None:
 def _stat(pid: str) -> list[str]:
     # The second field, the program's name in parentheses, may hold anything.
     return (_PROC / pid / "stat").read_text(errors="replace").rpartition(")")[2].split()
-
-
-log = logging.getLogger(__name__)
-
-_PR_SET_CHILD_SUBREAPER = 36
-_libc = ctypes.CDLL(None, use_errno=True)
 
 
 def start(end_the_rest: Callable[[], None]) -> int:

@@ -34,13 +34,7 @@ RUN export HOME=/root && {exports}bash /root/.fogft/setup.sh && rm -rf /root/.fo
 def write(
     folder: Path, asked: Mapping[str, Any], image: str, wheel: Path, lock: Mapping[str, bytes]
 ) -> None:
-    """Write the context of a build into an empty folder; see `RealCloud`.
-
-    Args:
-        asked: The pool file's task, with absolute paths.
-        wheel: Folder with fogft's wheel.
-        lock: What fogft needs, as files; see `wheel.LockFolder`.
-    """
+    """Write the context of a build into an empty folder; see `RealCloud.bake`."""
     for key in ("secrets", "file_mounts"):
         if asked.get(key):
             raise SpecError.of_key(

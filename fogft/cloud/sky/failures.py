@@ -1,8 +1,7 @@
 """What a failed launch means: capacity, quota, credentials, setup, timeout or error. Pure.
 
-SkyPilot reports a refused launch as one exception with a history of others. The clouds' own codes
-stand in their texts or, as AWS's do, in the log of the launch only. The codes decide, not the
-exception's class: no capacity, no quota and no permission come in the same class.
+The clouds' own codes decide, not the exception's class, which is the same for no capacity, no quota
+and no permission. They stand in the texts or, as AWS's do, in the log of the launch only.
 """
 
 from __future__ import annotations

@@ -148,8 +148,6 @@ class Following:
         elif self._age(entry) > SETUP_LIMIT_S:  # it was asked: who hears nothing concludes nothing
             self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "setting up"))
 
-    # -- failures ---------------------------------------------------------------------------
-
     def _fail(self, entry: Entry, failure: Reason) -> None:
         """Write the failure first: whatever happens while it is taken down, it stays known."""
         log.warning("launch_failed replica=%s reason=%r", entry.id.short, in_words(failure))

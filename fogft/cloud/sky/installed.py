@@ -13,11 +13,12 @@ import importlib
 import io
 import os
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, wait
 from typing import Any, TypeVar, cast
 
 from fogft.cloud.sky import catalogue
-from fogft.cloud.sky.calls import Calls
 from fogft.cloud.sky.naming import replica_of
 from fogft.cloud.sky.sdk import (
     JOBS,
@@ -30,12 +31,14 @@ from fogft.cloud.sky.sdk import (
     cluster_of,
     request_of,
     told_reasons,
+    translated,
 )
 from fogft.cloud.sky.settings import NO_REPORTS, Settings
-from fogft.errors import CloudError
+from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.names import VM_CLOUDS
 
 F = TypeVar("F", bound=Callable[..., Any])
+T = TypeVar("T")
 
 ASK_LIMIT_S = 30.0
 REFRESH_LIMIT_S = 60.0
@@ -43,6 +46,48 @@ CHECK_LIMIT_S = 300.0  # asks every cloud, and may start the API server: minutes
 JOB_LIMIT_S = 120.0  # starts a Python on the machine, over ssh
 LAUNCH_LIMIT_S = 120.0  # uploads `workdir` and `file_mounts`, and may start the API server
 DOWN_LIMIT_S = 300.0
+
+
+class Calls:
+    """Runs calls to SkyPilot with a time limit, which its client lacks.
+
+    A call that is given up still runs, here and on the API server. Until it has ended the same
+    question is not asked again, so that a slow server is not buried under repetitions; its late
+    answer is thrown away, since it may be older than what the next asker wants to know.
+    """
+
+    def __init__(self) -> None:
+        self._given_up: dict[str, Future[Any]] = {}  # by subject
+
+    def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
+        """Run a call on its own thread within a limit; `subject` tells which question it is."""
+        ends_at = time.monotonic() + limit_s
+        running = self._given_up.get(subject)
+        if running is not None:
+            wait([running], limit_s)
+        if running is None or running.done():
+            running = Future()
+            threading.Thread(target=_run, args=(call, running), daemon=True).start()
+            wait([running], max(0.0, ends_at - time.monotonic()))
+            if running.done():
+                self._given_up.pop(subject, None)
+                error = running.exception()
+                if error is not None:
+                    raise translated(error, subject) from error
+                answer: T = running.result()
+                return answer
+        self._given_up[subject] = running
+        raise CloudUnreachable(
+            f"SkyPilot did not answer within {limit_s:.0f} s about {subject}",
+            "`sky api info` and `sky api logs` show the state of its API server",
+        )
+
+
+def _run(call: Callable[[], T], outcome: Future[T]) -> None:
+    try:
+        outcome.set_result(call())
+    except BaseException as error:  # SystemExit too: SkyPilot's client uses it
+        outcome.set_exception(error)
 
 
 def _limited(limit_s: float, subject: str) -> Callable[[F], F]:

@@ -23,7 +23,12 @@ from fogft.errors import CloudError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 
+log = logging.getLogger(__name__)
+
 NOWHERE = Placement("", "", "", "")
+CLUSTERS_FRESH_S = 5.0
+CLUSTERS_USABLE_S = 15.0  # so long nobody waits for a newer list, which is under way
+PROVIDER_SURE_AFTER_S = 60.0  # a provider's list may miss a machine in its first seconds
 
 
 def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -> Machine:
@@ -80,8 +85,7 @@ def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
             endpoint = f"{cluster.head_ip}:{naming.link_port(cluster.labels)}"
     elif not launching:
         phase = MachinePhase.FAILED
-        said = f"SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}"
-        failure = _error(said)
+        failure = _error(f"SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}")
     return Machine(
         id=id,
         placement=cluster.placement or NOWHERE,
@@ -126,13 +130,6 @@ def _as_found(entry: Entry, found: Placement) -> Placement:
         return asked
     instance = found.instance if found.instance in entry.instead else asked.instance
     return replace(asked, zone=asked.zone or found.zone, instance=instance)
-
-
-log = logging.getLogger(__name__)
-
-CLUSTERS_FRESH_S = 5.0
-CLUSTERS_USABLE_S = 15.0  # so long nobody waits for a newer list, which is under way
-PROVIDER_SURE_AFTER_S = 60.0  # a provider's list may miss a machine in its first seconds
 
 
 @dataclass

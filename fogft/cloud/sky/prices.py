@@ -1,8 +1,7 @@
 """What can be bought, and for how much: SkyPilot's catalogue, live spot prices, disks, quotas.
 
 The catalogue is a file that SkyPilot renews every few hours; spot prices move meanwhile. So an
-offer says where its price comes from and how old it is. Prices are kept for a while: the
-planner asks every half minute, and the answer must not cost a second each time.
+offer says where its price comes from and how old it is.
 """
 
 from __future__ import annotations

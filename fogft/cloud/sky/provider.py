@@ -31,9 +31,7 @@ class NotAllowedError(Exception):
 
 
 class Provider(Protocol):
-    """One cloud, by its own interface. Calls come from any thread and have limits.
-
-    What an implementation leaves out is not known there.
+    """One cloud, by its own interface: what is left out is not known. From any thread, with limits.
 
     All raise `CloudUnreachable` when the cloud cannot tell, or it is not known whether it heard,
     and `NotAllowedError` where the account may not.

@@ -61,16 +61,11 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Sale:
-    """The offers that SkyPilot has for a `resources` section.
+    """The offers that SkyPilot has for a `resources` section."""
 
-    Attributes:
-        offers: Of each location several machines that would do, at the catalogue's prices.
-        left_out: Cloud -> why no such machine can be launched there.
-        quotas: Instance type and whether spot -> the quota's code, and how many vCPUs it needs.
-    """
-
-    offers: Sequence[Offer]
-    left_out: Mapping[str, str] = field(default_factory=dict)
+    offers: Sequence[Offer]  # of each location several that would do, at the catalogue's prices
+    left_out: Mapping[str, str] = field(default_factory=dict)  # cloud -> why not there
+    # Instance type and whether spot -> the quota's code, and how many vCPUs it needs.
     quotas: Mapping[tuple[str, bool], tuple[str, float]] = field(default_factory=dict)
 
 

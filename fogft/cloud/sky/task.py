@@ -91,12 +91,8 @@ def build(
 ) -> dict[str, Any]:
     """Return the task of one replica, for exactly one location.
 
-    Args:
-        template: What `read` returns.
-        files: Folder with the order's files.
-        wheel: Folder with fogft's wheel.
-        base: Folder that relative paths of the pool file start from.
-        instead: What else is tried there, in this order, where the first has no capacity.
+    Relative paths of the pool file start from `base`. `instead` is tried there, in this order,
+    where the order's own placement has no capacity.
     """
     refuse_what_cannot_be_honoured(order.task)
     marks = {

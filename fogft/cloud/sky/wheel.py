@@ -1,10 +1,7 @@
 """What a VM installs: the running fogft as a wheel, and a lock file of its dependencies.
 
-No build tool and no index is needed for the wheel: it is made of the imported package's own files
-and of what pip recorded of it, the same bytes each time.
-
-For the lock `uv` resolves for every platform and Python at once. `up` makes it; a generation keeps
-the one of its first launch for all replicas.
+The wheel is made of the imported package's own files and of what pip recorded of it, the same bytes
+each time. `up` makes the lock; a generation keeps the one of its first launch for all replicas.
 """
 
 from __future__ import annotations
