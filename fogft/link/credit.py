@@ -5,9 +5,8 @@ send and receive buffers of Linux sockets with two batches of Zenoh's, together 
 than that may be sent from a thread that must never block. Kept true by
 tests/link/zenoh/robot/test_memory_bounds.py.
 
-Copies of one large request that leave together all arrive late. In turns the first replica has its
-copy while the others' still leave, and the last is no later: with 0.92 MB over loopback the first
-of three responses took 2.33 ms in turns and 3.29 ms together.
+Copies of one large request that leave together all arrive late: with 0.92 MB over loopback the
+first of three responses took 2.33 ms in turns and 3.29 ms together.
 """
 
 from __future__ import annotations

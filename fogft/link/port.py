@@ -1,9 +1,5 @@
 """The port between proxies: a robot's links on one side, a replica's listener on the other.
 
-What flows: a request (id, service, remaining time, bytes) from the robot; one answer
-(bytes, or a refusal with a reason) from the replica; probes, which the server proxy
-answers at once whatever the service does.
-
 Law of this port: `Link.offer` never blocks, whatever the peer does; a slow or dead peer
 costs its own link only. Callbacks come from the wire's threads; they must not block.
 Implementations: `fogft.link.zenoh.robot.link` and `uplinks`, `tests.fakes.link`. A replica's end is

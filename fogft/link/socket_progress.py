@@ -3,10 +3,8 @@
 1 MB needs eight seconds at 1 Mbit/s: a send that takes long is a fault only where nothing moves.
 The kernel counts what the peer has acknowledged, so no time-out has to be guessed.
 
-Where more is asked of a thin link than it carries, each request leaves after those before it, and
-every one arrives too late. So what would be too late at the rate that was seen is declined at once,
-and may go elsewhere. The rate is known for ten seconds only: then a request is let through again,
-by which the link is measured anew.
+What would be too late at the rate that was seen is declined at once, and may go elsewhere. The rate
+is known for ten seconds only: then a request is let through, by which the link is measured anew.
 
 `now` is an argument. Not here: where the counts come from (`sockets`), the bounds (`window`).
 """

@@ -3,9 +3,6 @@
 Whoever removes an attempt from its window reports its end, so that each end is reported once. The
 offering thread, the sender thread and Zenoh's threads meet here: each step holds one short lock.
 
-On a thin uplink attempts wait for seconds until they are sent. Of a service that wants the latest,
-the newest takes the turn of the oldest; the others are sent while their time lasts.
-
 To tell a replica that a request was cancelled costs a message. So it is told at once only if the
 request has been out for `WORTH_S` and the replica was told nothing for `EVERY_S`, else with the
 next flush, and not at all if the answer comes first.

@@ -1,13 +1,6 @@
 """Hedging that follows the load: every replica while they are idle, one when they are full. Pure.
 
-* **The first copy** goes where the answer is expected first.
-* **Spare copies** go to every other replica as soon as it is believed to be free. A replica drops
-  one that would have to wait. While spares cost more waiting than they save, fewer requests get
-  them.
-* **A late hedge**: an attempt that takes longer than 95 % of that replica's recent answers is
-  hedged at a free replica, if the budget has a token.
-* **Doubt**: a replica with such an attempt, that has ended nothing since that began, is doubted
-  until it does. What it has goes to another one, and that costs no token.
+First copies, spare copies, late hedges and doubt: docs/design/hedging.md.
 
 Laws: a request always has a copy that is no spare; late hedges <= capacity + share * requests.
 

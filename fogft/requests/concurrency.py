@@ -1,10 +1,8 @@
 """How many requests a service may have concurrently, given or learned from latency. Pure.
 
-A service that works on one request after the other gains nothing from ten: nine wait inside it,
-where nobody can take them back or put a more urgent one before them. One that works on ten at a
-time needs ten. Which it is shows in its throughput, limit / latency: under demand, half the limit
-is tried for some answers, and kept if throughput stays near what it was; once in a while the
-double is, and kept if it gains.
+What waits inside a service nobody can take back or overtake. How many it works on shows in its
+throughput, limit / latency: under demand, half the limit is tried for some answers, and kept if
+throughput stays near what it was; once in a while the double is, and kept if it gains.
 
 A service that answers every 3 ms or more often is not limited: what waits in it is over before it
 matters. One that takes up to 0.1 s has one more in hand than it works on, or it would stand still

@@ -129,8 +129,6 @@ class Decide:
         """Return counters and state, for people."""
         return {}
 
-    # -- what replicas must have ----------------------------------------------------------
-
     def hold(self) -> None:
         """Stop ordering: another proxy does."""
 

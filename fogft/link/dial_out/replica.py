@@ -74,8 +74,6 @@ class DialOut:
         self.follow(())
         self._tunnels.close()
 
-    # -- a thread for each waiting connection -------------------------------------------------
-
     def _keep_waiting(self, door: str, stop: threading.Event) -> None:
         while not stop.is_set():
             link: socket.socket | None = None

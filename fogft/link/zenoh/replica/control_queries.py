@@ -55,8 +55,6 @@ class ControlQueries:
         self._work_queue = work
         self._counters = counters
 
-    # -- Zenoh's threads ------------------------------------------------------------------
-
     def open_answers(self, asked: QueryEnd) -> None:
         """Handle an admitted connection's query for its stream of answers."""
         try:
@@ -120,8 +118,6 @@ class ControlQueries:
     def _end_of_stranger(self, asked: QueryEnd, refusal: str) -> None:
         asked.refusal = refusal
         self._queues.end(_STRANGERS, "strangers", asked)
-
-    # -- the worker thread -----------------------------------------------------------
 
     def _answer(
         self, greeting: frame.Greeting, asked: QueryEnd, answer: Callable[[], bytes]

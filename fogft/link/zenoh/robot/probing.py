@@ -82,8 +82,6 @@ class Probing:
         self.heard_at: float | None = None  # when that came, monotonic seconds
         self.rtt_s: float | None = None  # what that took
 
-    # -- asking and hearing ---------------------------------------------------------------
-
     def ask(self, connection: Connection, probe: Probe, now: float) -> None:
         """Send a probe. Raises zenoh.ZError: it could not be sent."""
         self._of_connection.began(now)
@@ -132,8 +130,6 @@ class Probing:
         if not answer.types and known is not None and known.incarnation == answer.incarnation:
             return replace(answer, types=known.types)
         return answer
-
-    # -- silence --------------------------------------------------------------------------
 
     def excuse(self, seconds: float, now: float) -> None:
         """Exclude time before `now` in which nothing could be received."""
