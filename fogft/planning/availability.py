@@ -27,12 +27,8 @@ _ROUNDING = 1 + 1e-9
 def unavailability(uptime_s: float, recovery_s: float) -> float:
     """Return the fraction of time, in [0, 1), that one replica does not answer.
 
-    Args:
-        uptime_s: Mean time from ready to gone, in seconds, above 0.
-        recovery_s: Mean time from gone to ready again elsewhere, in seconds, 0 or more.
-
-    Raises:
-        ValueError: An argument is out of range or not finite.
+    `uptime_s` is the mean time from ready to gone, `recovery_s` that from gone to ready again
+    elsewhere. Raises ValueError: an argument is out of range or not finite.
     """
     if not (math.isfinite(uptime_s) and uptime_s > 0):
         raise ValueError(f"uptime_s must be finite and above 0, not {uptime_s}")
@@ -42,13 +38,9 @@ def unavailability(uptime_s: float, recovery_s: float) -> float:
 
 
 def system_unavailability(replicas: Iterable[float]) -> float:
-    """Return the fraction of time that no replica answers.
+    """Return the fraction of time that no replica answers, by each one's unavailability.
 
-    Args:
-        replicas: The unavailability of each, in [0, 1]. Of none, nothing ever answers.
-
-    Raises:
-        ValueError: One is out of range.
+    Raises ValueError: one is not in [0, 1].
     """
     product = 1.0
     for value in replicas:
@@ -59,17 +51,10 @@ def system_unavailability(replicas: Iterable[float]) -> float:
 
 
 def replicas_needed(availability: float, target: float, *, limit: int = 16) -> int:
-    """Return the fewest replicas that together reach a target availability.
+    """Return the fewest replicas that together reach a target availability, if independent.
 
-    All n are down with probability ``(1 - availability) ** n``.
-
-    Args:
-        availability: Fraction of time that one replica answers, in (0, 1].
-        target: Fraction of time that at least one must answer, in (0, 1).
-        limit: The most replicas to consider.
-
-    Raises:
-        ValueError: An argument is out of range, or ``limit`` is too low.
+    `availability` is one replica's, in (0, 1]; `target` is in (0, 1). Raises ValueError: an
+    argument is out of range, or `limit` is too low.
     """
     if not 0 < availability <= 1:
         raise ValueError(f"availability must be above 0 and at most 1, not {availability}")

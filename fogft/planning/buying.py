@@ -1,9 +1,5 @@
 """Turn needs into launches, within surge, budget and offers. Pure.
 
-Where a group mixes spot and on-demand, its first `base` replicas are on demand and the rest
-spot, besides on-demand ones that stand in (`fallback`).
-
-Owns: which market a launch is bought on, and what is said when it cannot be.
 Not here: the order among offers (`placement`) and what is needed (`needs`).
 """
 

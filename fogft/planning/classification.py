@@ -1,6 +1,5 @@
 """Classify every machine of a pool: kept, to be replaced, or lost. Pure.
 
-Owns: why a working replica is not wanted as it is.
 Not here: health (`health`), and moving those that could be better placed (`migration`).
 """
 

@@ -1,10 +1,7 @@
 """The cost of a pool per hour and month, egress included. Pure arithmetic.
 
-Clouds charge for what leaves them, so for responses: one from each replica that is asked,
-the late ones included. Requests come in for nothing.
-
-Owns: egress prices (dated) and sums.
-Not here: machines' prices (offers carry them).
+Clouds charge for what leaves them: one response from each replica that is asked, the late ones
+included.
 """
 
 from __future__ import annotations

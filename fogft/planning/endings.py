@@ -4,7 +4,6 @@ The law: a replica that serves, or may serve, ends only if enough others serve. 
 never counts one that is itself to go, has a notice, or is silent. One whose link is up is
 first marked as draining, so that requests stop going there, and ends when it is idle.
 
-Owns: the order of endings and the two steps of draining.
 Not here: why a replica should go (`classification`, `health`).
 """
 
@@ -146,9 +145,7 @@ class _Chooser:
     ) -> None:
         """End up to `count`, in order, where the law allows it.
 
-        Args:
-            coming: So many of those that are counted have yet to serve. While they are needed,
-                one that should come back stays: its successor may never come.
+        While `coming` ones, which have yet to serve, are needed, one that should come back stays.
         """
         for replica in replicas:
             if count <= 0:

@@ -1,10 +1,8 @@
 """Explain a plan: the offers considered, those chosen, and why others were not. Pure.
 
-The pool is planned by the planner itself, from nothing; then each offer that was not chosen
-is held against each that was, and the comparison that it lost last is told: an offer that
-lost by its price came nearer than one that lost by the spread.
+Each offer that was not chosen is held against each that was, and the comparison that it lost last
+is told: one that lost by its price came nearer than one that lost by the spread.
 
-Owns: reasons, and the figures beside them.
 Not here: the decisions (`planner`) and how they are shown (`fogft.cli`).
 """
 
@@ -235,10 +233,10 @@ class _Reasons:
         if pick.budget is not None and offer.usd_per_hour > pick.budget + 1e-9:
             left = max(0.0, pick.budget)
             return 1, Reason(Cause.OVER_BUDGET, slot=slot, limit_usd_per_hour=left)
-        ours, theirs = self._rank(offer, pick), self._rank(chosen, pick)
-        for level, domain in enumerate(offer.placement.domains):
-            if ours[level] > theirs[level]:
-                count = pick.crowd[domain]
+        both = zip(offer.placement.domains, chosen.placement.domains, strict=True)
+        for level, (domain, other) in enumerate(both):
+            count = pick.crowd[domain]
+            if count > pick.crowd[other]:
                 crowded = Reason(Cause.CROWDED, slot=slot, location=domain, count=count)
                 return 3 + level, crowded
         return 6, replace(
@@ -246,9 +244,6 @@ class _Reasons:
             slot=slot,
             because=(self._score(Cause.CHOSEN, chosen),),
         )
-
-    def _rank(self, offer: Offer, pick: _Pick) -> tuple[int, ...]:
-        return tuple(pick.crowd[domain] for domain in offer.placement.domains)
 
     def _score(self, cause: Cause, offer: Offer) -> Reason:
         return Reason(

@@ -1,16 +1,10 @@
 """On-demand machines that fill in while too few spot machines are ready. Pure.
 
-What counts is readiness: whether enough replicas serve, not whether every location refused.
-Where a group has `fallback`, on-demand machines in slots of their own stand in. They are ordered
-the moment that a spot replica is lost, is noticed or is refused, beside the order of
-another spot machine, and end once enough others have been ready for `SETTLED_S`.
+Where a group has `fallback`, on-demand machines in slots of their own stand in, ordered beside
+another spot machine. What counts is readiness, not whether every location refused. While an
+on-demand machine serves, which nobody takes away, spot is asked for alone, and another one stands
+in only once that was refused. Nor is a slot short whose first machine is still booting.
 
-Once all are lost, more than are wanted boot, as `max_surge` allows, until the first of them
-serves; two in place of a lone one, since they cost the more. While an on-demand machine serves,
-which nobody takes away, spot is asked for alone, and another one stands in only once that was
-refused. Nor is a slot short whose first machine is still booting.
-
-Owns: who stands in, and how many are missing.
 Not here: where they are bought (`buying`) and the two steps of an ending (`endings`).
 """
 
@@ -39,8 +33,7 @@ def held(
 ) -> int:
     """Return how many of a group's stand-ins replace spot machines, for which no search is made.
 
-    One, where `OFTEN` were lost within `OFTEN_S`. None in place of a lone one: that would be to
-    give up spot machines.
+    None in place of a lone one: that would be to give up spot machines.
     """
     spot = wanted - group.on_demand.base
     if not group.on_demand.fallback or spot < 2:
@@ -76,13 +69,7 @@ def missing(
     surge: int,
     safe: bool,
 ) -> int:
-    """Return how many more stand-ins a group needs, for so many replicas to be ready.
-
-    Args:
-        here: The group's machines, without `standing_in`.
-        surge: So many more boot while nobody serves.
-        safe: A replica serves that cannot be preempted.
-    """
+    """Return how many more stand-ins a group needs; `safe`: one serves that is not preempted."""
     kept = (*here.good, *here.replaced)
     covered = sum(
         s.ever_ready or is_first(s.slot, s.id.generation, history, safe=safe) for s in kept

@@ -2,15 +2,10 @@
 
     score = ln(usd_per_hour) + weight * ln(round trip)
 
-The lower the better. In logarithms only ratios count: with equal weights, half the price
-makes up for twice the round trip. So the order of two offers depends on those two alone,
-never on what else is offered, and a margin of hysteresis is a percentage.
+The lower the better. In logarithms the order of two offers depends on those two alone, and a
+margin of hysteresis is a percentage. The last tuple of offers keeps what was worked out of it:
+thousands take longer to sort than a whole plan takes.
 
-Thousands of offers take longer to sort than a whole plan takes, and they change with the prices,
-not with the plans. So the last tuple of offers keeps what was worked out of it, by question. The
-results are those of working it out each time; a test compares them.
-
-Owns: which offers can be bought at all, and their order.
 Not here: choosing among them (`placement`).
 """
 

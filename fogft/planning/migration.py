@@ -1,19 +1,9 @@
 """Move a replica to where it would be launched today if that is much better. Pure.
 
-Only a pool that is whole and quiet moves anything, one replica at a time, the new one first.
-A replica moves when
+Only a pool that is whole and quiet moves anything, one replica at a time, the new one first, for
+the reasons in docs/design/planner.md. To move back, prices must swing by twice `gain`: so with
+steady offers every move lowers the crowding or the sum of the scores, and moves come to an end.
 
-* it is on demand and should be spot, or the other way round; or
-* its new place would leave the pool better spread over clouds, regions or zones, and is not known
-  to lose more than its own by a loss in four hours, which regions that go as a whole outweigh; or
-* the spread stays as it is, and its score falls by `gain`.
-
-It has then been ready for `stay_s`, and the new place neither backs off nor has it refused within
-an hour. To move back, they must swing by twice as much: so while prices
-waver within it nobody returns to where he was, and with steady offers every move lowers the
-crowding or the sum of the scores, so that moves come to an end.
-
-Owns: who moves, and why.
 Not here: carrying it out, which is a replacement like any other (`needs`, `buying`).
 """
 

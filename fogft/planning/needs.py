@@ -1,6 +1,5 @@
 """Which launches are needed: missing replicas at once, replacements one at a time. Pure.
 
-Owns: slots and reasons of launches.
 Not here: where they go and whether they can be paid (`buying`).
 """
 

@@ -1,13 +1,9 @@
 """Choose where the next replica goes. Pure and deterministic.
 
-Spread first, price and distance second: replicas in one zone are preempted together, and a
-cloud or a region fails as a whole. So the offer whose cloud, then region, then zone holds
-the fewest of our replicas wins; among those the one with the lowest score; among those
-the cheaper one; among those one drawn by lot, for each pool another.
+Spread first, price and distance second: replicas in one zone are preempted together, and a cloud or
+a region fails as a whole. What is equal in both is drawn by lot, for each pool another.
 
-Owns: the rank of an offer and the reason when none is left.
-Not here: the order within a rank (`listing`), how long a location is avoided
-(`observed.backoff`) and how many are needed (`planner`).
+Not here: the order within a rank (`listing`), how long a location is avoided (`observed.backoff`).
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
 """Decide how a pool should change. Pure: no clock, no cloud, no randomness.
 
-The reconciler observes, calls `plan` and applies the result. All that the decision
-depends on is an argument, so a bug report that quotes the arguments is a failing test,
-and planning again after a crash is always safe. docs/design/planner.md has the flow.
-
-Owns: the order of the steps, and what holds the pool within its cap.
-Not here: the steps: how many (`sizing`), who is ill (`health`), who is what
-(`classification`), what is missing (`needs`), where it goes (`buying`, `placement`), who moves
-(`migration`), who ends (`endings`).
+The reconciler observes, calls `plan` and applies the result. All that the decision depends on is an
+argument, so planning again after a crash is always safe. Here are the order of the steps, and what
+holds the pool within its cap. docs/design/planner.md has the flow.
 """
 
 from __future__ import annotations
@@ -73,8 +68,7 @@ def plan(
 ) -> Plan:
     """Plan changes that bring the pool closer to its spec, within the safety rules.
 
-    It is planned again on the world as it is once a plan is under way, until nothing is added: a
-    launch makes a replica superfluous, an ending leaves another one the last of its region.
+    It is planned again on the world as it is once a plan is under way, until nothing is added.
 
     `health` is what `judge` makes of these very arguments, where that is known already.
     """

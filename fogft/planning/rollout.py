@@ -1,12 +1,9 @@
 """Roll out a changed pool file replica by replica, or roll it back. Pure.
 
 A *version* is what a replica runs: `replica_hash` names it. The *good* file is the last one with
-which the pool was wholly ready. While another version takes its place, this judges the new
-version by its own replicas alone; the first proof against it ends the update, for good.
+which the pool was wholly ready. Rules: docs/design/rolling-update.md.
 
-Owns: what speaks against a version, when an update is done, and in what order it goes.
 Not here: launches and endings (`planner`), what is remembered (`fogft.pool.manager.updating`).
-Rules: docs/design/rolling-update.md.
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
 """Decide how many replicas are wanted now, and up to what price. Pure.
 
-The pool file's number, or the one that its availability target needs; the schedule's within
-a window; the user's own when he has scaled. Each group gets its share, and services that
-ask for more get replicas that carry them alone.
+A target's number is that of a pool laid out from nothing over all that is offered: it depends on
+the offers alone, not on what runs, so it does not change with every preemption.
 
-A target's number is that of a pool laid out from nothing over all that is offered: it
-depends on the offers alone, not on what runs, so it does not change with every preemption.
-
-Owns: numbers and the cap.
 Not here: what is missing (`planner`), the arithmetic (`availability`).
 """
 

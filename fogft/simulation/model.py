@@ -1,10 +1,6 @@
 """The generator of spot markets: its parameters, and the resulting times with capacity.
 
-A zone is struck now and then, and each strike decides anew whether it has room: by chance,
-or by the regime (scarcity or plenty) of its region, its cloud or the world. Zones are alike
-because they follow the same regimes, and because some strikes meet a whole region at once.
-
-Every random number comes from the generator handed in.
+docs/design/simulation.md tells how. Every random number comes from the generator handed in.
 Not here: finding the numbers in traces (`fitting`).
 """
 

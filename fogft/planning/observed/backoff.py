@@ -1,20 +1,9 @@
-"""How long a location is avoided after failures. Pure.
+"""How long a location is avoided after failures. Pure. The rule: docs/design/planner.md.
 
-A location sells spot machines and on-demand ones; each supply backs off by itself. Failures are
-refused launches (no capacity, no quota), launches that failed, and replicas that died young. After
-n failures in a row a supply is not tried for
-
-    min(BASE_S * 2 ** (n - 1), LIMIT_S)
-
-seconds from the last one; NO_ROOM_S in place of BASE_S where it had no room, so that a round over
-all locations ends before the first is asked again. A replica that becomes ready there, or
-FORGIVE_S without a failure, ends it. A failed `setup`, or a service that is not ready in time, is
-the pool file's fault, not the location's: it counts against `EVERYWHERE`, so that a broken file is
-not tried in one location after the other.
-
-While all supplies back off, the one whose last failure is oldest is tried, one try in EAGER_S. A
-replica that could move, but need not, asks no location that refused within FORGIVE_S and has had
-none ready since. Events from the future, left by a clock that was set back, count for nothing.
+A location's spot machines and its on-demand ones are two supplies, each of which backs off by
+itself. What is the pool file's fault counts against `EVERYWHERE`: a broken file is not tried in one
+location after the other. NO_ROOM_S lets a round over all locations end before the first is asked
+again. Events from the future, left by a clock that was set back, count for nothing.
 """
 
 from __future__ import annotations

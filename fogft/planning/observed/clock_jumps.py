@@ -1,12 +1,9 @@
 """Detect that the wall clock was set, or that the machine slept. Pure: readings come in.
 
-All that is remembered bears the time of the clock on the wall, for that outlives a process and a
-reboot. When somebody sets it, a launch under way would look late, a rest over, a stay long
-enough. So two steady clocks are read beside it: one that stands still while the machine sleeps,
-and one that does not. What the wall clock gained on the first is no time in which anybody looked:
-all that is remembered moves along with it (`history`), so that durations stay what they were.
+All that is remembered bears the time of the clock on the wall, for that outlives a reboot. What it
+gains on a steady clock that stands still while the machine sleeps is no time in which anybody
+looked: all that is remembered moves along with it, so that durations stay what they were.
 
-Owns: how far the clock was moved, and for how long the time of day is in doubt.
 Not here: reading clocks (`fogft.pool.manager.timekeeping`), moving what is remembered (`history`).
 """
 

@@ -1,14 +1,9 @@
 """Loss rates of spot machines at each location, learned from this pool's history. Pure.
 
-The rate is (PRIOR_LOSSES + losses) / (PRIOR_S + seconds lived there), what is longer ago
-counting for less: by half after HALF_LIFE_S. A launch that was refused for want of room is
-REFUSED of a loss. So a location that was never asked has the prior's rate, one loss tells
-something and ten tell much, and in time all is forgiven.
+The rate is (PRIOR_LOSSES + losses) / (PRIOR_S + seconds lived there), what is longer ago counting
+for less. It is worked out as of the last multiple of EVERY_S, losses since included, so that it
+does not depend on who asks when.
 
-It is worked out as of the last multiple of EVERY_S, losses since included, so that it does not
-depend on who asks when.
-
-Owns: the rate and what it is worth in a score.
 Not here: the rest after refusals (`backoff`).
 """
 

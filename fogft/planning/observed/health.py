@@ -1,11 +1,7 @@
 """Judge the health of every replica from its cloud and its links. Pure.
 
-The cloud says whether a machine exists; the links say whether it answers. Neither alone
-replaces anything: a machine that the cloud lists and that is silent may be behind a dead
-uplink, so silence counts only while another replica answers.
-
-Owns: each replica's phase and verdict, and the suspicion against the robot's own uplink.
-Not here: what to do about it (`planner`).
+Neither alone replaces anything: a machine that the cloud lists and that is silent may be behind a
+dead uplink, so silence counts only while another replica answers.
 """
 
 from __future__ import annotations

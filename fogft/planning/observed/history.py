@@ -1,12 +1,10 @@
-"""The history of a pool's replicas: events, and the facts derived from them.
+"""The history of a pool's replicas: events in, facts out. Pure.
 
-The cloud's list says what is; history says what was: which generations are used up,
-who was ever ready, which locations failed, and since when a replica drains. It is
-the only memory that must outlive a crash of the manager. Pure: events in, facts out.
+The cloud's list says what is; history says what was. It is the only memory that must outlive a
+crash of the manager.
 
-Owns: the events and the facts derived from them.
-Not here: the file they are stored in (`fogft.pool.folder.history_file`) and what to make of
-failures (`backoff`).
+Not here: the file it is stored in (`fogft.pool.folder.history_file`), what to make of failures
+(`backoff`).
 """
 
 from __future__ import annotations
@@ -336,12 +334,9 @@ def compacted(
 ) -> list[Event]:
     """Drop events that no decision needs any more.
 
-    Kept whole: launches that are open, or to which something happened within `KEPT_S`.
-    Kept in part: the latest launch of each slot, so that generations stay used; the latest failed
-    launches of a version, and one that was ready, so that it is known what was given up. Of a
-    kept launch's comings and goings of readiness the first READY and the last two stay. That the
-    clock was set is never forgotten, that the machine slept only with all that was before. What
-    no decision reads (`TOLD_ONLY`) stays for `KEPT_S`. `history` is what follows from the events.
+    Kept are launches that are open, or to which something happened within `KEPT_S`, the latest of
+    each slot, and what proves that a version was given up. Of comings and goings of readiness the
+    first READY and the last two stay. That the clock was set is never forgotten.
     """
     events = list(events)
     history = history or History(events)

@@ -1,13 +1,9 @@
 """Which versions are no longer launched, and the limit of launches per hour. Pure.
 
-A version (`replica_hash`) whose launches fail for its own reasons is given up: once a slot has had
-GIVE_UP_AFTER launches of it that failed so, and none of it was ever ready anywhere. Nothing of it
-is launched until the file changes or the user asks for it again. Reasons of its own are a `setup`
-that fails or hangs, and a service that is not ready in time; what a cloud refuses or takes away is
-none.
-
-Whatever else is wrong, no more than LAUNCHES_AN_HOUR machines a replica are had within an hour;
-spot machines and those on demand are counted apart, so that what restores readiness is not held up.
+A version (`replica_hash`) is given up once a slot has had GIVE_UP_AFTER launches of it that failed
+for its own reasons, and none of it was ever ready anywhere; until the file changes or the user asks
+again. Spot machines and those on demand are counted apart, so that what restores readiness is not
+held up by the limit.
 """
 
 from __future__ import annotations

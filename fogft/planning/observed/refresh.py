@@ -1,12 +1,9 @@
 """Which replicas a caching cloud is asked about: those whose links fell silent. Pure.
 
-Such a cloud's list may still show what was preempted, so the silence of a link is a reason to
-look; and to look only, since the answer may well be that the machine is there. So nobody waits
-until a link is suspect: a probe whose answer is late is enough. Asked at once, then less and
-less often while nothing changes, and for the whole pool when all links are silent: losing every
-replica together looks like a dead uplink until the cloud has told.
+Such a cloud's list may still show what was preempted. A late answer to a probe is a reason to look,
+and to look only; all that are silent are asked about, for losing every replica together looks like
+a dead uplink until the cloud has told.
 
-Owns: who is due.
 Not here: asking (`fogft.cloud`), on a thread of its own (`fogft.pool.manager.operations`).
 """
 

@@ -1,10 +1,8 @@
 """Service discovery for pool files that list none: services most replicas advertise. Pure.
 
 One replica's word changes nothing: it may be broken, or in wrong hands. What was agreed on is kept
-as long as the pool's replicas run the same: a replica that dies, or all of them, takes no name from
-the robot. A changed file begins anew, once most replicas that run it have told what they offer.
+as long as the pool's replicas run the same: a replica that dies takes no name from the robot.
 
-Owns: what is known, how it grows, and who is outvoted.
 Not here: what a replica offers (`fogft.proxy.replica.offering`), the file
 (`fogft.pool.folder.discovered`).
 """
