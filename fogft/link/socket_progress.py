@@ -129,17 +129,14 @@ class SocketProgress:
         full = sending or (last.unsent > 0 and flow.unsent > 0)
         self.throughput.look(moved, since_s, now, queued=full)
         if sending or (queued and flow.outstanding >= BULK_BYTES):
-            self._measured(moved / since_s)
+            rate, old = moved / since_s, self.bytes_per_s
+            self.bytes_per_s = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
         if (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES:
             waited_s, self._waited_s = self._waited_s, 0.0
             return waited_s + since_s
         # Acknowledgements come in steps: what was waited for one counts when it has come.
         self._waited_s = self._waited_s + since_s if queued else 0.0
         return 0.0
-
-    def _measured(self, rate: float) -> None:
-        old = self.bytes_per_s
-        self.bytes_per_s = rate if old is None else old + _SHARE_OF_NEW * (rate - old)
 
     def left_bytes(self, now: float, bytes_per_s: float) -> float:
         """Return how many of the outstanding bytes have not arrived yet."""

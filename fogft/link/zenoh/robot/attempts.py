@@ -277,11 +277,9 @@ class Attempts:
 
     def _tell(self) -> None:
         self._telling = False
-        ids = self._cancellations.take() if self._cancellations is not None else []
-        if not ids:
-            return
         try:
-            self._outlet.cancel(ids)
+            if self._cancellations is not None and (ids := self._cancellations.take()):
+                self._outlet.cancel(ids)
         except Exception as error:
             self._lose(error)
 
