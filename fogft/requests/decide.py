@@ -122,8 +122,8 @@ class Decide:
         """Note that a request has ended in any way."""
 
     def hears_out(self, request: bytes) -> bool:
-        """Whether replicas keep working on a request that has ended."""
-        return False
+        """Whether replicas keep working on a request that has ended: they must have it."""
+        return self.replicates
 
     def report(self) -> dict[str, Any]:
         """Return counters and state, for people."""

@@ -3,7 +3,7 @@
 Once k ballots agree, every ballot is judged by that answer, also those that come later. Without
 agreement nobody is blamed: two that differ do not tell who is wrong.
 
-Not here: what agreeing means (`fogft.ros.comparison`), requests and deadlines (`pending`).
+Not here: what agreeing means (`fogft.ros.messages`), requests and deadlines (`pending`).
 """
 
 from __future__ import annotations

@@ -24,8 +24,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.rmw_zenoh import naming
-from fogft.ros.pacing.client_probes import NodeProbes
-from fogft.ros.pacing.pacer import Pacer
+from fogft.ros.pacing.pacer import NodeProbes, Pacer
 
 log = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ from fogft.rmw_zenoh import naming
 from fogft.rmw_zenoh.entities import Client, Server
 from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
 from fogft.ros import vendors
-from fogft.ros.pacing.client_probes import NodeProbes
+from fogft.ros.pacing.pacer import NodeProbes
 
 log = logging.getLogger(__name__)
 

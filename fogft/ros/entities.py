@@ -18,8 +18,7 @@ from typing import Any
 
 from fogft.counters import Counters
 from fogft.errors import RosError
-from fogft.ros.pacing.client_probes import NodeProbes
-from fogft.ros.pacing.pacer import Pacer
+from fogft.ros.pacing.pacer import NodeProbes, Pacer
 from fogft.ros.port import OnBurst
 from fogft.ros.serialised import ClientEnd, ServiceEnd
 

@@ -3,23 +3,26 @@
 CycloneDDS ends the process over a message of fewer than four bytes, and takes some that Fast DDS
 refuses. So bytes are walked along their type first (`fogft.model.cdr`).
 
-Owns: rclpy's two functions, default responses, boolean fields, one status list of an action out of
-those of its replicas. Not here: C messages (`serialised`), which are checked by the same walk;
-which status counts (`fogft.topics.goals`).
+Owns: rclpy's two functions, default responses, boolean fields, comparing responses, one status list
+of an action out of its replicas'. Not here: C messages (`serialised`), votes
+(`fogft.requests.votes`), which status counts (`fogft.topics.goals`).
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import Any
 
 from fogft.errors import RosError, Unreadable
 from fogft.model.cdr import NUMBER_BYTES
-from fogft.ros.types import load_service_type, shape
+from fogft.model.type_definition import nested
+from fogft.ros.types import load_service_type, nested_type, shape
 from fogft.topics import goals
 
 _XCDR1_HEADERS = (b"\x00\x00", b"\x00\x01")  # big and little endian
+_FLOAT = re.compile(r"(sequence<)?(float|double)\b.*")  # one, or a list of them
 
 
 def to_bytes(message: Any) -> bytes:
@@ -33,16 +36,13 @@ def from_bytes(payload: bytes, message_type: Any) -> Any:
     """Deserialise a message. Raises Unreadable."""
     from rclpy.serialization import deserialize_message
 
-    fault = _shape_of(message_type).fault(payload)
+    fault = shape(message_type).fault(payload)
     if not fault:
         try:
             return deserialize_message(payload, message_type)
         except Exception as error:  # rclpy's own error types are private and vary by release
             fault = str(error)
     raise Unreadable(f"{len(payload)} bytes are not a serialised {message_type.__name__}: {fault}")
-
-
-_shape_of = lru_cache(maxsize=256)(shape)
 
 
 def default_response(name: str) -> bytes:
@@ -118,3 +118,71 @@ def merged_status(said: Mapping[int, bytes]) -> bytes | None:
         entries[goal].status = status
         found.status_list.append(entries[goal])
     return to_bytes(found)
+
+
+class Comparison:
+    """Compares responses of a service type field by field: padding between them is anything.
+
+    Args:
+        tolerances: Path of a float field -> how far two values may be apart. A path leads
+            through lists as through their elements. All else must be equal.
+
+    Raises:
+        RosError: The type cannot be loaded, or has no such float field.
+    """
+
+    def __init__(self, type_name: str, tolerances: Mapping[str, float]) -> None:
+        self._response = load_service_type(type_name).Response
+        self._tolerances = dict(tolerances)
+        for path in tolerances:
+            _check_float(self._response, type_name, path)
+
+    def read(self, payload: bytes) -> Any:
+        """Return the message. Raises Unreadable."""
+        return from_bytes(payload, self._response)
+
+    def agree(self, one: Any, other: Any, path: str = "") -> bool:
+        """Whether two messages, or parts at a path, are the same within the tolerances.
+
+        NaN agrees with NaN.
+        """
+        if isinstance(one, float):
+            close = abs(one - other) <= self._tolerances.get(path, 0.0)
+            return one == other or close or (math.isnan(one) and math.isnan(other))
+        if hasattr(one, "get_fields_and_field_types"):
+            prefix = f"{path}." if path else ""
+            return all(
+                self.agree(getattr(one, name), getattr(other, name), prefix + name)
+                for name in one.get_fields_and_field_types()
+            )
+        if isinstance(one, (str, bytes, bool, int)):
+            return bool(one == other)
+        return len(one) == len(other) and self._same_elements(one, other, path)
+
+    def _same_elements(self, one: Any, other: Any, path: str) -> bool:
+        if hasattr(one, "tobytes"):  # numbers, side by side: usually there is no difference at all
+            if one.tobytes() == other.tobytes():
+                return True
+            kind = getattr(one, "typecode", None) or one.dtype.kind
+            if kind not in "fd":
+                return False
+        return all(self.agree(_plain(a), _plain(b), path) for a, b in zip(one, other, strict=True))
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if hasattr(value, "item") else value
+
+
+def _check_float(message_type: Any, type_name: str, path: str) -> None:
+    *parents, last = path.split(".")
+    for parent in parents:
+        kind = nested(message_type.get_fields_and_field_types().get(parent, ""))
+        message_type = nested_type(kind) if kind else None
+        if message_type is None:
+            break
+    fields = message_type.get_fields_and_field_types() if message_type else {}
+    if not _FLOAT.fullmatch(fields.get(last, "")):
+        raise RosError(
+            f"the response of `{type_name}` has no float field `{path}`",
+            "write the path from the response, such as `plan.poses.pose.position.x`",
+        )

@@ -25,7 +25,7 @@ from fogft.model.topic import TopicSpec
 from fogft.ros import cyclone, spdp, topic_ends, vendors
 from fogft.ros.entities import Client, Server
 from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
-from fogft.ros.pacing.client_probes import NodeProbes
+from fogft.ros.pacing.pacer import NodeProbes
 from fogft.ros.port import OnBurst
 from fogft.ros.serialised import ClientEnd, ServiceEnd, self_test
 from fogft.ros.shared_memory import PortWatch

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fogft.errors import RosError
-from fogft.ros.pacing.client_probes import KEPT, NodeProbes
+from fogft.ros.pacing.pacer import KEPT, NodeProbes
 
 CLIENT = b"c" * 16
 

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from fogft.errors import RosError
-from fogft.ros.comparison import Comparison
+from fogft.ros.messages import Comparison
 from fogft.ros.types import trouble
 
 pytestmark = pytest.mark.ros

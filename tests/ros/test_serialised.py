@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import RosError
 from fogft.ros import memory_tuning, messages, rcl, serialised
-from fogft.ros.comparison import Comparison
+from fogft.ros.messages import Comparison
 from fogft.ros.node import SerialisedNode
 from fogft.ros.types import load_service_type
 from tests.nightly import by_day

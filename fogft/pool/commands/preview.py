@@ -202,8 +202,7 @@ def _tested(
 
 def checks_here() -> Checks:
     """Return the checks that depend on this machine: installed types and their fields."""
-    from fogft.ros.comparison import Comparison
-    from fogft.ros.messages import bool_field
+    from fogft.ros.messages import Comparison, bool_field
     from fogft.ros.state_bytes import StateBytes
     from fogft.ros.types import load_type, trouble
 

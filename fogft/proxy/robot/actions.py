@@ -112,10 +112,6 @@ class _CancelPart(Decide):
     ) -> None:
         self.declined(id, replica, self._action.clock())
 
-    def hears_out(self, request: bytes) -> bool:
-        """All replicas shall be told, whoever was first."""
-        return True
-
     def report(self) -> dict[str, Any]:
         return {"to_cancel": len(self._action.to_cancel)}
 
@@ -191,10 +187,6 @@ class _GoalPart(Decide):
         with self._action.lock:
             if goal not in self._action.goals:
                 self._action.goals.ended(goal)
-
-    def hears_out(self, request: bytes) -> bool:
-        """All replicas shall have the goal, whoever was first."""
-        return True
 
     def report(self) -> dict[str, Any]:
         return {"goals": self._action.goals.kept}

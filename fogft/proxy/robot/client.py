@@ -158,8 +158,9 @@ class ClientProxy:
                 self._through_gateways = through
                 for service in self._services.values():
                     self._adopt(service)
-            for id in self.links.missing(members):
-                self._drop(id)
+            for link in self.links:
+                if link.peer.id not in members:
+                    self._drop(link.peer.id)
             for member in members.values():
                 self.links.reach(member)
         self.look_again()

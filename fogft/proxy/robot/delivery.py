@@ -60,8 +60,6 @@ class Delivery:
             unasked = replace(old, after_s=None, while_none_ready=False)
             requests.fallback.spec = spec.fallback or unasked
 
-    # -- without the lock -----------------------------------------------------------------
-
     def give(self, pending: Pending, payload: bytes) -> None:
         """Send a response to its caller. A failure affects no other request."""
         try:
@@ -112,8 +110,6 @@ class Delivery:
                 self._ledger.requests.fallback.ended(request)
         if response is not None:
             self.give(pending, response)
-
-    # -- the fallback ---------------------------------------------------------------------
 
     def tick(self, now: float, *, able: bool) -> float:
         """Call the fallback for due requests, and give up the rest; return when to call again."""

@@ -193,10 +193,6 @@ class Links:
         """Go over all of them; safe while another thread changes them."""
         return iter(list(self._links.values()))
 
-    def missing(self, members: Collection[ReplicaId]) -> list[ReplicaId]:
-        """Return the linked replicas that are no longer members."""
-        return [id for id in self._links if id not in members]
-
     def reach(self, member: Member) -> None:
         """Ensure a link to a member; redial it if it has moved."""
         old = self._members.get(member.id)

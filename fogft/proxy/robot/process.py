@@ -190,7 +190,6 @@ class _Running:
     ) -> Dispatcher:
         """Create a service's dispatcher. Raises RosError: its type is needed and not usable."""
         from fogft.ros import messages
-        from fogft.ros.comparison import Comparison
 
         pool_uid = self.config.pool_uid
         fault_of = middleware.fault_of(spec.type, RESPONSE)
@@ -207,7 +206,7 @@ class _Running:
             return make(decide=order, max_pending_bytes=_STATEFUL_BYTES)
         ok_of = functools.partial(messages.bool_field, spec.type)
         if spec.quorum > 1:
-            comparison = Comparison(spec.type, spec.tolerance)
+            comparison = messages.Comparison(spec.type, spec.tolerance)
 
             def flagged(replica: int, count: int) -> None:
                 log.error("replica_disagrees service=%s replica=%s count=%d",

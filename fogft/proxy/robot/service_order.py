@@ -120,10 +120,6 @@ class ServiceOrder(Decide):
             del self._requests[number]
             self._term.abandon(number)
 
-    def hears_out(self, request: bytes) -> bool:
-        """Return True: all replicas apply all requests."""
-        return True
-
     # -- what replicas say ----------------------------------------------------------------
 
     def request_of(self, id: bytes) -> bytes | None:

@@ -4,12 +4,13 @@ A client keeps the last ten responses that it has not taken yet and silently los
 queue has no room for waits here. One that discovery has not found yet gets its first response again
 until it has; the others wait behind it.
 
-Owns: the responses that wait, and the thread that sends them. Not here: when one may be sent
-(`pace`), sending it (`entities`), asking a client's node (`client_probes`).
+Owns: the responses that wait, the thread that sends them, and probes of clients' nodes. Not here:
+when one may be sent (`pace`), sending it (`entities`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import threading
 import time
@@ -19,9 +20,8 @@ from operator import itemgetter
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.ros.pacing.client_probes import NodeProbes
 from fogft.ros.pacing.pace import EVERY_S, ClientPace, Pace, Probing
-from fogft.ros.port import NotFoundYet
+from fogft.ros.port import NotFoundYet, RosClient
 
 log = logging.getLogger(__name__)
 
@@ -29,6 +29,62 @@ log = logging.getLogger(__name__)
 _ASK_EVERY_S, _ASK_LIMIT_S, _ASK_AGAIN_S = 0.02, 2.0, 10.0
 _LOOK_EVERY_S = 0.2
 _GUID_BYTES = 16
+_SERVICE, _TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTypes"
+_OF_NO_PARAMETER = b"\x00\x01\x00\x00" + bytes(4)  # a list of names, which is empty
+KEPT = 64
+
+
+class NodeProbes:
+    """Probes of the nodes in one ROS domain, for the clients of all services. Any thread.
+
+    A node answers the services of its parameters by the same executor that takes its clients'
+    responses, one in each turn: an answer means that there was a turn.
+
+    Args:
+        make_client: As `RosNode.client`.
+        same_node_serves: Returns the full name of the service of a last name, of the node that a
+            client of a service belongs to: None while it is not discovered, empty without one.
+    """
+
+    def __init__(
+        self,
+        make_client: Callable[[str, str], RosClient],
+        same_node_serves: Callable[[str, str, bytes], str | None],
+    ) -> None:
+        self._make_client, self._same_node_serves = make_client, same_node_serves
+        self._by_name: dict[str, RosClient] = {}
+        self._by_client: dict[bytes, RosClient] = {}
+        self._lock = threading.Lock()
+
+    def answers(self, service: str, client: bytes) -> bool | None:
+        """Whether the node of a service's client answers probes; None while it is not known."""
+        asked = self._same_node_serves(_SERVICE, service, client)
+        if not asked:
+            return None if asked is None else False
+        with self._lock:
+            end = self._by_name.get(asked)
+            if end is None:
+                if len(self._by_name) >= KEPT:
+                    self._by_name.pop(next(iter(self._by_name))).close()
+                try:
+                    end = self._by_name[asked] = self._make_client(asked, _TYPE)
+                except RosError:
+                    return False
+            if not end.available():
+                return None
+            if len(self._by_client) >= 4 * KEPT:  # long gone
+                self._by_client.pop(next(iter(self._by_client)))
+            self._by_client[client] = end
+        return True
+
+    def same_node(self, client: bytes, other: bytes) -> bool:
+        """Whether two clients' nodes have one name: one was started again as the other."""
+        return self._by_client.get(client) is self._by_client.get(other)
+
+    def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
+        """Try to send a probe; `on_answer` is called from the take loop, or never."""
+        with contextlib.suppress(KeyError, RosError):
+            self._by_client[client].call(_OF_NO_PARAMETER, lambda _: on_answer())
 
 
 class Pacer:
