@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import random
 import shlex
 import signal
 import subprocess
@@ -172,6 +174,23 @@ def test_terminate_ends_even_what_hides_in_a_session_with_a_clean_environment(lo
     wait_for(lambda: environ(pid) == b"")
     local.cloud.terminate(id)
     assert not processes.alive(pid)
+
+
+def test_terminate_ends_what_a_machine_starts_at_that_moment(local):
+    """Each child has a clean environment, and its parent is gone at once."""
+    name = f"{3600 + random.random()}"
+    id = local.running(spawn=[f"while :; do (env -i setsid sleep {name} &); sleep 0.001; done"]).id
+
+    def left() -> list[int]:
+        found = []
+        for path in Path("/proc").glob("[0-9]*/cmdline"):
+            with contextlib.suppress(OSError):
+                found += [int(path.parent.name)] if name.encode() in path.read_bytes() else []
+        return found
+
+    wait_for(lambda: len(left()) > 20)
+    local.cloud.terminate(id)
+    assert left() == []
 
 
 def test_orphans_of_a_dead_server_end_with_the_machine(local, tmp_path):

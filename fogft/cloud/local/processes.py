@@ -75,12 +75,16 @@ def end(pids: Iterable[int], limit_s: float = _LIMIT_S) -> None:
 
 
 def end_machine(machine: str, *, spare: Collection[int] = ()) -> bool:
-    """End a machine's processes but some, until a look finds none; return if there were any."""
-    ended = False
-    while pids := set(find(machine=machine)) - set(spare):
-        end(pids)
-        ended = True
-    return ended
+    """End a machine's processes but some; return if there were any.
+
+    All are stopped first: of one that dies as it forks, the child might be nobody's descendant.
+    """
+    held: set[int] = set()
+    while new := set(find(machine=machine)) - set(spare) - held:
+        send(new, signal.SIGSTOP)
+        held |= new
+    end(held)
+    return bool(held)
 
 
 def send(pids: Iterable[int], number: signal.Signals) -> None:
