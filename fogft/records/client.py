@@ -186,14 +186,14 @@ class RendezvousClient:
 
     def _assert_own(self, kind: RecordKind, subject: str, own: _Own) -> None:
         """See that what stands for us is what we say now, signed by our present certificate."""
-        held = self._records.get(kind, subject)
-        signed = self._records.signed(kind, subject)
-        if held is not None and signed is not None and held.content == own.content:
+        found = self._records.get(kind, subject)
+        held = None if found is None else found.record
+        if found is not None and found.record.content == own.content:
             if own.sequence is not None:
-                stands = held.order == (own.generation, own.sequence)
+                stands = found.record.order == (own.generation, own.sequence)
             else:
-                renewed = signed.certificate != self._signer.certificate
-                stands = held.generation == own.generation and not renewed
+                renewed = found.signed.certificate != self._signer.certificate
+                stands = found.record.generation == own.generation and not renewed
             if stands:
                 return
         sequence = own.sequence

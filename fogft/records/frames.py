@@ -62,9 +62,6 @@ def frame(message: dict[str, Any]) -> bytes:
     return _LENGTH.pack(len(content)) + content
 
 
-# -- greeting -------------------------------------------------------------------------------
-
-
 def challenge(nonce: bytes, seen_host: str) -> bytes:
     """Return the rendezvous' first message: a nonce to sign, and the caller's host as seen."""
     return frame({"type": "challenge", "v": VERSION, "nonce": nonce.hex(), "seen": seen_host})
@@ -97,9 +94,6 @@ def read_greeting(message: dict[str, Any]) -> tuple[bytes, bytes]:
     if not isinstance(certificate, str) or not isinstance(signature, str):
         raise RecordError("malformed", "a greeting without proof")
     return _hex(certificate), _hex(signature)
-
-
-# -- records --------------------------------------------------------------------------------
 
 
 def ping() -> bytes:

@@ -42,7 +42,9 @@ class Verdict(str, Enum):
 
 
 @dataclass(frozen=True)
-class _Held:
+class Held:
+    """A record that stands, as it was verified."""
+
     record: Record
     signed: SignedRecord
     writer: Writer
@@ -57,10 +59,8 @@ class RecordSet:
         self.last_refusal = ""
         self._verify = verify
         self._limit = limit
-        self._held: dict[Key, _Held] = {}
-        self._revoked: frozenset[str] = frozenset()
-
-    # -- merging ----------------------------------------------------------------------------
+        self._held: dict[Key, Held] = {}
+        self.revoked: frozenset[str] = frozenset()  # common names of certificates
 
     def offer(self, signed: SignedRecord, verify: Verify | None = None) -> Verdict:
         """Add a record if it is valid, by `verify` or the usual check, and newer than its key's."""
@@ -87,21 +87,19 @@ class RecordSet:
             raise RecordError("full", f"a record beyond the {self._limit} that are kept")
         # Last, being the costly step: a flood of old records costs no signature checks.
         writer = verified_writer(record, signed, verify)
-        if writer.common_name in self._revoked:
+        if writer.common_name in self.revoked:
             raise RecordError("revoked", f"the certificate of `{writer.common_name}` is revoked")
-        self._held[record.key] = _Held(record, signed, writer)
+        self._held[record.key] = Held(record, signed, writer)
         if record.kind is RecordKind.REVOCATION:
             self._revoke(revoked_names(record))
         return Verdict.ACCEPTED
 
     def _revoke(self, names: frozenset[str]) -> None:
         """Forget what revoked certificates have signed, whatever its order."""
-        self._revoked = names
+        self.revoked = names
         for key in [k for k, held in self._held.items() if held.writer.common_name in names]:
             if key[0] != RecordKind.REVOCATION.value:
                 del self._held[key]
-
-    # -- exchange ---------------------------------------------------------------------------
 
     def digest(self) -> dict[Key, Order]:
         """Return the current order of each key."""
@@ -118,27 +116,16 @@ class RecordSet:
     def __len__(self) -> int:
         return len(self._held)
 
-    def get(self, kind: RecordKind, subject: str = "") -> Record | None:
-        """Return the current record of a key."""
-        held = self._held.get((kind.value, subject))
-        return None if held is None else held.record
-
-    def signed(self, kind: RecordKind, subject: str = "") -> SignedRecord | None:
-        """Return the current record of a key in its signed form."""
-        held = self._held.get((kind.value, subject))
-        return None if held is None else held.signed
+    def get(self, kind: RecordKind, subject: str = "") -> Held | None:
+        """Return what stands for a key."""
+        return self._held.get((kind.value, subject))
 
     def of(self, kind: RecordKind) -> list[Record]:
         """Return all records of a kind, by subject."""
         return [held.record for key, held in sorted(self._held.items()) if key[0] == kind.value]
 
-    @property
-    def revoked(self) -> frozenset[str]:
-        """The common names of revoked certificates."""
-        return self._revoked
 
-
-def _replaces(record: Record, signed: SignedRecord, held: _Held) -> bool:
+def _replaces(record: Record, signed: SignedRecord, held: Held) -> bool:
     if record.order != held.record.order:
         return record.order > held.record.order
     # A writer that said two things under one number: all must settle on the same one.

@@ -87,7 +87,7 @@ def _pool(paths: PoolPaths) -> None:
         store.good,
         store.intent,
         store.membership,
-        lambda: Lease.take(paths).release(),
+        lambda: Lease(paths).release(),
         lambda: records_cache.read(paths.records),
         lambda: Ledger(paths.credentials).by_hand(),
         lambda: Ledger(paths.credentials).gateways(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 from fogft.errors import RosError
@@ -256,8 +257,9 @@ class FakeListener:
         self.signed: Record | None = None
         self.services: dict[str, str] = {}
 
-    def lease(self) -> Record | None:
-        return self.signed
+    def lease(self) -> Any:
+        found = self.signed
+        return None if found is None else SimpleNamespace(record=found)
 
     def serve(self, services, on_request, on_probe, on_cancel) -> None:
         self.on_cancel = on_cancel

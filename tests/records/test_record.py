@@ -123,7 +123,7 @@ def test_only_the_manager_admits_and_revokes(kind):
     content = {"pool": "p", "members": [], "names": [], "at": 1.0, "lasts_s": 60.0}
     record = Record(UID, kind, "", 9, 9, content)
     held = merged(world.signed(record))
-    assert held.get(kind) == record
+    assert held.get(kind).record == record
     newer = replace(record, sequence=10)
     for role, name in [
         ("replica", ReplicaId(UID, 0, 1).certificate_name),
@@ -131,7 +131,7 @@ def test_only_the_manager_admits_and_revokes(kind):
         ("gateway", certificate_names.gateway(UID, "g")),
     ]:
         assert held.offer(sign_record(newer, world.signer(role, name))) is Verdict.REFUSED
-    assert held.get(kind) == record
+    assert held.get(kind).record == record
 
 
 def test_a_changed_body_is_forged_and_another_pools_is_refused():
@@ -239,7 +239,7 @@ def test_odd_contents_from_the_right_writer_are_refused_or_usable(content, one):
     except ValueError:
         return  # not even its writer can encode it
     held = merged(odd, world.admission(5, 5, world.member(0, 1)))
-    membership = admission(held.get(RecordKind.ADMISSION))
+    membership = admission(held.get(RecordKind.ADMISSION).record)
     assert located(membership, held.of(RecordKind.SLOT)).pool_uid == UID
 
 

@@ -50,15 +50,12 @@ class _Rendezvous:
         verify = Verifier(config.credentials.ca)
         self._records = RecordSet(config.pool_uid, verify)
         cache.restore(config.records, self._records, config.credentials.ca)
-        self._news = False
+        self._news = asyncio.Event()
         self._reported = ""
         self._trouble = ""
         self._server = RendezvousServer(
-            config.listen, config.credentials, verify, Exchange(self._records, self._changed)
+            config.listen, config.credentials, verify, Exchange(self._records, self._news.set)
         )
-
-    def _changed(self) -> None:
-        self._news = True
 
     async def live(self) -> None:
         """Serve until a signal comes."""
@@ -89,9 +86,9 @@ class _Rendezvous:
 
     def _save(self) -> None:
         try:
-            if self._news:
+            if self._news.is_set():
                 cache.write(self._config.records, self._records.lacking({}))
-                self._news = False
+                self._news.clear()
             report = {"pid": os.getpid(), "endpoint": self._server.endpoint}
             report.update(self._server.report())
             if self._status is not None and str(report) != self._reported:

@@ -46,13 +46,9 @@ def clouds_used() -> list[str]:
     return [LOCAL, *([SKY] if (home() / SKY).exists() else [])]
 
 
-def sweep_cloud(name: str) -> Swept:
+def sweep_cloud(name: str, cloud: Cloud | None = None) -> Swept:
     """Return the machines in a cloud that belong to this user's pools but have no manager."""
-    return swept(name, make_cloud(name, Path.cwd()))
-
-
-def swept(name: str, cloud: Cloud) -> Swept:
-    """Do the same for a cloud given by name."""
+    cloud = cloud or make_cloud(name, Path.cwd())
     if not isinstance(cloud, Auditing):
         raise FogftError(f"cloud `{name}` cannot be swept")
     audit = cloud.audit()
@@ -72,7 +68,7 @@ def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
     Its keys were in that folder: no manager can take these machines over.
     """
     try:
-        found = [one.machine for one in swept(name, cloud).unowned if not one.known]
+        found = [one.machine for one in sweep_cloud(name, cloud).unowned if not one.known]
     except FogftError as error:
         return [f"cannot tell now whether machines of an earlier `{pool}` run: {error.message}"]
     left = [machine for machine in found if machine.pool.casefold() in ("", pool.casefold())]

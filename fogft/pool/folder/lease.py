@@ -26,29 +26,25 @@ class _Held:
 
 
 class Lease:
-    """Held from `take` to `release` or the end of the process."""
+    """Held, with an epoch above all earlier ones and `at_least`, to `release` or the process's end.
 
-    def __init__(self, paths: PoolPaths, lock: disk.Lock, epoch: int) -> None:
+    PoolBusy where another manager holds it.
+    """
+
+    def __init__(self, paths: PoolPaths, *, at_least: int = 0) -> None:
         self._paths = paths
-        self._lock = lock
-        self._beat = 0
-        self.epoch = epoch
-
-    @classmethod
-    def take(cls, paths: PoolPaths, *, at_least: int = 0) -> Lease:
-        """Take the lease with an epoch above all earlier ones, and above `at_least`."""
-        lock = disk.Lock(paths.manager_lock)
+        self._lock = disk.Lock(paths.manager_lock)
         try:
-            taken = lock.acquire(wait=False)
+            taken = self._lock.acquire(wait=False)
         except OSError as error:
             raise disk.not_opened(paths.manager_lock, error) from error
         if not taken:
             said = (disk.read_bytes(paths.manager_lock) or b"").decode("latin-1")
             who = f" (pid {said})" if said.isascii() and said.isdecimal() else ""
             raise PoolBusy(f"pool `{paths.folder.name}` already has a manager{who}")
-        lease = cls(paths, lock, max(read_epoch(paths), at_least) + 1)
-        lease._write()
-        return lease
+        self.epoch = max(read_epoch(paths), at_least) + 1
+        self._beat = 0
+        self._write()
 
     def beat(self) -> None:
         """Write the heartbeat. Raises PoolBusy where a later manager has it: stop at once."""

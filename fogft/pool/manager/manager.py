@@ -95,7 +95,7 @@ class Manager:
         self._identity = store.identity()
         published = store.membership()
         first = max(self._identity.first_epoch, published.epoch if published else 0)
-        self._lease = Lease.take(self._paths, at_least=first)
+        self._lease = Lease(self._paths, at_least=first)
         self._report = disk.Report(self._paths.status)
         self._wake = threading.Event()
         self._proxy = ProxySupervisor(

@@ -29,28 +29,27 @@ def wait_for(condition: Callable[[], bool], limit_s: float) -> bool:
 
 
 def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0) -> int | None:
-    """End the process that holds a lock by SIGTERM, then SIGKILL; return its pid.
+    """End the process that holds a lock by SIGTERM, then SIGKILL; return its pid, or None.
 
     Returns when it is gone, not only its lock: a process lets go of what it holds, and may
     hang only then. Another that waited for the lock may hold it by then.
 
     Args:
-        only: End no other process than this one.
+        only: End no other process than this one: then None is returned.
         patience_s: How long each signal is given.
-
-    Returns:
-        The pid; None if nobody, or another process, holds the lock.
     """
     pid = disk.holder(lock)
     if pid is None or pid == os.getpid() or only not in (None, pid):
         return None
-    with _opened(pid) as process:
+    with _opened(pid) as descriptor:
         for number in (signal.SIGTERM, signal.SIGKILL):
             with contextlib.suppress(ProcessLookupError, PermissionError):
-                process.send(number)
-                process.send(signal.SIGCONT)  # one that is stopped would never hear of it
+                _send(pid, descriptor, number)
+                _send(pid, descriptor, signal.SIGCONT)  # one that is stopped would never hear of it
             end = time.monotonic() + patience_s
-            while process.alive or (disk.is_locked(lock) and disk.holder(lock) in (None, pid)):
+            while _is_alive(descriptor) or (
+                disk.is_locked(lock) and disk.holder(lock) in (None, pid)
+            ):
                 if time.monotonic() > end:
                     break
                 time.sleep(POLL_S)
@@ -66,49 +65,39 @@ def call_at_end(pid: int, call: Callable[[], None]) -> None:
     """
 
     def wait() -> None:
-        with _opened(pid) as process:
-            if process.wait():
-                call()
+        with _opened(pid) as descriptor:
+            if descriptor is not None:
+                ended = select.poll()
+                ended.register(descriptor, select.POLLIN)
+                ended.poll()
+            elif Path("/proc", str(pid)).exists():
+                return
+            call()
 
     threading.Thread(target=wait, name=f"end-of-{pid}", daemon=True).start()
 
 
-class _Process:
-    """A process that stays this one, even if its number is given to another."""
+def _is_alive(descriptor: int | None) -> bool:
+    """Whether a process has not ended; a zombie has. False where the kernel cannot tell."""
+    return descriptor is not None and not select.select([descriptor], [], [], 0)[0]
 
-    def __init__(self, pid: int, descriptor: int | None) -> None:
-        self._pid = pid
-        self._descriptor = descriptor
 
-    @property
-    def alive(self) -> bool:
-        """Whether it has not ended; a zombie has. False where the kernel cannot tell."""
-        return self._descriptor is not None and not select.select([self._descriptor], [], [], 0)[0]
-
-    def wait(self) -> bool:
-        """Wait until it has ended; return whether it has, which an old kernel cannot tell."""
-        if self._descriptor is not None:
-            ended = select.poll()
-            ended.register(self._descriptor, select.POLLIN)
-            ended.poll()
-        return self._descriptor is not None or not Path("/proc", str(self._pid)).exists()
-
-    def send(self, number: signal.Signals) -> None:
-        """Send it a signal."""
-        if self._descriptor is None:
-            os.kill(self._pid, number)
-        else:
-            signal.pidfd_send_signal(self._descriptor, number)
+def _send(pid: int, descriptor: int | None, number: signal.Signals) -> None:
+    if descriptor is None:
+        os.kill(pid, number)
+    else:
+        signal.pidfd_send_signal(descriptor, number)
 
 
 @contextlib.contextmanager
-def _opened(pid: int) -> Iterator[_Process]:
+def _opened(pid: int) -> Iterator[int | None]:
+    """Yield what stays this process, even if its number is given to another; None if unknown."""
     try:
         descriptor = os.pidfd_open(pid)
     except OSError:  # it has gone, or the kernel is older than 5.3
-        yield _Process(pid, None)
+        yield None
         return
     try:
-        yield _Process(pid, descriptor)
+        yield descriptor
     finally:
         os.close(descriptor)

@@ -133,7 +133,7 @@ class ServerProxy:
     def run_once(self) -> None:
         """Supervise the command, readiness and deadlines. Call at about 10 Hz."""
         lease = self._listener.lease()
-        self.renew(() if lease is None else (lease,))
+        self.renew(() if lease is None else (lease.record,))
         died, stopped = self._poll(), self._pauses.was_long()
         if died or stopped or self._node is None or not self._node.alive:
             self.ready = frozenset()

@@ -125,7 +125,7 @@ def main() -> None:
             notice.Watch(f"file:{source}", partial(noted, Path(state_file)))
         state.update(command)
         lease = listener.lease()
-        told = {"lease": 0 if lease is None else lease.sequence}
+        told = {"lease": 0 if lease is None else lease.record.sequence}
         print(json.dumps({**listener.counters(), **told}), flush=True)
     listener.close()
 

@@ -58,8 +58,8 @@ class Place:
         self._thread.join()
 
     def admitted(self) -> Membership | None:
-        record = self.records.get(RecordKind.ADMISSION)
-        return None if record is None else admission(record)
+        held = self.records.get(RecordKind.ADMISSION)
+        return None if held is None else admission(held.record)
 
 
 @pytest.fixture

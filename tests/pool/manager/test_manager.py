@@ -198,12 +198,12 @@ def test_lease_survives_damage_and_ends_with_its_holder(scene: Scene) -> None:
     """A damaged lease gives a higher epoch all the same, if the membership knows one."""
     scene.write()
     scene.paths.lease.write_text("{torn")
-    lease = Lease.take(scene.paths, at_least=7)
+    lease = Lease(scene.paths, at_least=7)
     assert lease.epoch == 8
     with pytest.raises(PoolBusy, match=f"pid {os.getpid()}"):
-        Lease.take(scene.paths)
+        Lease(scene.paths)
     lease.release()
-    assert Lease.take(scene.paths).epoch == 9
+    assert Lease(scene.paths).epoch == 9
 
 
 def test_start_manager_reports_why_it_did_not_start(scene: Scene) -> None:

@@ -144,7 +144,8 @@ class ControlQueries:
             elif verdict is Verdict.OLDER:
                 self._counters.add("records_older")
                 record = read_body(one)
-                newer += filter(None, [self._records.signed(record.kind, record.subject)])
+                held = self._records.get(record.kind, record.subject)
+                newer += [] if held is None else [held.signed]
         self._sessions.revoke(self._records.revoked)
         return newer
 
