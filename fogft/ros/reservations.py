@@ -15,12 +15,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from fogft.ros.spdp import BASE_PORT, DOMAIN_GAIN
+
 DOMAINS = range(1, 102)  # above, the ports of a domain reach Linux's ephemeral ones
 _LOW_DOMAINS = 60  # robots' own, chosen by hand or by tests, tend to be 0 or above these
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ones
-
-_FIRST_DDS_PORT = 7400
-_DDS_PORTS_PER_DOMAIN = 250
 
 
 @dataclass
@@ -88,5 +87,5 @@ def _domains_in_use() -> set[int]:
         with contextlib.suppress(OSError):
             for line in Path(table).read_text().splitlines()[1:]:
                 port = int(line.split()[1].rpartition(":")[2], 16)
-                domains.add((port - _FIRST_DDS_PORT) // _DDS_PORTS_PER_DOMAIN)
+                domains.add((port - BASE_PORT) // DOMAIN_GAIN)
     return domains

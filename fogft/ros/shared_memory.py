@@ -144,9 +144,10 @@ def dead_ports_held(domain_id: int) -> Iterator[None]:
     takes the first number of which it can bind both UDP ports; its shared memory has the second's.
     """
     first = spdp.first_port(domain_id)
+    left = {path.name.rpartition("port")[2] for path in FOLDER.glob("fast*_port*")}
     with contextlib.ExitStack() as held:
         for port in range(first, first + 2 * _HELD_IDS, 2):
-            if any(FOLDER.glob(f"fast*_port{port + 1}")):
+            if str(port + 1) in left:
                 for number in (port, port + 1):
                     sock = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
                     with contextlib.suppress(OSError):  # it is alive

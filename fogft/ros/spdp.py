@@ -28,7 +28,7 @@ _END = struct.pack("<HH", 1, 0)
 _LAST = 0x7FFFFFFF  # a number above all that it can have used
 _GROUP = "239.255.0.1"
 _LOOPBACK = "127.0.0.1"
-_BASE_PORT, _DOMAIN_GAIN, _UNICAST_OFFSET, _ID_GAIN = 7400, 250, 10, 2
+BASE_PORT, DOMAIN_GAIN, _UNICAST_OFFSET, _ID_GAIN = 7400, 250, 10, 2
 _IDS = 64  # participants of one machine that are told, one by one
 _ANSWERED_WITHIN_S = 0.3
 _LOOK_S = 0.02
@@ -73,7 +73,7 @@ def _here(prefix: bytes, port: int) -> bytes:
 
 def first_port(domain_id: int) -> int:
     """Return the UDP port at which a machine's first participant of a domain hears of others."""
-    return _BASE_PORT + _DOMAIN_GAIN * domain_id + _UNICAST_OFFSET
+    return BASE_PORT + DOMAIN_GAIN * domain_id + _UNICAST_OFFSET
 
 
 def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.environ) -> None:
@@ -88,7 +88,7 @@ def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.enviro
                 with contextlib.suppress(OSError):
                     through = struct.pack("=4s4si", b"", b"", index)
                     sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, through)
-                    sending.sendto(message, (_GROUP, _BASE_PORT + _DOMAIN_GAIN * domain_id))
+                    sending.sendto(message, (_GROUP, BASE_PORT + DOMAIN_GAIN * domain_id))
 
 
 def declare_gone(
@@ -147,7 +147,7 @@ def _own_ports(domain_id: int) -> list[int]:
         with contextlib.suppress(OSError):
             sockets.add(os.readlink(f"/proc/self/fd/{descriptor}"))
     first = first_port(domain_id)
-    discovery = range(first, first + _DOMAIN_GAIN - _UNICAST_OFFSET, _ID_GAIN)
+    discovery = range(first, first + DOMAIN_GAIN - _UNICAST_OFFSET, _ID_GAIN)
     with open("/proc/self/net/udp") as table:
         lines = [line.split() for line in table][1:]
     ours = [line[1] for line in lines if f"socket:[{line[9]}]" in sockets]

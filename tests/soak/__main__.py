@@ -42,7 +42,8 @@ def main() -> int:
     given = parser.parse_args()
     nightly = given.minutes >= LONG_MIN
     if given.robot:
-        print("the clock is set by `--only 'clock set'` alone: that needs UDP", file=sys.stderr)
+        if not given.only:
+            print("not run: clock set: give `--only 'clock set'`, it needs UDP", file=sys.stderr)
         if not can_make_namespaces():
             parser.error("--robot needs root: it mounts disks of its own")
         with tempfile.TemporaryDirectory(prefix="fogft-soak-") as folder:
