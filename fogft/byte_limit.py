@@ -1,7 +1,5 @@
 """Bound the bytes of large messages held at once; small ones neither wait for them nor bar them."""
 
-from __future__ import annotations
-
 SMALL_BYTES = 16 << 10
 
 

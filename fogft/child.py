@@ -1,7 +1,5 @@
 """Start programs: one that cannot outlive this process, or one that does not depend on it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Count events by name, and log those that matter to people."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import Counter

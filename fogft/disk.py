@@ -3,8 +3,6 @@
 Errors: StateError.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import json

@@ -1,7 +1,5 @@
 """Log files: all output of a process and its children, in one file of bounded size."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What all processes of fogft share: logging, signals, systemd notification, faster start-up."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import importlib

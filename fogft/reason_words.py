@@ -1,7 +1,5 @@
 """Reasons in words, for command line, logs and reports. Nothing is decided from them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from fogft.model.reason import Cause, Reason

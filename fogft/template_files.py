@@ -1,7 +1,5 @@
 """The `templates/` folder: examples, scripts and profiles shipped with fogft."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from fogft.errors import FogftError

@@ -3,8 +3,6 @@
 A command's module is imported when the command is run or described.
 """
 
-from __future__ import annotations
-
 import keyword
 import sys
 from collections import UserDict

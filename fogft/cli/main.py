@@ -6,8 +6,6 @@ Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage
 Imports that take long are made inside the command that needs them (tests/cli/test_laziness).
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Options shared by several commands, and their completion, which never fails or prints."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """``fogft check | plan | bake``: a pool file's mistakes, what it would launch, and its image."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """``ros2 fog``: the commands of ``fogft`` as verbs of ``ros2``. Loaded by ros2cli only."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -7,8 +7,6 @@
 | Azure | ``scheduledevents``, of type ``Preempt`` or ``Terminate`` | 30 s at least |
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from datetime import datetime, timezone

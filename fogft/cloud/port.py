@@ -7,8 +7,6 @@ Errors: `CloudUnreachable` when the cloud cannot tell, `NoCapacity` and `QuotaEx
 where they are known at once; a launch that fails later is listed as FAILED.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path

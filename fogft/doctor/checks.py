@@ -1,7 +1,5 @@
 """All checks, in the order in which a person would look."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

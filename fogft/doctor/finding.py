@@ -1,7 +1,5 @@
 """The result of a check, with a remedy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from enum import Enum

@@ -1,7 +1,5 @@
 """Checks of this machine: the installation, disk, shared memory, ports, the clock."""
 
-from __future__ import annotations
-
 import os
 import platform
 import shutil

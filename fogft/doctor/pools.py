@@ -1,7 +1,5 @@
 """Checks of a pool file, of the pools on this machine, and of what lost pools left behind."""
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone

@@ -3,8 +3,6 @@
 rclpy is imported in processes of their own only: a broken one can end the process.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import secrets

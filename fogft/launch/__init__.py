@@ -4,8 +4,6 @@ Needs ROS 2's `launch` and `launch_ros`, which are loaded when a name is first u
 Not here: what starting and ending a pool means (`fogft.pool.commands`).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 __all__ = ["CloudNode", "FogPool"]

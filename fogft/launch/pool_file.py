@@ -1,7 +1,5 @@
 """Turn a launch file's nodes and pool into a pool file."""
 
-from __future__ import annotations
-
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

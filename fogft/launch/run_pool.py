@@ -4,8 +4,6 @@ Starts the pool, prints a line that the launch file waits for, then shows the re
 signal it ends, and with `--down` it ends the pool first.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import signal

@@ -4,8 +4,6 @@ A message costs both ends far more than the few bytes in it. Like `frame`, a dec
 or raises `FrameError`. What is sent together is decided in `window` and `reply_queue`.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from typing import Any

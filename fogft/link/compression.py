@@ -9,8 +9,6 @@ spend that time, nor may one peer wait behind another: a thread of each peer's o
 Not here: rates (`socket_progress`), headers (`frame`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading

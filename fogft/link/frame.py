@@ -5,8 +5,6 @@ be of another version. Each frame begins with its version. Other frames: `probe_
 `batch_frames`, `fogft.records.frames`, `fogft.topics.frames`.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Like `frame`: a decoder returns a value or raises `FrameError`, whatever bytes come in.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import lru_cache

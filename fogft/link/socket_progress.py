@@ -9,8 +9,6 @@ is known for ten seconds only: then a request is let through, by which the link 
 `now` is an argument. Not here: where the counts come from (`sockets`), the bounds (`window`).
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass

@@ -10,8 +10,6 @@ next flush, and not at all if the answer comes first.
 Not here: sending (`attempts`), deadlines.
 """
 
-from __future__ import annotations
-
 import heapq
 import threading
 from collections.abc import Collection

@@ -3,8 +3,6 @@
 All methods are called under the dispatcher's lock, but `late`, which has its own.
 """
 
-from __future__ import annotations
-
 import bisect
 import threading
 from collections import defaultdict, deque

@@ -3,8 +3,6 @@
 A slow or hostile scraper occupies a thread, but there are few: a newer connection ends the oldest.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 from collections.abc import Callable

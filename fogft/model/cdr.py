@@ -7,8 +7,6 @@ Serialised messages are plain CDR: four bytes of header that tell the byte order
 at a multiple of its own size, counted from behind the header.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Each field that is made by `key` is a key of the pool file.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ from ``k * BLOCK`` on; the upper half of a block, from `STAND_INS` on, is for on
 that stand in for spot ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -3,8 +3,6 @@
 The command line writes what an operation returns, the manager reads it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

@@ -8,8 +8,6 @@ files all come from that.
         suspect_after_s: float = key(Number(3600, "seconds"), "Mark a replica ...", default=2.0)
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field

@@ -6,8 +6,6 @@ that is launched again elsewhere resumes the same connection.
 Source: FogROS2-SGC's construction of identifiers, extended to connections by FogROS2-FT.
 """
 
-from __future__ import annotations
-
 import hashlib
 import ipaddress
 import re

@@ -5,8 +5,6 @@ and a key of a pool file the check of its form. Unknown keys are left alone: a n
 have written them.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import types
 import typing

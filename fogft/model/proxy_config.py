@@ -1,7 +1,5 @@
 """The proxies' configuration files. Values only; paths are relative to the file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -3,8 +3,6 @@
 Pure data, immutable, compared by value. The words are those of docs/reference/glossary.md.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

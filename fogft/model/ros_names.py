@@ -6,8 +6,6 @@ Source: the ROS 2 design documents on topic and service names and on interface
 definitions; `rmw_validate_full_topic_name` and rosidl's own patterns.
 """
 
-from __future__ import annotations
-
 import re
 from functools import partial
 

@@ -6,8 +6,6 @@ Windows are told by the clock on the wall, so they follow daylight-saving time.
         └─► window that holds now + prelaunch ─► the more replicas, with its cap
 """
 
-from __future__ import annotations
-
 import datetime
 import zoneinfo
 from typing import NamedTuple

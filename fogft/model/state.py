@@ -1,7 +1,5 @@
 """The two services that save and restore a service's state."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from fogft.model.keys import Map, key

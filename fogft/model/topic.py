@@ -1,7 +1,5 @@
 """A topic that passes between the robot and its replicas, as values. Pure."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -4,8 +4,6 @@ Whoever goes through gateways holds links to them and to no replica. A gateway m
 others; a loop is refused wherever a topology is read.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from graphlib import CycleError, TopologicalSorter

@@ -5,8 +5,6 @@ definition would be read as numbers that look right and are not. Distributions w
 (Iron and later) tell sameness by them; else, or to say what differs, fields are compared.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field

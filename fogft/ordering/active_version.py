@@ -6,8 +6,6 @@ A version becomes active by a handover, from a snapshot of the active one, or wh
 Rules: docs/design/rolling-update.md. Not here: carrying the change out (`ordering.sequencer`).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 

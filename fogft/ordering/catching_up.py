@@ -5,8 +5,6 @@ collects until `take`. Not here: what replicas answer, and who obeys (`sequencer
 Protocol: docs/design/state.md.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ index. So a request needs no envelope. An answer is the payload that belongs to 
 refusal. Protocol: docs/design/state.md.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 from enum import IntEnum

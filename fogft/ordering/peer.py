@@ -5,8 +5,6 @@ every caller would wait until it has applied all that it lacks. So one that is f
 snapshot instead, though not too often. What follows from all this is the `sequencer`'s.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import Enum
 

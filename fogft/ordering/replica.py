@@ -7,8 +7,6 @@ Not here: calling the service and answering (`fogft.proxy.replica.ordered_respon
 Protocol: docs/design/state.md.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar

@@ -9,8 +9,6 @@ Not here: what each replica is to be sent (`catching_up`), callers and deadlines
 (`fogft.proxy.robot.service_order`). Protocol and its argument: docs/design/state.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ own figures (15 h up, 20 min recovery: 2.17 % for one, 0.047 % for two) agree wi
 Not here: how many are launched (`sizing`).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections import defaultdict

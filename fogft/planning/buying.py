@@ -3,8 +3,6 @@
 Not here: the order among offers (`placement`) and what is needed (`needs`).
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence

@@ -4,8 +4,6 @@ Clouds charge for what leaves them: one response from each replica that is asked
 included.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 

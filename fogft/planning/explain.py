@@ -6,8 +6,6 @@ is told: one that lost by its price came nearer than one that lost by the spread
 Not here: the decisions (`planner`) and how they are shown (`fogft.cli`).
 """
 
-from __future__ import annotations
-
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -8,8 +8,6 @@ in only once that was refused. Nor is a slot short whose first machine is still 
 Not here: where they are bought (`buying`) and the two steps of an ending (`endings`).
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 

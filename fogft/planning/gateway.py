@@ -6,8 +6,6 @@ the file asks for another; not before it is gone, since its ports may be those o
 Not here: the gateway's order (`fogft.pool.manager.configuration`).
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple

@@ -4,8 +4,6 @@ Nothing is written when the time has come: every tick finds it out anew, so no m
 forget it, and a file with a larger `max_hours` gives more time to one that still runs.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from fogft.model.intent import Intent

@@ -9,8 +9,6 @@ thousands take longer to sort than a whole plan takes.
 Not here: choosing among them (`placement`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

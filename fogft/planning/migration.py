@@ -7,8 +7,6 @@ steady offers every move lowers the crowding or the sum of the scores, and moves
 Not here: carrying it out, which is a replacement like any other (`needs`, `buying`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import dataclass

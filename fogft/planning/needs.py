@@ -3,8 +3,6 @@
 Not here: where they go and whether they can be paid (`buying`).
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple

@@ -6,8 +6,6 @@ a region fails as a whole. What is equal in both is drawn by lot, for each pool 
 Not here: the order within a rank (`listing`), how long a location is avoided (`observed.backoff`).
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence

@@ -5,8 +5,6 @@ argument, so planning again after a crash is always safe. Here are the order of 
 holds the pool within its cap. docs/design/planner.md has the flow.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -6,8 +6,6 @@ which the pool was wholly ready. Rules: docs/design/rolling-update.md.
 Not here: launches and endings (`planner`), what is remembered (`fogft.pool.manager.updating`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ the offers alone, not on what runs, so it does not change with every preemption.
 Not here: what is missing (`planner`), the arithmetic (`availability`).
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from fogft.model.choices import MAX_REPLICAS

@@ -6,8 +6,6 @@ is the same to it.
 Not here: who stands in, and when (`fallback`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 from fogft.model.groups import group_of, groups_of, is_current, is_stand_in

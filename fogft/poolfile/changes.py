@@ -1,7 +1,5 @@
 """The differences between two pool files, in words. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A process's configuration file, written and read by the table of its keys."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path

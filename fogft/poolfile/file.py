@@ -1,7 +1,5 @@
 """Read a pool file from disk."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 from pathlib import Path

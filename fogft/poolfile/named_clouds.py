@@ -1,7 +1,5 @@
 """Clouds and places named in a pool file's resources, with their lines."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A service's policy as ROS parameters, each judged by the pool file's own reader. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias

@@ -1,7 +1,5 @@
 """Check a pool file and turn it into a `PoolSpec`. Pure: tree and type checks are passed in."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

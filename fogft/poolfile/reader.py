@@ -1,7 +1,5 @@
 """Read a map of keys into the dataclass that describes them. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Hints for keys that were moved, renamed or removed. Pure."""
 
-from __future__ import annotations
-
 from fogft.model.choices import (
     AvailabilitySpec,
     FallbackSpec,

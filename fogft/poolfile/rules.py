@@ -1,7 +1,5 @@
 """Rules for combinations of keys in a pool file: each judges a map once its keys are read. Pure."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The JSON Schema (draft 2020-12) of the pool file, for completion in editors. Pure."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from fogft.model import keys

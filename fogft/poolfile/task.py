@@ -1,7 +1,5 @@
 """Check the SkyPilot part of a pool file: names of keys, and what no pool can do."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ PyYAML's own loader forgets lines, keeps the last of two equal keys, and expands
 end. What comes out can be written as JSON: dates stay the text that was written.
 """
 
-from __future__ import annotations
-
 import yaml
 
 from fogft.errors import SpecError

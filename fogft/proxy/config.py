@@ -3,8 +3,6 @@
 Each raises StateError where a file cannot be read, or a key is missing or of the wrong type.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

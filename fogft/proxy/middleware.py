@@ -7,8 +7,6 @@ Owns: which implementation of `fogft.ros.port.RosNode` a process gets.
 Not here: the implementations, and what the node is for.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 from collections.abc import Callable, Mapping, Sequence

@@ -4,8 +4,6 @@ One host cannot keep others out for longer than these take to greet: where the r
 oldest connection of the host that has most of them is ended.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 from collections import Counter

@@ -4,8 +4,6 @@ The file has a version and a checksum, and each record in it keeps its signature
 again. A damaged file is told and costs only itself.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ lost only after 1, 3, 7 seconds, and one that crosses a slow link needs seconds.
 Not here: what is exchanged then (`exchange`).
 """
 
-from __future__ import annotations
-
 import asyncio
 import os
 import socket

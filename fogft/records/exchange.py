@@ -6,8 +6,6 @@ on at once what is new. So a rendezvous that comes back empty is filled by whoev
 Not here: making connections (`server`, `dialling`).
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 from collections import Counter

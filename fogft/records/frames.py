@@ -4,8 +4,6 @@ Each message is a JSON object behind its length. Whatever bytes come in, and how
 cut, a reader gives messages or raises `RecordError`, and holds no more than one frame.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from collections.abc import Iterator, Sequence

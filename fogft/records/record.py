@@ -6,8 +6,6 @@ these bytes, so anybody may pass a record on and nobody can change it.
 Not here: merging (`record_set`), what contents mean (`roster`), cryptography (passed in).
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import json

@@ -6,8 +6,6 @@ simply exchange what the other lacks.
 Not here: a record's bytes (`record`), its meaning (`roster`), how it travels (`exchange`).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ none raises `RecordError`.
 Not here: who may write them (`record`) and which one stands (`record_set`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any

@@ -6,8 +6,6 @@ comes from anybody else, or is no message, ends that connection and is counted b
 Not here: records (`exchange`), the process (`fogft.pool.commands.rendezvous`).
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import hashlib

@@ -4,8 +4,6 @@ One that is broken, or lies, says so of requests that others answer. Were it bel
 would run each of those alone. What follows from a death is `pending`'s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 FALSE_ALARMS, LATELY_S = 3, 60.0  # so many false alarms lately, and it is not believed

@@ -7,8 +7,6 @@ Laws: a request always has a copy that is no spare; late hedges <= capacity + sh
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 

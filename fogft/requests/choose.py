@@ -7,8 +7,6 @@ Owns: `all` and `failover`; the interface of every policy. Not here: `auto` (`re
 which answer wins (`decide`).
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any

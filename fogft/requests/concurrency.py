@@ -9,8 +9,6 @@ matters. One that takes up to 0.1 s has one more in hand than it works on, or it
 between two. Who waits is `fair_queue`'s.
 """
 
-from __future__ import annotations
-
 QUICK_S = 0.003
 IN_HAND_S = 0.1  # below this, one more is in hand
 _NEAR = 0.85

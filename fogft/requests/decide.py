@@ -9,8 +9,6 @@ Owns: the interface of every decision; the first success, and the first that is 
 (`pending`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum

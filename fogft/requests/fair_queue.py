@@ -11,8 +11,6 @@ deadline goes first.
 Not here: how many may wait or run at once (`concurrency`, `proxy.replica.responder`).
 """
 
-from __future__ import annotations
-
 import heapq
 from dataclasses import dataclass, field
 from itertools import count

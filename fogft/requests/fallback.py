@@ -6,8 +6,6 @@ after a delay, or at once while no replica is ready. After the deadline only its
 Law: a request is handed to the fallback at most once, and ends exactly once.
 """
 
-from __future__ import annotations
-
 from fogft.model.choices import FallbackSpec
 from fogft.requests.decide import Pending
 from fogft.requests.load import NEVER

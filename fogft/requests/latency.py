@@ -5,8 +5,6 @@ was stopped counts as the time until then: leaving it out would make a slow repl
 its fast answers.
 """
 
-from __future__ import annotations
-
 import math
 
 _FIRST_S = 1e-4

@@ -4,8 +4,6 @@ Between two reports the robot counts what it sent itself. Several robots need no
 sees the others in the replica's words. Who is asked is decided in `auto` and `choose`.
 """
 
-from __future__ import annotations
-
 import math
 from enum import IntFlag
 from typing import NamedTuple

@@ -14,8 +14,6 @@ Not here: what an answer means (`decide`), who is asked (`choose`), when the fal
 (`fallback`), sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from enum import Enum
 from typing import Any

@@ -6,8 +6,6 @@ agreement nobody is blamed: two that differ do not tell who is wrong.
 Not here: what agreeing means (`fogft.ros.messages`), requests and deadlines (`pending`).
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Any

@@ -6,8 +6,6 @@ come from Zenoh's threads.
 Owns: queries under way, on either side. Not here: the session and the graph (`node`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

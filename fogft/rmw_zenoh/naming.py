@@ -11,8 +11,6 @@ Owns: keys, tokens, attachments, who is there. Not here: sessions (`fogft.rmw_ze
 Source: the design document and `attachment_helpers.cpp` of ros2/rmw_zenoh.
 """
 
-from __future__ import annotations
-
 import hashlib
 import struct
 import threading

@@ -8,8 +8,6 @@ Owns: the session and its settings, the graph, what is offered and called. Not h
 (`entities`), names (`rmw_zenoh.naming`), settings of links (`fogft.link.zenoh.settings`).
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import logging

@@ -6,8 +6,6 @@ knows the writer of its requests. Only CycloneDDS can tell whose it is.
 Owns: what that header means. Not here: which node a writer belongs to (`node`).
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from ctypes import CDLL, c_int32, c_size_t, c_uint32, c_uint64, c_void_p, string_at

@@ -8,8 +8,6 @@ Owns: the shared-memory profile's place, variables of ROS and of its Python whee
 Not here: judging what is found (`fogft doctor`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

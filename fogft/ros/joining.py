@@ -4,8 +4,6 @@ A participant that is known already has its services found within milliseconds, 
 second. Owns: contexts. Not here: the node of a proxy (`node`).
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

@@ -5,8 +5,6 @@ dropping one costs hundreds of page faults: 0.75 ms against 0.05 ms when it is k
 is kept, and given back now and then (`Trimmer`), or one burst would hold its memory for ever.
 """
 
-from __future__ import annotations
-
 import ctypes
 import re
 import time

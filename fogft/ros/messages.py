@@ -8,8 +8,6 @@ of an action out of its replicas'. Not here: C messages (`serialised`), votes
 (`fogft.requests.votes`), which status counts (`fogft.topics.goals`).
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

@@ -9,8 +9,6 @@ Owns: the context, the node, the thread, quality of service.
 Not here: pending requests (`entities`), bytes (`serialised`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading

@@ -8,8 +8,6 @@ Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.rmw_zenoh.node.
 (Zenoh, no ROS installed), `tests.fakes.ros` (tests). Topics pass by the first alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum

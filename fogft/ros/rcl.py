@@ -8,8 +8,6 @@ Owns: names, argument types, return codes, C structures, error texts.
 Not here: when to call them (`serialised`).
 """
 
-from __future__ import annotations
-
 import ctypes
 from ctypes import (
     CDLL,

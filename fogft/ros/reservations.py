@@ -5,8 +5,6 @@ user, and takes it back when the process ends. What others use without asking us
 the ports that are bound.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import random

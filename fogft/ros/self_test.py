@@ -7,8 +7,6 @@ parameters as services. ``segment`` prints how large a shared-memory segment a n
 Each prints one JSON object on stdout. Exit status 0 when it worked.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

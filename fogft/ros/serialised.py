@@ -10,8 +10,6 @@ Owns: C messages and buffers. Not here: threads and locks (`node`), types (`type
 (`rcl`).
 """
 
-from __future__ import annotations
-
 from ctypes import CDLL, addressof, byref, c_int64, string_at
 from functools import lru_cache
 from typing import Any

@@ -20,8 +20,6 @@ Names begin with ``fastrtps`` before Fast DDS 3. The ROS wheels' tracing library
 ``lttng-ust-wait-*``; the same rules hold. Needs neither rclpy nor Fast DDS.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import fcntl

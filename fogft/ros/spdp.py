@@ -8,8 +8,6 @@ ROS does not see, is announced for an instant, and what it is answered is passed
 Owns: these messages, and where they go. Not here: who was killed (`fogft.proxy.robot.process`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -7,8 +7,6 @@ Python messages are built here, as nowhere else in a proxy.
 Owns: reading and writing that field. Not here: when (`fogft.proxy.replica.ordered_responder`).
 """
 
-from __future__ import annotations
-
 import array
 import re
 from typing import Any

@@ -12,8 +12,6 @@
 and in the pool file ``state: {snapshot: /count/get_state, restore: /count/set_state}``.
 """
 
-from __future__ import annotations
-
 import array
 import json
 from collections.abc import Callable

@@ -7,8 +7,6 @@ Owns: names of types, their errors and hints, shapes, definitions.
 Not here: messages (`messages`), comparing two definitions (`fogft.model.type_definition`).
 """
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import json

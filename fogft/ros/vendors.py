@@ -5,8 +5,6 @@ CycloneDDS put requests behind headers of their own. Discovery shows a service t
 What tells them apart is the number of the implementation, which every identifier begins with.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 FAST_DDS, CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # as the OMG assigns them

@@ -8,8 +8,6 @@ Owns: that node, its thread and its level, which that of our log follows.
 Not here: what is said (`fogft.proxy.robot.diagnostics`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import deque

@@ -7,8 +7,6 @@ needs none of this.
 Owns: that prefix. Not here: building (`templates/workspace.sh`).
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import sys

@@ -7,8 +7,6 @@ through time, each in some location or on demand, and the cheapest flow is the b
 Owns: the flow. Not here: what policies reach (`comparison`).
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import math

@@ -3,8 +3,6 @@
 Not here: how it is shown (`fogft.cli`, `plot`).
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import random

@@ -6,8 +6,6 @@ included); correlations are means over pairs of locations, `together` the share 
 in which another zone of the region was lost at the same time. `regime_s` is not estimated.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from bisect import bisect_left

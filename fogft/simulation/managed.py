@@ -5,8 +5,6 @@ Only the cloud, the links and the clock are simulated. Nothing here decides anyt
 Owns: the links' report, and when the manager can next have something to do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

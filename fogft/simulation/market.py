@@ -3,8 +3,6 @@
 Not here: the machines themselves (`world`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The availability and cost of a simulated pool."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 HOURS_A_MONTH = 730.0

@@ -4,8 +4,6 @@ docs/design/simulation.md tells how. Every random number comes from the generato
 Not here: finding the numbers in traces (`fitting`).
 """
 
-from __future__ import annotations
-
 import math
 import random
 from bisect import bisect_right

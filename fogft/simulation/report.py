@@ -3,8 +3,6 @@
 Not here: running each policy (`comparison`) and drawing the result (`plot`).
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace

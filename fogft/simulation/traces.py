@@ -11,8 +11,6 @@ alone, ``us-west-2b_v100_1.json``: what follows the first underscore is only a r
 Not here: what is made of them (`comparison`).
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 from collections.abc import Iterable, Sequence

@@ -6,8 +6,6 @@ after each event and when it wanted to be asked; it acts through the cloud port 
 Not here: who decides (`managed`, `baselines`) and what the market does (`market`).
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import random

@@ -4,8 +4,6 @@ They travel as the payloads of requests and answers, so all that holds for those
 Whatever bytes come in, a decoder returns a value or raises `FrameError`.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Sequence
 

@@ -6,8 +6,6 @@ request (CDR, after its header).
 Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.messages`).
 """
 
-from __future__ import annotations
-
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping

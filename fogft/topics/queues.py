@@ -4,8 +4,6 @@ Messages are numbered by their publisher from 1. A robot asks for what comes aft
 that it has, so whatever is lost on the way is asked for again.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable
 

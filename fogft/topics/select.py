@@ -4,8 +4,6 @@ Replicas run the same nodes on the same input, so most of what they publish says
 an action's status (`fogft.ros.messages`).
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 
 from fogft.model.topic import Select

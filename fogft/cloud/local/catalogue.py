@@ -4,8 +4,6 @@ Prices are made up, in the proportions of real ones. ``regions.yaml`` in the clo
 replaces any of it; docs/design/local-cloud.md shows one.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Inject faults into the local cloud, by files that the machines watch and by signals."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import time

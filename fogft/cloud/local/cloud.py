@@ -1,7 +1,5 @@
 """The local cloud: replicas as folders, locks and processes. See docs/design/local-cloud.md."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

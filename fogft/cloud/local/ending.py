@@ -4,8 +4,6 @@ A machine is gone when none of its processes is left and its folder has been rem
 log stands in ``logs/``, which also marks its id as used. `CloudUnreachable`: it is not sure.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

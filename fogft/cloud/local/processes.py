@@ -10,8 +10,6 @@ the machine's lock: the machine counts as alive until all of it is gone. If the 
 the machine sees that its parent changed, and ends.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import logging

@@ -8,8 +8,6 @@ As on a network, the server sees from which host who connects, and a host that f
 the others little: of those that wait for the server, the newest are kept.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math

@@ -4,8 +4,6 @@ A pool written for another cloud can run here: ``aws/us-west-1`` is then the loc
 name. Keys of SkyPilot's that say neither where a machine may be nor what it is do nothing.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """How a machine runs a task's commands: environment and ROS domain."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """AWS through its own API (boto3, which comes with SkyPilot's AWS support). See `provider`."""
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import hashlib

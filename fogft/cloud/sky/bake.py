@@ -4,8 +4,6 @@ A VM that starts from it runs the same set-up, which finds what there is already
 wrong, only late. It holds no certificate, key or secret.
 """
 
-from __future__ import annotations
-
 import shlex
 import shutil
 from collections.abc import Mapping

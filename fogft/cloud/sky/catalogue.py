@@ -4,8 +4,6 @@ SkyPilot chooses one machine without accelerators; one type alone often has no c
 of a cloud's general families are offered beside it: as many vCPUs, no less memory.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

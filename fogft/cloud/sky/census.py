@@ -4,8 +4,6 @@ A machine's absence counts only where the provider has listed it before. The cre
 of another account than those that SkyPilot, or its API server elsewhere, launches with.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -5,8 +5,6 @@ refresh from the cloud, and the provider is asked itself where it can be. What S
 forgotten is ended through the provider, by its labels.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 from collections.abc import Callable

@@ -4,8 +4,6 @@ The clouds' own codes decide, not the exception's class, which is the same for n
 and no permission. They stand in the texts or, as AWS's do, in the log of the launch only.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 

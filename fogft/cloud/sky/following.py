@@ -5,8 +5,6 @@ So a step can be lost, repeated, or made by another process after a crash. A lau
 fails or hangs is taken down at once: a machine that was made before would cost money.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass

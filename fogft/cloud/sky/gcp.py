@@ -3,8 +3,6 @@
 Lists machines by our labels, and deletes those that were just listed; no more of `provider`.
 """
 
-from __future__ import annotations
-
 import datetime
 import importlib
 import threading

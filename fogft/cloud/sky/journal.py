@@ -6,8 +6,6 @@ if the manager dies in that moment. Losing it loses no machine: names and labels
 say the same. All raise `StateError` where a file cannot be read or written.
 """
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Answers that are kept for a while, and renewed elsewhere before they are too old."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ What does not match is not ours, and nothing that is not ours is ever touched: e
 reaches SkyPilot is made by `cluster_name`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ SkyPilot's list decides what exists; the journal says what a launch is waiting f
 failed; the provider is heard where SkyPilot is silent.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace

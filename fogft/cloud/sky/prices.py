@@ -4,8 +4,6 @@ The catalogue is a file that SkyPilot renews every few hours; spot prices move m
 offer says where its price comes from and how old it is.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math

@@ -4,8 +4,6 @@ SkyPilot's database is a file that can be lost; the provider's own list cannot. 
 gone" is checked there, and what SkyPilot has forgotten is found and ended there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol

@@ -4,8 +4,6 @@ No object of its own gets past `installed`. The line that matters: "nobody knows
 the network, the credentials) against "the answer is no". From the first nothing may be concluded.
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -6,8 +6,6 @@ no replica ever runs on it: SkyPilot sets `autostop` only when a machine is whol
 server elsewhere goes the guard only: what that gives away its administrator has decided.
 """
 
-from __future__ import annotations
-
 import base64
 import importlib
 import json

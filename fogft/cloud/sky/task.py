@@ -4,8 +4,6 @@ What the pool file says passes through untouched, but for the few fields that a 
 itself; those are refused, since a field that is ignored is a promise broken in silence.
 """
 
-from __future__ import annotations
-
 import copy
 import os
 from collections.abc import Mapping, Sequence

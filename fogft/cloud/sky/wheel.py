@@ -4,8 +4,6 @@ The wheel is made of the imported package's own files and of what pip recorded o
 each time. `up` makes the lock; a generation keeps the one of its first launch for all replicas.
 """
 
-from __future__ import annotations
-
 import base64
 import contextlib
 import hashlib

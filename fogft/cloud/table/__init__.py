@@ -7,8 +7,6 @@ where a table spans clouds or is dated. Without ``Cloud`` the file's folder name
 Not here: launching, which a table cannot do.
 """
 
-from __future__ import annotations
-
 import csv
 import datetime
 import math

@@ -4,8 +4,6 @@ One that is taken into use is joined with this replica's own listener, and anoth
 place. Not here: the door (`robot`), the listener (`listener`).
 """
 
-from __future__ import annotations
-
 import logging
 import select
 import socket

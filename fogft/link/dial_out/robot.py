@@ -7,8 +7,6 @@ the TLS server, end to end, so the door can neither read nor change what passes.
 Not here: the replica's side (`replica`), links (`link`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import secrets

@@ -3,8 +3,6 @@
 The kernel moves the bytes (`splice`), so a tunnel costs a robot two sleeping threads.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -6,8 +6,6 @@ A certificate begins 24 hours before it was made. So one that is "not yet valid"
 a clock a day ahead of the one that judges it, and TLS's word for it helps nobody.
 """
 
-from __future__ import annotations
-
 import contextlib
 import datetime
 import socket

@@ -3,8 +3,6 @@
 Owns: a connection's socket. Not here: the judgement (`socket_progress`), when to look (`link`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

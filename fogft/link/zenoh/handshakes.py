@@ -5,8 +5,6 @@ and then; a full pipe could block Zenoh. What the process itself prints, and its
 standard output went before.
 """
 
-from __future__ import annotations
-
 import fcntl
 import logging
 import os

@@ -4,8 +4,6 @@ Zenoh opens the sockets and tells nothing of them. The kernel does: it lists thi
 descriptors and counts each connection's bytes. Where it does not (no Linux), nothing is found.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import fcntl

@@ -8,8 +8,6 @@ A daemon thread that returns from Zenoh while the interpreter shuts down aborts 
 not for long: towards a frozen peer it takes ten seconds.
 """
 
-from __future__ import annotations
-
 import atexit
 import ctypes
 import logging

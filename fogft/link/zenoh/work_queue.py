@@ -1,7 +1,5 @@
 """A worker thread for jobs that Zenoh's threads must not do themselves."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import deque

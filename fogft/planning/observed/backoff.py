@@ -6,8 +6,6 @@ location after the other. NO_ROOM_S lets a round over all locations end before t
 again. Events from the future, left by a clock that was set back, count for nothing.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from operator import itemgetter

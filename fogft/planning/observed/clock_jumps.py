@@ -7,8 +7,6 @@ looked: all that is remembered moves along with it, so that durations stay what 
 Not here: reading clocks (`fogft.pool.manager.timekeeping`), moving what is remembered (`history`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from fogft.model.reason import Cause, Reason

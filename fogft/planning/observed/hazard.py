@@ -7,8 +7,6 @@ does not depend on who asks when.
 Not here: the rest after refusals (`backoff`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping
 

@@ -4,8 +4,6 @@ Neither alone replaces anything: a machine that the cloud lists and that is sile
 dead uplink, so silence counts only while another replica answers.
 """
 
-from __future__ import annotations
-
 import math
 from enum import Enum
 from typing import NamedTuple

@@ -6,8 +6,6 @@ again. Spot machines and those on demand are counted apart, so that what restore
 held up by the limit.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 

@@ -7,8 +7,6 @@ a dead uplink until the cloud has told.
 Not here: asking (`fogft.cloud`), on a thread of its own (`fogft.pool.manager.operations`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

@@ -7,8 +7,6 @@ Not here: what a replica offers (`fogft.proxy.replica.offering`), the file
 (`fogft.pool.folder.discovered`).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 Not here: what the image is built of (`fogft.cloud.port.RealCloud`).
 """
 
-from __future__ import annotations
-
 import subprocess
 import tempfile
 from pathlib import Path

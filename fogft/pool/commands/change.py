@@ -7,8 +7,6 @@ Not here: what the operations mean (`fogft.model.intent`), bundles (`joining`), 
 ledger (`fogft.pool.credentials`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -3,8 +3,6 @@
 A file that is already there is never overwritten unless that was asked for.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -8,8 +8,6 @@ Owns: the content of bundles, and the folders of joined holders.
 Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`claiming`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import re
 import secrets

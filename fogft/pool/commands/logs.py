@@ -4,8 +4,6 @@ Owns: finding them.
 Not here: reading and following them (`fogft.cli.status`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import sys
 from pathlib import Path

@@ -5,8 +5,6 @@ docs/design/manager.md says what keeps the old machine, or another copy, from ma
 Owns: what is in the file, and the order of steps. Not here: sealing (`bundle`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import os

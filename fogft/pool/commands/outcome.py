@@ -4,8 +4,6 @@ Owns: the verdict on a status.
 Not here: looking and waiting (`fogft.cli.progress`).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum, auto
 

@@ -1,7 +1,5 @@
 """Plan a pool file and explain its cost and availability. Nothing is launched."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -4,8 +4,6 @@ Owns: the placements that a new pool would get, and what a changed file changes.
 Not here: doing it (`startup`) and saying it (`fogft.cli`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -3,8 +3,6 @@
 Its memory on disk spares callers a moment after a restart; without it they bring everything.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

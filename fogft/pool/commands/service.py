@@ -7,8 +7,6 @@ Owns: the units' text and names, their environment, and the calls of systemctl.
 Not here: what the processes tell systemd (`fogft.process`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pwd

@@ -7,8 +7,6 @@ Owns: creating and changing a pool on disk, and starting its manager.
 Not here: judging the file (`pool_file`), waiting for the services (`fogft.cli.progress`).
 """
 
-from __future__ import annotations
-
 import secrets
 import shutil
 import sys

@@ -10,8 +10,6 @@ Owns: reading and renewing a status.
 Not here: its schema (`fogft.pool.manager.status`), showing it (`fogft.cli`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import time

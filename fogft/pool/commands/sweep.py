@@ -6,8 +6,6 @@ listed costs money that nobody watches.
 Not here: what exists (`fogft.cloud`, past every memory) and asking the user (`fogft.cli`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ the readable part is sealed along with it (AES-GCM). What is wrong raises `Crede
 Not here: what is in it (`joining`), and that it is used once (`claiming`).
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import hashlib

@@ -5,8 +5,6 @@ finds the record of the first and joins nothing. Of two that join in the same mo
 one stands, whichever rendezvous each has reached.
 """
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Callable, Sequence

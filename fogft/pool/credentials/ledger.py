@@ -8,8 +8,6 @@ cannot be certified raises `CredentialError`.
 Not here: making certificates (`authority`), telling others of a revocation (`manager`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace

@@ -7,8 +7,6 @@ is charged for as long as it can have run without one. What a cloud refused cost
 The file stays when the pool has ended.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Mapping, Sequence

@@ -4,8 +4,6 @@ Owns: the file, and which types can be offered on this machine.
 Not here: how it grows (`fogft.planning.observed.services`).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

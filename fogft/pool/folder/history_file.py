@@ -5,8 +5,6 @@ A launch is written before the cloud is asked, so that its generation is never u
 Owns: `history.jsonl`. Not here: what follows from events (`fogft.planning.observed.history`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

@@ -6,8 +6,6 @@ the later one, for everybody.
 Owns: `manager.lock` and `lease.json`.
 """
 
-from __future__ import annotations
-
 import secrets
 from dataclasses import dataclass
 

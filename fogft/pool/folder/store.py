@@ -5,8 +5,6 @@ Not here: what to remember (`fogft.planning`), what happened (`history_file`) an
 replaced (`fogft.disk`).
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace

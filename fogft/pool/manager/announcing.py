@@ -7,8 +7,6 @@ Owns: the manager's certificate for signing, and its record client.
 Not here: what the membership is (`reconciler`).
 """
 
-from __future__ import annotations
-
 import datetime
 from typing import Any
 

@@ -4,8 +4,6 @@ Owns: the values in `proxy.yaml` and `replica.yaml`, and who gets which certific
 Not here: reading them (`fogft.proxy.config`) and signing (`credentials`).
 """
 
-from __future__ import annotations
-
 import datetime
 import re
 import socket

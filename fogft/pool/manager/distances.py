@@ -9,8 +9,6 @@ where nothing else is known, a region with a replica would look nearer than all 
 Not here: what they are for (`fogft.planning.listing`).
 """
 
-from __future__ import annotations
-
 import csv
 import functools
 import math

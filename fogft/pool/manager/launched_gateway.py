@@ -3,8 +3,6 @@
 Not here: the decision (`planning.gateway`), and carrying it out (`reconciler`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

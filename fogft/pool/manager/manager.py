@@ -7,8 +7,6 @@ Owns: the loop, what wakes it, and the pool's status file.
 Not here: a tick's work (`reconciler`), the client proxy's life (`proxy_supervisor`).
 """
 
-from __future__ import annotations
-
 import datetime
 import logging
 import os

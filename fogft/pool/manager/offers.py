@@ -4,8 +4,6 @@ Owns: telling whose offer is whose.
 Not here: what a cloud sells (`fogft.cloud`) and which is chosen (`fogft.planning.placement`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Protocol

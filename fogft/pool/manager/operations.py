@@ -7,8 +7,6 @@ or already in the cloud's.
 Not here: what to order (`reconciler`) and the threads (the `Submit` that comes in).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Mapping

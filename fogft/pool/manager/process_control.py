@@ -4,8 +4,6 @@ Owns: ending by process id. Never by name: only a process that holds one of our 
 signalled.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -5,8 +5,6 @@ Not here: writing it (`fogft.proxy.robot.process`) and judging it
 (`fogft.planning.observed.health`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial

@@ -9,8 +9,6 @@ client proxy starts a manager again that was killed (`fogft.proxy.robot.manager_
 Not here: its configuration (`configuration`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

@@ -5,8 +5,6 @@ that its successor does not repair.
 Not here: the decisions (`fogft.planning.planner`), the loop and the processes (`manager`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json

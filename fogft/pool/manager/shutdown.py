@@ -7,8 +7,6 @@ it: what is only starting finds its place taken and ends.
 Not here: the machines, and the proof that none is left (`teardown`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import shutil
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ to say when it is not known what still runs.
 Not here: ending one machine (`fogft.cloud`).
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

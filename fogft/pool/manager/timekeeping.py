@@ -6,8 +6,6 @@ history first, and all that is remembered moves along.
 Not here: what a jump is (`planning.observed.clock_jumps`), and what moves (`history`, `updating`).
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

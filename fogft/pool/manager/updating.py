@@ -6,8 +6,6 @@ next `up` with a changed file tries again. Killed anywhere, the next tick goes o
 Not here: the judgement (`fogft.planning.rollout`), the files' place (`store`).
 """
 
-from __future__ import annotations
-
 import logging
 from dataclasses import replace
 

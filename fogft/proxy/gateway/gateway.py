@@ -8,8 +8,6 @@ Owns: which requests of robots are under way, and whom each answer goes to.
 Not here: fanning out (`dispatcher`), links (`client`), files and signals (`process`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

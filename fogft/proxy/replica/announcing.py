@@ -4,8 +4,6 @@ Owns: the replica's record, when it is written anew, and the doors that it dials
 Not here: what is told with each probe (`server`), records (`fogft.records.record`).
 """
 
-from __future__ import annotations
-
 import logging
 
 from fogft.link.dial_out.replica import DialOut

@@ -9,8 +9,6 @@ Owns: `send_goal` requests, from the wire to the answer, and which goals the pre
 has. Not here: the action's other services (`responder`).
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -6,8 +6,6 @@ until its deadline, and its answer is kept for copies as long as there is room.
 Owns: ids, their deadlines, kept answers and their bounds. Called under the owner's lock.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections import OrderedDict
 

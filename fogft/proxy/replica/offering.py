@@ -7,8 +7,6 @@ Owns: which services there are, since when, and the definitions of their types.
 Not here: whether they answer (`server`), which the robot proxies (`fogft.pool.folder.discovered`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 from fogft.model.names import NAMES_BYTES_LIMIT

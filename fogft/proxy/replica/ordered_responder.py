@@ -7,8 +7,6 @@ Owns: the calls of the service, of its snapshot and of its restore. Not here: de
 (`fogft.ordering.replica`), what the bytes of a state service mean (`fogft.ros.state_bytes`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -4,8 +4,6 @@ It ends with status 0 when it was told to or when its lease is over; whoever sta
 job, the local cloud's machine) then ends the machine.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

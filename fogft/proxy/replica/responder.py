@@ -12,8 +12,6 @@ Not here: which ids are known (`known_requests`), in what order they run and how
 (`service_queue`), readiness and the command (`supervisor`), links, ROS.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -7,8 +7,6 @@ Owns: a service's queue, its limit, and the room that is taken.
 Not here: request ids and copies (`responder`), the order itself (`requests.fair_queue`).
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 from fogft.link.port import Incoming

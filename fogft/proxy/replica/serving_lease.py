@@ -7,8 +7,6 @@ keeps a machine alive.
 Owns: when the lease is over. Not here: signatures (`fogft.records`), ending (`process`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from fogft.records import roster

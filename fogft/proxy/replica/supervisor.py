@@ -6,8 +6,6 @@ The command gets a session of its own and dies with this process, whatever ends 
 Owns: one child process. Not here: whether its services answer (`server`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

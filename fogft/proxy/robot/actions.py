@@ -8,8 +8,6 @@ Not here: a request's life (`dispatcher`), what a goal is (`fogft.topics.goals`)
 status (`topics`).
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -4,8 +4,6 @@ Owns: calls of the fallback service. Not here: where a caller is (the function t
 answer is returned (`dispatcher`), when the fallback is asked (`requests.fallback`).
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterable

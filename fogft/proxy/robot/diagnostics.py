@@ -4,8 +4,6 @@ Owns: levels, sentences, and the values below them; when they are told. Not here
 (`fogft.ros.visible`), the policies that parameters set (`fogft.poolfile.policy_parameters`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import deque

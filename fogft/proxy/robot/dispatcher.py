@@ -10,8 +10,6 @@ Owns: a request's life, and which policy a service has.
 Not here: sending (`sending`), links (`fogft.link`), ROS. Design: docs/design/dispatcher.md.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import time

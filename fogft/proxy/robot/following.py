@@ -7,8 +7,6 @@ Owns: the record client and the door of a client proxy.
 Not here: links (`links`), files and signals (`process`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -3,8 +3,6 @@
 Not here: what happens to them (`dispatcher`).
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable

@@ -8,8 +8,6 @@ Owns: which links exist. Not here: which of them a service uses (`client`), link
 (`fogft.link`). Under the client proxy's lock.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import asdict

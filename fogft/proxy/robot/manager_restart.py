@@ -3,8 +3,6 @@
 Owns: when. Not here: which manager wants it, and how it is started (its own file says so).
 """
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import time

@@ -6,8 +6,6 @@ kernel: it survives SIGKILL, and costs less than a microsecond.
 Owns: the file. Not here: what the numbers mean (`fogft.ordering.sequencer`).
 """
 
-from __future__ import annotations
-
 import mmap
 import re
 from pathlib import Path

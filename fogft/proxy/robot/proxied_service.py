@@ -7,8 +7,6 @@ request that may still be answered.
 Owns: offering and withdrawing it. Not here: its requests (`dispatcher`).
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection, Sequence
 

@@ -6,8 +6,6 @@ Owns: which links may be asked. Not here: whom to ask, and when (`requests.choos
 (`fogft.link`), answers (`dispatcher`).
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from types import MappingProxyType

@@ -7,8 +7,6 @@ wait for one, and the mark that survives this process. Protocol: docs/design/sta
 Owns: terms and the mark's file. Not here: callers, deadlines and links (`dispatcher`).
 """
 
-from __future__ import annotations
-
 import logging
 import secrets
 import time

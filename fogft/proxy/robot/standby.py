@@ -7,8 +7,6 @@ a spare waits for its place, which has no thread of ROS's or Zenoh's yet, so tha
 Owns: the place in line, and the order of a hand-over. Not here: a client proxy's work (`process`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import importlib

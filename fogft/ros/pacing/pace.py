@@ -8,8 +8,6 @@ taken. What shows that it takes: docs/design/serialised-services.md.
 Owns: that account. Not here: sending, probing, waiting (`pacer`).
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterator

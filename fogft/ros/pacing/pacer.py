@@ -8,8 +8,6 @@ Owns: the responses that wait, the thread that sends them, and probes of clients
 when one may be sent (`pace`), sending it (`entities`).
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import threading

@@ -8,8 +8,6 @@ holds after a while. All are counted. Where strangers hold all descriptors that 
 have, all of them are ended. Who looks sees, too, which links are thin.
 """
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os

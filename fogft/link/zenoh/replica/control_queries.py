@@ -4,8 +4,6 @@ Zenoh's threads only decode them and hand them over; the worker thread answers t
 queue behind the replies of their robot. Requests and replies: `listener`, `reply_queue`.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace

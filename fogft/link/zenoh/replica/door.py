@@ -5,8 +5,6 @@ that fails, so few strangers are let in of each host (an IPv4 address, or a netw
 they are ended one by one. The sockets are in `connection_reaper` and `listen_filter`.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Mapping
 

@@ -6,8 +6,6 @@ Links that are open are other sockets, and do not notice. Whose connections are 
 in `door`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import ipaddress

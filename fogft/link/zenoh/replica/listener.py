@@ -8,8 +8,6 @@ more thread, ahead of all replies.
 Not here: what a request is worth (`fogft.proxy.replica.responder`), duplicates included.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

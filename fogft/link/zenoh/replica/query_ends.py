@@ -6,8 +6,6 @@ that only it can make. So a query is ended when that thread has come to the next
 by the threads of `reply_queue`.
 """
 
-from __future__ import annotations
-
 import time
 
 import zenoh

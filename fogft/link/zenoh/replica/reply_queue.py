@@ -9,8 +9,6 @@ is closed.
 Not here: what is replied (`fogft.proxy.replica`).
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Sequence

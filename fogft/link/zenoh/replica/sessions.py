@@ -6,8 +6,6 @@ token and this replica's name. From then on the token, which only the two ends k
 for the holder. Not here: signatures (`signing`), TLS (`settings`).
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import OrderedDict

@@ -5,8 +5,6 @@ connection's own, so a peer that takes nothing costs nobody else. Not here: the 
 (`connection`), what becomes of requests (`fogft.proxy.robot.dispatcher`).
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence

@@ -10,8 +10,6 @@ nothing costs nobody else. What sends raises `zenoh.ZError` where the session is
 Not here: the requests open on it (`attempts`), when to open and when to give up (`link`).
 """
 
-from __future__ import annotations
-
 import secrets
 import threading
 import time

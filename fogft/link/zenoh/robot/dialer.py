@@ -1,7 +1,5 @@
 """Creates links over Zenoh, and holds what all links of a robot share."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time
