@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -26,6 +27,16 @@ def wait_for(
         if time.monotonic() > deadline:
             pytest.fail(f"waited {limit_s:.0f} s in vain: {what}")
         time.sleep(0.005)
+
+
+def expect_line(process: subprocess.Popen[str], line: str) -> None:
+    """Read a process's next line; end the process if it is another one."""
+    assert process.stdout is not None
+    said = process.stdout.readline()
+    if said != f"{line}\n":
+        process.kill()
+        process.wait()
+    assert said == f"{line}\n"
 
 
 @pytest.fixture

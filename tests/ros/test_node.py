@@ -19,7 +19,7 @@ from fogft.errors import RosError
 from fogft.ros import cyclone
 from tests.needs import needs
 
-from .conftest import LIMIT_S, SET_BOOL, wait_for
+from .conftest import LIMIT_S, SET_BOOL, expect_line, wait_for
 
 pytestmark = pytest.mark.ros
 
@@ -44,7 +44,7 @@ def test_no_other_user_can_read_what_a_node_sends(
     """Fast DDS makes its segments readable by all; ports hold no message, and stay as they are."""
     echo_pair(make_node, ros_domain)
     maps = Path("/proc/self/maps").read_text()
-    segments = set(re.findall(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]{16}\b", maps))
+    segments = set(re.findall(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]{16}$", maps, re.M))
     assert segments
     assert {Path(one).stat().st_mode & 0o777 for one in segments} == {0o600}
 
@@ -301,8 +301,7 @@ def test_a_process_that_forgets_to_close_still_ends(ros_domain: int) -> None:
     process = subprocess.Popen(
         [sys.executable, "-c", child], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
-    assert process.stdout is not None
-    assert process.stdout.readline() == "up\n"
+    expect_line(process, "up")
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=LIMIT_S)
     assert process.returncode != 0

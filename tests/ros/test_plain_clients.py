@@ -22,7 +22,7 @@ import pytest
 from fogft.ros.messages import default_response
 from fogft.ros.node import SerialisedNode
 
-from .conftest import wait_for
+from .conftest import expect_line, wait_for
 
 pytestmark = pytest.mark.ros
 
@@ -84,7 +84,7 @@ def start(domain: int, name: str, client: tuple[int, float, int], *service: str)
         stdout=subprocess.PIPE,
         text=True,
     )
-    assert process.stdout.readline() == "ready\n"
+    expect_line(process, "ready")
     return process
 
 
