@@ -14,7 +14,6 @@ from fogft.link.frame import NO_STAMP, STAMP_BYTES, RequestHeader
 from fogft.link.port import Answer
 from fogft.model import refusal
 from fogft.model.names import REQUEST_ID_BYTES
-from fogft.requests.load import Load
 
 LIMIT = 64  # entries
 ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload leaves alone: it does not wait, nor make wait
@@ -76,17 +75,15 @@ def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
     """Return the stamp and the answers of a batch. Raises FrameError: it is not one."""
     if not is_batch(header) or len(header) != _STAMPED:
         raise FrameError("no batch of answers")
-    return header[1:], [
-        _answer(id, part, frame.decode_load(load), refused=refused)
-        for (id, load, refused, _), part in _entries(_ANSWER, payload)
-    ]
-
-
-def _answer(id: bytes, part: bytes, load: Load | None, *, refused: bool) -> Answer:
-    if not refused:
-        return Answer(id, part, load=load)
-    kind, detail = refusal.read(frame.read_reason(part))
-    return Answer(id, refusal=kind, detail=detail, load=load)
+    found = []
+    for (id, said, refused, _), part in _entries(_ANSWER, payload):
+        load = frame.decode_load(said)
+        if refused:
+            kind, detail = refusal.read(frame.read_reason(part))
+            found.append(Answer(id, refusal=kind, detail=detail, load=load))
+        else:
+            found.append(Answer(id, part, load=load))
+    return header[1:], found
 
 
 def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[Any, ...], bytes]]:

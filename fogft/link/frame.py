@@ -28,7 +28,6 @@ TOKEN_BYTES = 8
 STAMP_BYTES = 4
 NO_STAMP = bytes(STAMP_BYTES)  # nothing was seen yet, or nobody asks
 REASON_LIMIT = 64
-REMAINING_LIMIT_S = LONGEST_S
 CANCEL_LIMIT = 4096
 _CANCEL_BYTES_LIMIT = 1 + CANCEL_LIMIT * REQUEST_ID_BYTES
 
@@ -94,7 +93,7 @@ def read_origin(origin: bytes) -> tuple[bytes, str]:
 
 def check_remaining(remaining_s: float) -> None:
     """Refuse a remaining time that is negative, too long, or no number."""
-    if not 0 <= remaining_s <= REMAINING_LIMIT_S:  # false for NaN too
+    if not 0 <= remaining_s <= LONGEST_S:  # false for NaN too
         raise FrameError(f"a remaining time of {remaining_s} s")
 
 

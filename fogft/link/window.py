@@ -19,6 +19,7 @@ from queue import SimpleQueue
 
 from fogft.byte_limit import ByteLimit
 from fogft.link import batch_frames
+from fogft.link.frame import CANCEL_LIMIT
 from fogft.requests.load import Handling
 
 # 512 small attempts cost less than 1 MB (here and in Zenoh); the bytes are what
@@ -212,7 +213,6 @@ class BatchBuffer:
 
 WORTH_S = 0.005
 EVERY_S = 0.01  # under load each answer has a loser: they are told together
-CANCELLED_LIMIT = 4096  # what one message carries; of further ones nobody is told
 
 
 class Cancellations:
@@ -227,7 +227,7 @@ class Cancellations:
 
     def add(self, request_id: bytes, sent_at: float, now: float) -> bool:
         """Cancel a request sent at `sent_at`; return whether to tell the replica at once."""
-        if len(self._ids) < CANCELLED_LIMIT:
+        if len(self._ids) < CANCEL_LIMIT:  # what one message carries; of others nobody is told
             self._ids[request_id] = None
         if now - sent_at < WORTH_S or now - self._told_at < EVERY_S:
             return False
@@ -243,9 +243,6 @@ class Cancellations:
         return [id for id in list(self._ids) if self._ids.pop(id, self) is None]
 
 
-Waiting = list[tuple[float, int, OpenAttempt]]
-
-
 class SendQueue:
     """A queue of attempts, the newest of `latest` services first. None ends the sender thread."""
 
@@ -254,7 +251,7 @@ class SendQueue:
         self.qsize = self._queued.qsize
         self._lock = threading.Lock()
         self._order = count()
-        self._waiting: dict[str, Waiting] = {service: [] for service in latest}
+        self._waiting = {service: list[tuple[float, int, OpenAttempt]]() for service in latest}
 
     def overtakes(self, service: str) -> bool:
         """Whether a service's newest request is sent first."""

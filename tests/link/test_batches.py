@@ -26,6 +26,7 @@ from fogft.link.zenoh.replica.reply_queue import BYTES_LIMIT as REPLY_BYTES_LIMI
 from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueue, ReplyQueues
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
+from fogft.model.keys import LONGEST_S
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.requests.load import Handling, Load
@@ -48,9 +49,7 @@ ORIGIN = frame.origin("ada", bytes(8))
 loads = st.sampled_from([NO_LOAD, frame.encode_load(Load(3, 1, 2, 0.5, 0.25))])
 handlings = st.sampled_from([Handling.NORMAL, Handling.DROP_IF_BUSY, Handling.ALONE])
 requests = st.lists(
-    st.tuples(
-        ids, st.floats(0, frame.REMAINING_LIMIT_S), st.sampled_from(list(Handling)), payloads
-    ),
+    st.tuples(ids, st.floats(0, LONGEST_S), st.sampled_from(list(Handling)), payloads),
     min_size=1,
     max_size=8,
 )

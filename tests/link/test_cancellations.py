@@ -7,7 +7,8 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.link.window import CANCELLED_LIMIT, EVERY_S, WORTH_S, Cancellations
+from fogft.link.frame import CANCEL_LIMIT
+from fogft.link.window import EVERY_S, WORTH_S, Cancellations
 
 ids = st.binary(min_size=16, max_size=16)
 
@@ -32,9 +33,9 @@ def test_each_is_told_once_unless_it_was_answered(steps):
 
 def test_they_are_bounded():
     cancellations = Cancellations()
-    for number in range(CANCELLED_LIMIT + 10):
+    for number in range(CANCEL_LIMIT + 10):
         cancellations.add(number.to_bytes(16, "big"), 0.0, 0.0)
-    assert len(cancellations.take()) == CANCELLED_LIMIT
+    assert len(cancellations.take()) == CANCEL_LIMIT
 
 
 @given(st.lists(st.tuples(st.floats(0, 0.02), st.floats(0, 0.02)), min_size=1))

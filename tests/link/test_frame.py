@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from fogft.errors import FrameError
 from fogft.link import frame, probe_frames
 from fogft.link.port import GatewayView, Probe, ProbeAnswer
+from fogft.model.keys import LONGEST_S
 from fogft.model.names import NAMES_BYTES_LIMIT
 from fogft.model.replica import LinkState
 from fogft.model.type_definition import Definition
@@ -28,7 +29,7 @@ stamps = st.binary(min_size=4, max_size=4)
 robots = st.text(st.characters(categories=["L", "N", "P"]), min_size=1, max_size=64).filter(
     lambda name: len(name.encode()) <= frame.ROBOT_BYTES_LIMIT and name.isprintable()
 )
-remaining = st.floats(0, frame.REMAINING_LIMIT_S, allow_nan=False)
+remaining = st.floats(0, LONGEST_S, allow_nan=False)
 reasons = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=64)
 texts = st.text(max_size=100).filter(str.isprintable)
 counts = st.integers(0, 2**53 - 1)

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
-from fogft.link.dial_out.tunnel import Tunnels, hang_up, keep_alive
+from fogft.link.dial_out.tunnel import GREETING_TIMEOUT_S, Tunnels, hang_up, keep_alive
 from fogft.model.names import host_and_port
 from fogft.records import frames
 from fogft.records.record import RecordError, Sign
@@ -24,7 +24,6 @@ WAITING = 2
 TARGETS_LIMIT = 64
 _BACKOFF_S = 0.3
 _CONNECT_TIMEOUT_S = 1.5
-_GREETING_TIMEOUT_S = 5.0
 
 
 class DialOut:
@@ -76,10 +75,12 @@ class DialOut:
         while not stop.is_set():
             link: socket.socket | None = None
             try:
-                link = self._come(door)
+                link = socket.create_connection(host_and_port(door), _CONNECT_TIMEOUT_S)
+                self._greet(link)
                 self._say(door, "")
                 if self._wait(link, stop):
-                    self._join(link)
+                    own = socket.create_connection(self._local, _CONNECT_TIMEOUT_S)
+                    self._tunnels.carry(link, own)
                     link = None
                     continue  # at once: another one takes its place
             except (OSError, EOFError, RecordError) as error:
@@ -89,19 +90,13 @@ class DialOut:
                     hang_up(link)
             stop.wait(_BACKOFF_S)
 
-    def _come(self, door: str) -> socket.socket:
-        """Return a connection on which the door was told who we are."""
-        link = socket.create_connection(host_and_port(door), _CONNECT_TIMEOUT_S)
-        try:
-            keep_alive(link)
-            nonce, _ = frames.read_challenge(tunnel.receive(link, 4 << 10, _GREETING_TIMEOUT_S))
-            link.settimeout(_GREETING_TIMEOUT_S)
-            proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
-            link.sendall(frames.greeting(*self._sign(proof)))
-        except BaseException:
-            link.close()
-            raise
-        return link
+    def _greet(self, link: socket.socket) -> None:
+        """Tell the door who we are."""
+        keep_alive(link)
+        nonce, _ = frames.read_challenge(tunnel.receive(link, 4 << 10))
+        link.settimeout(GREETING_TIMEOUT_S)
+        proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
+        link.sendall(frames.greeting(*self._sign(proof)))
 
     def _wait(self, link: socket.socket, stop: threading.Event) -> bool:
         """Wait until the connection is taken into use; return False where we are to leave."""
@@ -119,15 +114,6 @@ class DialOut:
             elif time.monotonic() - heard_at > SILENCE_S:
                 raise TimeoutError("the robot is silent")
         return False
-
-    def _join(self, link: socket.socket) -> None:
-        try:
-            own = socket.create_connection(self._local, _CONNECT_TIMEOUT_S)
-        except OSError:
-            hang_up(link)
-            raise
-        own.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._tunnels.carry(link, own)
 
     def _say(self, door: str, detail: str) -> None:
         with self._lock:

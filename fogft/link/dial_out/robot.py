@@ -19,7 +19,13 @@ from collections.abc import Callable, Collection, Mapping
 
 from fogft.counters import Counters
 from fogft.link.dial_out import tunnel
-from fogft.link.dial_out.tunnel import Tunnels, hang_up, keep_alive
+from fogft.link.dial_out.tunnel import (
+    GREETING_TIMEOUT_S,
+    Tunnels,
+    hang_up,
+    keep_alive,
+    shut_down,
+)
 from fogft.model.credentials import Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.records import frames
@@ -35,7 +41,6 @@ SILENCE_S = 3.0
 WAITING_LIMIT = 4  # of one replica
 REPLICAS_LIMIT = 64
 GREETINGS_LIMIT = 64
-_GREETING_TIMEOUT_S = 5.0
 _PATIENCE_S = 1.0
 
 
@@ -94,8 +99,7 @@ class DialIn:
                 if len(self._greeting) >= GREETINGS_LIMIT:
                     crowd = oldest_of_most(self._greeting)
                     self._count("greeting_crowded", self._greeting.pop(crowd))
-                    with contextlib.suppress(OSError):  # its thread closes it
-                        crowd.shutdown(socket.SHUT_RDWR)
+                    shut_down(crowd)  # its thread closes it
                 self._greeting[link] = host
             threading.Thread(
                 target=self._attend, args=(link, host), name="fogft-greet", daemon=True
@@ -119,10 +123,10 @@ class DialIn:
 
     def _greet(self, link: socket.socket, host: str) -> ReplicaId:
         keep_alive(link)
-        link.settimeout(_GREETING_TIMEOUT_S)
+        link.settimeout(GREETING_TIMEOUT_S)
         nonce = secrets.token_bytes(frames.NONCE_BYTES)
         link.sendall(frames.challenge(nonce, host))
-        message = tunnel.receive(link, 16 << 10, _GREETING_TIMEOUT_S)
+        message = tunnel.receive(link, 16 << 10)
         certificate, signature = frames.read_greeting(message)
         proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
         writer = self._verify(certificate, signature, proof)
@@ -214,7 +218,6 @@ class DialIn:
             if one is None:
                 link.close()  # the link tries again soon
                 continue
-            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._tunnels.carry(link, one.link)
             self._counters.add("tunnels")
 
@@ -256,19 +259,13 @@ class DialIn:
         hang_up(self._door)
         self.keep(())
         with self._lock:
-            waiting = list(self._waiting)
+            shut_down(*(one.link for one in self._waiting))
             self._lock.notify_all()
-        for one in waiting:
-            with contextlib.suppress(OSError):
-                one.link.shutdown(socket.SHUT_RDWR)
         self._tunnels.close()
 
 
 def _drained(link: socket.socket) -> bool:
-    """Read signs of life away up to the replica's `GO`, behind which TLS begins.
-
-    The TLS client speaks first, so nothing behind `GO` can be here yet.
-    """
+    """Read signs of life away up to the replica's `GO`: behind it the TLS client speaks first."""
     link.settimeout(SILENCE_S)
     try:
         while True:

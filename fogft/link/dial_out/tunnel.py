@@ -8,15 +8,17 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterable
 from typing import Any
 
 from fogft.records import frames
 
+GREETING_TIMEOUT_S = 5.0
 _LEAST_S = 0.01  # a time-out of 0 would mean none
 
 
-def receive(link: socket.socket, limit_bytes: int, within_s: float) -> dict[str, Any]:
+def receive(
+    link: socket.socket, limit_bytes: int, within_s: float = GREETING_TIMEOUT_S
+) -> dict[str, Any]:
     """Receive the first message, the whole of it within the time.
 
     Raises OSError: it did not come in time, or the connection broke. EOFError: the other party
@@ -51,9 +53,15 @@ def keep_alive(link: socket.socket) -> None:
 
 def hang_up(link: socket.socket) -> None:
     """End a connection in any state, also for a thread that waits on it."""
-    with contextlib.suppress(OSError):
-        link.shutdown(socket.SHUT_RDWR)
+    shut_down(link)
     link.close()
+
+
+def shut_down(*links: socket.socket) -> None:
+    """End connections, which the threads that wait on them close."""
+    for link in links:
+        with contextlib.suppress(OSError):
+            link.shutdown(socket.SHUT_RDWR)
 
 
 class Tunnels:
@@ -68,6 +76,7 @@ class Tunnels:
         ends = (one, other)
         for link in ends:
             link.setblocking(True)
+            link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
             self._open.update(ends)
         left = [other, one]  # directions that go on; list.pop is atomic
@@ -83,7 +92,7 @@ class Tunnels:
             _splice(source.fileno(), target.fileno())
             target.shutdown(socket.SHUT_WR)  # the other direction may go on
         except (OSError, ValueError):
-            _end((source, target))
+            shut_down(source, target)
         left.pop()
         if not left:
             with self._lock:
@@ -94,13 +103,7 @@ class Tunnels:
     def close(self) -> None:
         """End all tunnels. Their threads close the sockets."""
         with self._lock:
-            _end(self._open)
-
-
-def _end(links: Iterable[socket.socket]) -> None:
-    for link in links:
-        with contextlib.suppress(OSError):
-            link.shutdown(socket.SHUT_RDWR)
+            shut_down(*self._open)
 
 
 def _splice(source: int, target: int) -> None:
