@@ -45,14 +45,14 @@ class Forwarder:
         self._unready_since: dict[str, float] = {}
         self._known = KnownRequests(self.kept_bytes, 4 * self.held_limit, self.held_bytes)
         self._by_robot: Counter[str] = Counter()
-        self._queue: SimpleQueue[Job | None] = SimpleQueue()
+        self.queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
         self.joined = 0  # copies of requests that were known
         self.refused: Counter[Refusal] = Counter()
 
     def start(self) -> None:
         """Start forwarding on its own thread, since the link's threads must not send."""
-        threading.Thread(target=self._pass_on, name="fogft-forward", daemon=True).start()
+        threading.Thread(target=self.pass_on, name="fogft-forward", daemon=True).start()
 
     def use(self, service: str, dispatcher: Dispatcher) -> None:
         """Set the dispatcher of a service."""
@@ -79,7 +79,7 @@ class Forwarder:
                     job = Job(self._clock(), incoming)
                     self._known.add(job)
                     self._by_robot[job.robot] += 1
-                    self._queue.put(job)
+                    self.queue.put(job)
                     return
             else:
                 self.joined += 1
@@ -133,8 +133,9 @@ class Forwarder:
 
     # -- to replicas ----------------------------------------------------------------------
 
-    def _pass_on(self) -> None:
-        while (job := self._queue.get()) is not None:
+    def pass_on(self) -> None:
+        """Forward the requests taken, until closed."""
+        while (job := self.queue.get()) is not None:
             try:
                 self._forward(job)
             except Exception:  # in this thread nobody else would tell of it
@@ -156,13 +157,6 @@ class Forwarder:
         self.passed += 1
         if job.waiting is None:
             dispatcher.cancel(job.id)  # stopped in between; answered is fine, too
-
-    def pass_on_waiting(self) -> None:
-        """Forward the requests taken; for tests without a thread."""
-        while not self._queue.empty():
-            job = self._queue.get()
-            if job is not None:
-                self._forward(job)
 
     # -- from replicas (their links' threads) ---------------------------------------------
 
@@ -215,4 +209,4 @@ class Forwarder:
             left = self._known.unanswered(None)
         for job in left:
             self._stop(job.id, Refusal.LOST)
-        self._queue.put(None)
+        self.queue.put(None)

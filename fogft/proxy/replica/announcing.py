@@ -16,8 +16,6 @@ from fogft.records.signing import Signer
 
 log = logging.getLogger(__name__)
 
-_NOTHING = Known()
-
 
 class Presence:
     """A replica's connections to the rendezvous and to dial-in ports.
@@ -50,7 +48,7 @@ class Presence:
     def look(self, ready: frozenset[str], *, draining: bool) -> Known:
         """Publish changes, dial new dial-in ports; return the known records."""
         if self._client is None:
-            return _NOTHING
+            return Known()
         self._announce(self._client, ready, draining=draining)
         known = self._client.known
         if known is not self._seen:

@@ -67,6 +67,8 @@ class KnownRequests:
     def forget(self, job: Job) -> None:
         """Forget a finished job, so that a copy is run again."""
         del self._jobs[job.id]
+        if self._kept.pop(job.id, None) is not None:
+            self._kept_bytes -= len(job.answer or b"")
 
     def keep(self, job: Job, answer: bytes) -> None:
         """Keep the answer to a job for copies, within the bounds."""
@@ -80,12 +82,7 @@ class KnownRequests:
         if len(self._jobs) > self._kept_ids:
             oldest_done = next((job for job in self._jobs.values() if job.waiting is None), None)
             if oldest_done is not None:
-                self._drop(oldest_done)
-
-    def _drop(self, job: Job) -> None:
-        del self._jobs[job.id]
-        if self._kept.pop(job.id, None) is not None:
-            self._kept_bytes -= len(job.answer or b"")
+                self.forget(oldest_done)
 
     def expired(self, now: float) -> list[bytes]:
         """Forget jobs past their deadline; return the ids that a caller still waits for."""
@@ -96,7 +93,7 @@ class KnownRequests:
             if job is None or job.deadline > now:
                 continue
             if job.waiting is None:
-                self._drop(job)
+                self.forget(job)
             else:
                 late.append(id)
         return late

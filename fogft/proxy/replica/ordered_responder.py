@@ -34,10 +34,6 @@ class Clients(NamedTuple):
     snapshot: RosClient
     restore: RosClient
 
-    def available(self) -> bool:
-        """Whether discovery has found all three."""
-        return all(client.available() for client in self)
-
 
 class OrderedResponder:
     """Applies the requests of one stateful service, in their order."""
@@ -163,7 +159,8 @@ class OrderedResponder:
         """Look for the services, and retry calls that ROS rejected. Call at about 10 Hz."""
         with self._lock:
             clients = self._clients
-            self._machine.serving = alive and clients is not None and clients.available()
+            there = clients is not None and all(client.available() for client in clients)
+            self._machine.serving = alive and there
             again, self._again = self._again, None
             begun = self._begun
             waited_s = self._clock() - self._begun_at

@@ -75,7 +75,6 @@ class Responder:
         self.known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
         self._queues: dict[str, ServiceQueue] = {}
         self.ran, self.ran_s = 0, 0.0  # requests passed on, and the time they took together
-        self.joined = 0  # copies of requests that were known
         self.saved = self.interrupted = 0  # dropped unbegun, or told to stop: nobody wanted them
         self.wasted, self.wasted_s = 0, 0.0  # run for nobody: too late, or unwanted
 
@@ -137,7 +136,6 @@ class Responder:
         with self._lock:
             known = self.known.get(incoming.request_id)
             if known is not None:
-                self.joined += 1
                 if known.waiting is not None and not known.unwanted:
                     known.waiting.append(incoming)
                     return

@@ -179,8 +179,7 @@ class ServerProxy:
         if self._node is None or not self.command.alive:
             self._offering.reset()
             return
-        complete = len(self.ready) == len(self._offering.services)
-        for service in self._offering.look(self._node, complete=complete):
+        for service in self._offering.look(self._node, complete=self.complete):
             name, type_name = service.name, service.type
             log.info("service_found replica=%s service=%s type=%s", self._id, name, type_name)
             self._make_client(self._node, service)

@@ -141,7 +141,7 @@ class TopicsOnReplica:
         if node is None:
             return
         if self._thread is None:
-            self._thread = threading.Thread(target=self._publish, name="fogft-topics", daemon=True)
+            self._thread = threading.Thread(target=self.publish, name="fogft-topics", daemon=True)
             self._thread.start()
         for name, topic in self._topics.items():
             try:
@@ -190,28 +190,25 @@ class TopicsOnReplica:
             for name, subscription in self._subscriptions.items():
                 self._note(name, subscription.mismatch())
 
-    def _publish(self) -> None:
+    def publish(self) -> None:
+        """Publish queued messages, and confirm them to the robots, until closed."""
         while (incoming := self.queue.get()) is not None:
             try:
-                self.publish_one(incoming)
+                session, number, message = frames.decode_message(incoming.payload)
+                publisher = self._publishers.get(incoming.service)
+                if publisher is None:
+                    incoming.refuse(Refusal.NOT_READY)
+                    continue
+                publisher.check(message)
+                if self._seen[incoming.service].is_new(session, number):
+                    publisher.publish(message)
+                incoming.reply(b"")
             except (FrameError, Unreadable) as error:
                 log.warning("message_refused topic=%s reason=%r", incoming.service, str(error))
                 incoming.refuse(Refusal.MALFORMED)
             except Exception:
                 log.exception("message_not_published topic=%s", incoming.service)
                 incoming.refuse(Refusal.NOT_READY)
-
-    def publish_one(self, incoming: Incoming) -> None:
-        """Publish one queued message, and confirm it to the robot. Publishing thread only."""
-        session, number, message = frames.decode_message(incoming.payload)
-        publisher = self._publishers.get(incoming.service)
-        if publisher is None:
-            incoming.refuse(Refusal.NOT_READY)
-            return
-        publisher.check(message)
-        if self._seen[incoming.service].is_new(session, number):
-            publisher.publish(message)
-        incoming.reply(b"")
 
     def close(self) -> None:
         """Stop publishing."""

@@ -178,11 +178,8 @@ class Delivery:
     def _without_fallback(self, request: bytes, pending: Pending) -> None:
         """The fallback had nothing either: return the rejection if there is one."""
         response = pending.rejection
-        with self._ledger.lock:
-            outcome = Outcome.SILENT if response is None else Outcome.ANSWERED
-            self._ledger.end(request, pending, outcome)
-        if response is not None:
-            self.give(pending, response)
+        outcome = Outcome.SILENT if response is None else Outcome.ANSWERED
+        self._end(request, pending, outcome, response)
 
     def _warn(self, counter: str, event: str, reason: str) -> None:
         with self._ledger.lock:

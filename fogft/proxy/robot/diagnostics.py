@@ -69,7 +69,9 @@ class Diagnosis:
         links = report["links"]
         up = sum(link["state"] == "up" for link in links)
         worst = max((status.level for status in services), default=Level.WARN)
-        age_s, left_s = _lease(links)
+        leases = [one for one in links if one.get("lease_age_s") is not None]
+        age_s = min((float(one["lease_age_s"]) for one in leases), default=0.0)
+        left_s = min((float(one["lease_left_s"]) for one in leases), default=None)
         if report["uplink_suspected"]:
             message = "all replicas fell silent together: the robot's uplink is suspected"
             worst = Level.ERROR
@@ -168,13 +170,6 @@ class Diagnosis:
         return Status(level, f"fogft {self._pool}: {what}", message, hardware, told)
 
 
-def _lease(links: list[Mapping[str, Any]]) -> tuple[float, float | None]:
-    """Return how old the newest lease of a manager is, and when the first replica ends without."""
-    known = [one for one in links if one.get("lease_age_s") is not None]
-    age_s = min((float(one["lease_age_s"]) for one in known), default=0.0)
-    return age_s, min((float(one["lease_left_s"]) for one in known), default=None)
-
-
 def _ms(seconds: float | None) -> float | None:
     return None if seconds is None else round(seconds * 1000, 3)
 
@@ -206,7 +201,7 @@ class SeenFromRos:
     ) -> None:
         self._policies = Policies(check_field)
         self._lock = threading.Lock()
-        self._was_set = threading.Event()
+        self._was_set = False
         self._diagnosis = Diagnosis(pool, robot)
         self._diagnosed = float("-inf")
         self._visible = make_visible(self._set)
@@ -219,10 +214,10 @@ class SeenFromRos:
 
     def changed(self) -> tuple[ServiceSpec, ...] | None:
         """Return the services with parameters applied if one was set since; else None."""
-        if not self._was_set.is_set():
+        if not self._was_set:
             return None
         with self._lock:
-            self._was_set.clear()
+            self._was_set = False
             return self._take()
 
     def _take(self) -> tuple[ServiceSpec, ...]:
@@ -237,8 +232,8 @@ class SeenFromRos:
                 self._policies.set(values)
             except ValueError as error:
                 return str(error)
+            self._was_set = True
         log.info("policy_set values=%s", dict(values))
-        self._was_set.set()
         return ""
 
     def diagnose(self, report: Callable[[], Mapping[str, Any]], now: float) -> None:

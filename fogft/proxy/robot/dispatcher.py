@@ -57,9 +57,11 @@ class Dispatcher:
         ok_of: Returns, for a name of a boolean response field, whether a response is a success;
             asked where the spec names an `ok_field`.
         empty_response: The serialised default response, for ``on_timeout: empty``.
-        max_pending_bytes, max_pending: Requests kept at once; more are turned away and counted.
+        max_pending_bytes: Of requests kept at once; more are turned away and counted.
         id_of: Gives a caller's request its id, by service and handle.
     """
+
+    max_pending = 1 << 16  # requests kept at once; more are turned away, too
 
     def __init__(
         self,
@@ -73,7 +75,6 @@ class Dispatcher:
         wake: Wake = lambda at=-NEVER: None,
         clock: Callable[[], float] = time.monotonic,
         max_pending_bytes: int = 256 << 20,
-        max_pending: int = 1 << 16,
         id_of: Callable[[str, Any], bytes] = lambda service, handle: os.urandom(REQUEST_ID_BYTES),
     ) -> None:
         self._id_of = id_of
@@ -87,7 +88,6 @@ class Dispatcher:
         self._usual_s = NEVER  # how soon after it began a request wants a look
         self._clock = clock
         self.max_pending_bytes = max_pending_bytes
-        self.max_pending = max_pending
         self._decide = Decide() if decide is None else decide
         if spec.ok_field and ok_of is not None:
             self._decide.accepts = ok_of(spec.ok_field)

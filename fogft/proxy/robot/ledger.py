@@ -48,8 +48,6 @@ class Ledger:
         replica: str = "",
     ) -> None:
         """Trace a request's outcome, if enabled."""
-        if self.outcomes.trace is None:
-            return
         arrived, trace = pending.arrived, pending.trace or Trace({}, {})
         asked = {key: begun - arrived for key, begun in trace.asked.items()}
         self.outcomes.note(

@@ -28,7 +28,7 @@ class Scene:
         self.responses: list[tuple[object, bytes]] = []
         options = {
             key: spec.pop(key)
-            for key in ("empty_response", "fault_of", "max_pending_bytes", "max_pending")
+            for key in ("empty_response", "fault_of", "max_pending_bytes")
             if key in spec
         }
         if (is_ok := spec.pop("is_ok", None)) is not None:
@@ -282,7 +282,8 @@ def test_pending_bytes_are_bounded(caplog: pytest.LogCaptureFixture):
 
 
 def test_pending_requests_are_bounded_however_small():
-    scene = Scene(1, max_pending=2)
+    scene = Scene(1)
+    scene.dispatcher.max_pending = 2
     for _ in range(3):
         scene.dispatcher.submit(b"", "caller")
     assert scene.dispatcher.report()["turned_away"] == 1

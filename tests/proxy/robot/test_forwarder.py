@@ -39,8 +39,13 @@ class Scene:
     def request(self, number: int = 1, **given) -> FakeIncoming:
         incoming = FakeIncoming(bytes([number]) * 16, **given)
         self.forwarder.request(incoming)
-        self.forwarder.pass_on_waiting()
+        self.pass_on()
         return incoming
+
+    def pass_on(self) -> None:
+        """Do what the forwarder's thread does, here."""
+        self.forwarder.queue.put(None)
+        self.forwarder.pass_on()
 
     def answer(self, slot: int, payload: bytes) -> None:
         link = self.links[slot]
@@ -56,7 +61,7 @@ def test_id_and_payload_pass_unchanged_and_the_time_left_shrinks(scene):
     incoming = FakeIncoming(b"i" * 16, b"asked", remaining_s=3.0)
     scene.forwarder.request(incoming)
     scene.clock.now += 1.0  # it waits for the forwarding thread
-    scene.forwarder.pass_on_waiting()
+    scene.pass_on()
     for link in scene.links:
         assert link.offered == [("/s", b"i" * 16, b"asked", pytest.approx(2.0))]
     scene.answer(1, b"answered")
