@@ -47,14 +47,7 @@ class OfReplica:
 
 
 class Outcomes:
-    """Counts since the start. Replicas are numbers, as in `requests`.
-
-    Attributes:
-        count: By `OUTCOMES_COUNTED`, which `fogft.metrics.proxies` describes.
-        of: By replica.
-        poisoned_at: When services last died over a request that was then given up; wall clock.
-        trace: How each request ended, until somebody takes it; None where it is not wanted.
-    """
+    """Counts since the start, described by `metrics.proxies`. Replicas are numbers."""
 
     def __init__(self) -> None:
         self.count = dict.fromkeys(OUTCOMES_COUNTED, 0)
@@ -64,8 +57,9 @@ class Outcomes:
         self._buckets = [0] * (len(BUCKETS_S) + 1)
         self._took_s = 0.0
         self._late_lock = threading.Lock()
+        # When services last died over a request that was then given up; wall clock.
         self.poisoned_at: float | None = None
-        self.trace: deque[dict[str, Any]] | None = None
+        self.trace: deque[dict[str, Any]] | None = None  # until taken; None where not wanted
 
     def received(self, size_bytes: int) -> None:
         """Count a received request."""

@@ -259,10 +259,7 @@ _DAYS_FORM = Special("days of the week", _days, {"type": ["string", "array"]})
 class WindowSpec:
     """A weekly time window in the schedule's time zone; None for the pool's own number or cap.
 
-    Attributes:
-        days: 0 for Monday to 6 for Sunday: on which it begins.
-        begins_s: Seconds after midnight by the clock on the wall, in [0, 86400).
-        ends_s: Likewise, in (0, 86400]; not after `begins_s` means the next day.
+    Days are from 0 for Monday; times are seconds after midnight by the clock on the wall.
     """
 
     days: frozenset[int] = key(

@@ -31,16 +31,11 @@ class Role(str, Enum):
 
 @dataclass(frozen=True, order=True)
 class Holder:
-    """The holder that a certificate names.
-
-    Attributes:
-        name: A robot's or gateway's name; a replica's slot, as text.
-        generation: From 1; a rotation of keys or a launch of a slot makes the next one.
-    """
+    """The holder that a certificate names."""
 
     role: Role
-    name: str
-    generation: int
+    name: str  # of a replica its slot, as text
+    generation: int  # from 1; a rotation of keys or a launch of a slot makes the next one
     pool_uid: str
 
     @property

@@ -19,22 +19,15 @@ LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
 class Intent:
     """The user's changes to a pool.
 
-    Attributes:
-        target: Replicas wanted by `scale`; None when the pool file decides.
-        scaled_from: The file's `replicas` when `target` was set. Once the file says
-            another number, the file decides again.
-        drained: Slot -> the highest generation there that is to be replaced.
-        excluded: Locations (``cloud``, ``cloud/region`` or all three) to keep out of.
-        began_at: When the hours of `max_hours` began anew; 0 as long as they count from the
-            pool's creation.
+    Once the file's `replicas` are not what `target` was `scaled_from`, the file decides again.
     """
 
-    target: Count | None = None
+    target: Count | None = None  # wanted by `scale`; None when the pool file decides
     scaled_from: Count | None = None
-    drained: Mapping[int, int] = field(default_factory=dict)
-    excluded: frozenset[str] = frozenset()
+    drained: Mapping[int, int] = field(default_factory=dict)  # slot -> up to which generation
+    excluded: frozenset[str] = frozenset()  # ``cloud``, ``cloud/region`` or all three
     stopping: bool = False
-    began_at: Moment = 0.0
+    began_at: Moment = 0.0  # when `max_hours` began anew; 0: they count from the pool's creation
     retried_at: Moment = 0.0
 
     def wanted(self, spec: PoolSpec) -> int:

@@ -53,18 +53,14 @@ class OneOf:
 class Text:
     """A text of some form.
 
-    Attributes:
-        what: What it must be, such as ``a service name``.
-        check: Returns the text as it is kept. Raises ValueError with what is wrong.
-        suggest: Returns what was probably meant; empty for nothing.
-        has_parts: Whether the proxies are told of further ones that no file may name, such as the
-            types of an action's parts.
+    With `has_parts` the proxies are told of further ones that no file may name, such as the types
+    of an action's parts.
     """
 
-    what: str
+    what: str  # it must be, such as ``a service name``
     hint: str
-    check: Callable[[str], str] = str
-    suggest: Callable[[str], str] = lambda text: ""
+    check: Callable[[str], str] = str  # returns it as it is kept; raises ValueError: what is wrong
+    suggest: Callable[[str], str] = lambda text: ""  # what was probably meant; empty for nothing
     has_parts: bool = False
 
 
@@ -98,17 +94,12 @@ class Table:
 
 @dataclass(frozen=True)
 class Map:
-    """A map whose keys are a dataclass's.
-
-    Attributes:
-        short: Keys that a plain value in place of the map stands for.
-        off: Whether `false` in its place means None.
-    """
+    """A map whose keys are a dataclass's."""
 
     of: type
     hint: str = ""
-    short: tuple[str, ...] = ()
-    off: bool = False
+    short: tuple[str, ...] = ()  # keys that a plain value in place of the map stands for
+    off: bool = False  # whether `false` in its place means None
 
 
 @dataclass(frozen=True)
@@ -189,21 +180,14 @@ def checked(form: Form, value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Key:
-    """The description of one key.
-
-    Attributes:
-        name: The key, where the field is called otherwise.
-        usual: The default in words, where the value says nothing to people.
-        advanced: Whether it stands under `advanced`.
-        parameter: Whether it is a ROS parameter of the client proxy.
-    """
+    """The description of one key."""
 
     form: Form
     help: str
-    name: str = ""
-    usual: str = ""
-    advanced: bool = False
-    parameter: bool = False
+    name: str = ""  # where the field is called otherwise
+    usual: str = ""  # the default in words, where the value says nothing to people
+    advanced: bool = False  # whether it stands under `advanced`
+    parameter: bool = False  # whether it is a ROS parameter of the client proxy
 
 
 class Entry(NamedTuple):

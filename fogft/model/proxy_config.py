@@ -41,22 +41,16 @@ LastsFor = Annotated[float, within(1e-12, LONGEST_S)]
 
 @dataclass(frozen=True, kw_only=True)
 class ProxyConfig:
-    """Configuration common to all proxies.
-
-    Attributes:
-        domain_id: ROS domain; ROS_DOMAIN_ID where it is not set.
-        records: What was learned from rendezvous, for the next start.
-        announcements: What the manager signed for every replica.
-    """
+    """Configuration common to all proxies."""
 
     pool: str
     pool_uid: PoolUid
     credentials: CredentialPaths
     services: tuple[ServiceSpec, ...]
-    domain_id: DomainId | None = None
+    domain_id: DomainId | None = None  # ROS domain; ROS_DOMAIN_ID where it is not set
     rendezvous: tuple[Endpoint, ...] = ()
-    records: Path | None = None
-    announcements: Path | None = None
+    records: Path | None = None  # what was learned from rendezvous, for the next start
+    announcements: Path | None = None  # what the manager signed for every replica
     metrics: EndpointOrEmpty = ""
     topics: tuple[TopicSpec, ...] = ()
     rmw: Speaks = Speaks.RCLPY
@@ -64,54 +58,34 @@ class ProxyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ClientProxyConfig(ProxyConfig):
-    """Configuration of `fogft proxy` and `fogft gateway`, which passes `announcements` on.
+    """Configuration of `fogft proxy` and `fogft gateway`, which passes `announcements` on."""
 
-    Attributes:
-        robot: Name of this robot, or gateway.
-        membership: Which replicas there are; written by the manager.
-        status: What the proxy reports to the manager.
-        suspect_after_s: Nothing more is sent to a replica after so long without a probe reply.
-        tell_losers: Whether replicas are told which requests were answered elsewhere.
-        dial_in: Address that replicas which cannot be reached are given; `dial_in_listen` is where
-            to listen for them, if not on that port of all addresses.
-        uplinks: Network interfaces to use at once, the preferred one first.
-        listen: Where a gateway listens for robots.
-    """
-
-    robot: Robot
-    membership: Path
-    status: Path
+    robot: Robot  # the name of this robot, or gateway
+    membership: Path  # which replicas there are; written by the manager
+    status: Path  # what the proxy reports to the manager
     lock: Path
-    suspect_after_s: LastsFor = 2.0
-    tell_losers: bool = True
-    dial_in: EndpointOrEmpty = ""
-    dial_in_listen: EndpointOrEmpty = ""
-    uplinks: tuple[Interface, ...] = ()
-    listen: EndpointOrEmpty = ""
+    suspect_after_s: LastsFor = 2.0  # without a probe reply, a replica is sent nothing more
+    tell_losers: bool = True  # whether replicas are told which requests were answered elsewhere
+    dial_in: EndpointOrEmpty = ""  # what replicas are given that cannot be reached
+    dial_in_listen: EndpointOrEmpty = ""  # if not on that port of all addresses
+    uplinks: tuple[Interface, ...] = ()  # to use at once, the preferred one first
+    listen: EndpointOrEmpty = ""  # where a gateway listens for robots
 
 
 @dataclass(frozen=True, kw_only=True)
 class ServerProxyConfig(ProxyConfig):
-    """Configuration of `fogft serve`, whose options override the file.
-
-    Attributes:
-        run: Command that starts the services in `workdir`; empty where they are started otherwise.
-        spare: Whether a second process of it is kept, which takes over when the first dies.
-        notice: Where preemption notices come from.
-        advertise: Address at which this replica is reached, where it differs.
-        dial_out: Robots that this replica dials, where it cannot be reached.
-    """
+    """Configuration of `fogft serve`, whose options override the file."""
 
     slot: Annotated[int, within(0, 999_999)]
     generation: Generation
-    run: str = ""
-    spare: bool = False
+    run: str = ""  # starts the services in `workdir`; empty where they are started otherwise
+    spare: bool = False  # whether a second process of it is kept, for when the first dies
     listen: Endpoint = f"0.0.0.0:{LINK_PORT}"
     workdir: Path = Path()
     envs: Mapping[str, str] = field(default_factory=dict)
     notice: NoticeSource = "auto"
-    advertise: EndpointOrEmpty = ""
-    dial_out: tuple[Endpoint, ...] = ()
+    advertise: EndpointOrEmpty = ""  # where this replica is reached, if not where it listens
+    dial_out: tuple[Endpoint, ...] = ()  # robots that it dials, where it cannot be reached
 
     @property
     def id(self) -> ReplicaId:

@@ -124,36 +124,24 @@ class Cause(str, Enum):
 
 @dataclass(frozen=True)
 class Reason:
-    """A cause with its data. Fields that do not apply to the cause keep their defaults.
-
-    Attributes:
-        replica: ``slot.generation``.
-        location: ``cloud``, ``cloud/region`` or ``cloud/region/zone``.
-        name: Of a service, a gateway or a file.
-        seconds: How long, or until when.
-        count: How many, `of` so many.
-        share: Of one, such as a gain or an availability; `target` is what it is held against.
-        usd_per_hour: A price; `limit_usd_per_hour` is what it is held against.
-        words: What somebody else says: a cloud, a program, an error. Shown, never read.
-        because: What led to it, the main reason first.
-    """
+    """A cause with its data. Fields that do not apply to the cause keep their defaults."""
 
     omits_defaults: ClassVar = True  # written as plain data, it is the cause and what belongs to it
 
     cause: Cause
     slot: int | None = None
-    replica: str = ""
-    location: str = ""
-    name: str = ""
-    seconds: float | None = None
+    replica: str = ""  # ``slot.generation``
+    location: str = ""  # ``cloud``, ``cloud/region`` or ``cloud/region/zone``
+    name: str = ""  # of a service, a gateway or a file
+    seconds: float | None = None  # how long, or until when
     count: int | None = None
-    of: int | None = None
-    share: float | None = None
-    target: float | None = None
+    of: int | None = None  # so many
+    share: float | None = None  # of one, such as a gain or an availability
+    target: float | None = None  # what that is held against
     usd_per_hour: float | None = None
-    limit_usd_per_hour: float | None = None
-    words: str = ""
-    because: tuple[Reason, ...] = ()
+    limit_usd_per_hour: float | None = None  # what that is held against
+    words: str = ""  # what a cloud, a program or an error says: shown, never read
+    because: tuple[Reason, ...] = ()  # what led to it, the main reason first
 
 
 MOVES = frozenset(

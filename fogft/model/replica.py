@@ -22,17 +22,11 @@ _VERSION = re.compile(r"[\w.-]{0,64}", re.ASCII)
 
 @dataclass(frozen=True, order=True)
 class ReplicaId:
-    """One launch of one slot of one pool. Never used twice.
-
-    Attributes:
-        pool_uid: 16 lower-case hexadecimal digits, random, made at the pool's first `up`.
-        slot: The place in the pool, 0 and up. Outlives the machines that fill it.
-        generation: Counts the launches of a slot from 1. A higher one fences off the lower.
-    """
+    """One launch of one slot of one pool. Never used twice."""
 
     pool_uid: PoolUid
-    slot: Count
-    generation: Count
+    slot: Count  # outlives the machines that fill it
+    generation: Count  # counts the launches of a slot from 1; a higher one fences off the lower
 
     @property
     def short(self) -> str:
@@ -98,23 +92,15 @@ def supply(location: str, *, on_demand: bool) -> str:
 
 @dataclass(frozen=True)
 class Offer:
-    """A placement with its price in US dollars per hour.
-
-    Attributes:
-        source: Where the price comes from: ``live``, ``catalogue``; empty where it is simulated.
-        as_of: When it was true, in seconds since the epoch; 0 when that is not known.
-        group: The group of the pool file that it suits; empty where there are none.
-        extras_usd_per_hour: The part of the price that is for its disk and its address.
-        egress_usd_per_hour: The part that is for the responses that leave the cloud.
-    """
+    """A placement with its price in US dollars per hour."""
 
     placement: Placement
     usd_per_hour: float
-    source: str = ""
-    as_of: float = 0.0
-    group: str = ""
-    extras_usd_per_hour: float = 0.0
-    egress_usd_per_hour: float = 0.0
+    source: str = ""  # of the price: ``live``, ``catalogue``; empty where it is simulated
+    as_of: float = 0.0  # when it was true, in seconds since the epoch; 0 when that is not known
+    group: str = ""  # of the pool file that it suits; empty where there are none
+    extras_usd_per_hour: float = 0.0  # the part that is for its disk and its address
+    egress_usd_per_hour: float = 0.0  # the part that is for the responses that leave the cloud
 
 
 class Phase(str, Enum):
@@ -138,35 +124,25 @@ class MachinePhase(str, Enum):
 
 @dataclass(frozen=True)
 class Machine:
-    """One of fogft's machines in a cloud's list.
+    """One of fogft's machines in a cloud's list. Moments are seconds since the epoch; 0: unknown.
 
-    Attributes:
-        endpoint: ``host:port`` where the server proxy listens, once known.
-        notice: A preemption notice was given, where the cloud's own list tells: the machine ends
-            soon. Elsewhere its link tells (`LinkReport.leaving`).
-        spec_hash: `PoolSpec.replica_hash` at its launch; another one means outdated.
-        failure: Why the phase is FAILED, with the cloud's words (a log's last lines after a
-            line break); None otherwise.
-        progress: What the cloud says is being done there until it serves, for people.
-        running_at: When it was seen to run, in seconds since the epoch; 0 where it is not known.
-        set_up_at: When that was done, in seconds since the epoch; 0 where it is not known.
-        pool: The name of its pool, as far as the cloud knows it.
+    `notice` is of a preemption, where the list tells; elsewhere its link does (`LinkReport`).
     """
 
     id: ReplicaId
     placement: Placement
     phase: MachinePhase
     launched_at: float
-    endpoint: str | None = None
+    endpoint: str | None = None  # ``host:port`` where the server proxy listens, once known
     notice: bool = False
     usd_per_hour: float = 0.0
-    spec_hash: str = ""
-    failure: Reason | None = None
-    progress: str = ""
+    spec_hash: str = ""  # `PoolSpec.replica_hash` at its launch; another one means outdated
+    failure: Reason | None = None  # in its words, a log's last lines stand after a line break
+    progress: str = ""  # what the cloud says is being done there until it serves, for people
     setting_up: bool = False
-    running_at: float = 0.0
+    running_at: float = 0.0  # when it was seen to run
     set_up_at: float = 0.0
-    pool: str = ""
+    pool: str = ""  # its name, as far as the cloud knows it
 
 
 def by_id(machine: Machine) -> tuple[str, int, int]:
@@ -195,54 +171,33 @@ def doubted_after_s(rtt_s: float | None) -> float:
 
 @dataclass(frozen=True)
 class LinkReport:
-    """The client proxy's report of one replica. Ages and durations in seconds.
-
-    Attributes:
-        ready: Names of the services that this replica says it can answer now.
-        leaving: It asks to be left alone itself: its machine will be taken.
-        draining: Nothing new is sent to it while others can answer: it is leaving, or the
-            manager has marked it.
-        at_risk: Its cloud recommends to move it; it serves on meanwhile.
-        disagrees: Its answers have differed from those of a quorum, repeatedly, or have been
-            `misread` (they were no responses), or it `ignores` requests that others answer.
-        heard_age_s: Since the server proxy last answered a probe; None if never.
-        silent_for_s: How long probes have gone unanswered; 0 while they are answered.
-        strangers: Connections at its port that nobody with a certificate had opened.
-        version: Of fogft on the replica; empty where it is not known.
-        lease_age_s: Since the replica last heard of the manager; None if it never did.
-        lease_left_s: Until it shuts down unless it hears of it again; None for never.
-        answered: How many requests it has answered well, first or not.
-        failed: How many came to a crash, a refusal or a response that was not ok.
-        detail: Last error in words (connection refused, wrong certificate, ...).
-        differs: A service's type is not the same there as on the robot, or cannot be loaded.
-        offered: Name and type of each service that `run` offers, where that is found out or wrong.
-    """
+    """The client proxy's report of one replica. Ages and durations in seconds."""
 
     id: ReplicaId
     state: LinkState
-    ready: frozenset[str] = frozenset()
-    leaving: bool = False
-    draining: bool = False
-    at_risk: bool = False
-    disagrees: bool = False
-    misread: bool = False
-    ignores: bool = False
-    heard_age_s: float | None = None
-    silent_for_s: float = 0.0
+    ready: frozenset[str] = frozenset()  # services that it says it can answer now
+    leaving: bool = False  # it asks to be left alone itself: its machine will be taken
+    draining: bool = False  # it is leaving, or marked: nothing new while others can answer
+    at_risk: bool = False  # its cloud recommends to move it; it serves on meanwhile
+    disagrees: bool = False  # repeatedly, with a quorum; or one of the next two
+    misread: bool = False  # its answers were no responses
+    ignores: bool = False  # it never ends requests that others answer
+    heard_age_s: float | None = None  # since it last answered a probe; None if never
+    silent_for_s: float = 0.0  # how long probes have gone unanswered; 0 while they are answered
     rtt_s: float | None = None
     in_flight: int = 0
     won: int = 0
     restarts: int = 0
-    strangers: int = 0
-    version: str = ""
-    lease_age_s: float | None = None
-    lease_left_s: float | None = None
-    answered: int = 0
-    failed: int = 0
-    detail: str = ""
-    differs: bool = False
+    strangers: int = 0  # connections at its port that nobody with a certificate had opened
+    version: str = ""  # of fogft on the replica; empty where it is not known
+    lease_age_s: float | None = None  # since it last heard of the manager; None if it never did
+    lease_left_s: float | None = None  # until it shuts down unless it hears of it; None for never
+    answered: int = 0  # requests that it has answered well, first or not
+    failed: int = 0  # those that came to a crash, a refusal or a response that was not ok
+    detail: str = ""  # last error in words (connection refused, wrong certificate, ...)
+    differs: bool = False  # a service's type is another than on the robot, or cannot be loaded
     differing: tuple[str, ...] = ()
-    offered: tuple[tuple[str, str], ...] = ()
+    offered: tuple[tuple[str, str], ...] = ()  # by `run`: name and type, where found out or wrong
 
     @property
     def doubted(self) -> bool:
@@ -254,27 +209,17 @@ class LinkReport:
 
 @dataclass(frozen=True)
 class Observed:
-    """All inputs of a plan besides the spec: the pool as observed at `now`.
-
-    Attributes:
-        machines: The cloud's own list; None when the cloud could not tell.
-        links: What the client proxy reports; None when there is no fresh report.
-        ending: Machines that were already asked to end, and may still be listed.
-        rtt_s: ``cloud/region`` -> round trip from the robot in seconds, where it is known.
-        doubt_s: By so much the clock was set just now: the time of day goes without it.
-        gateway: The machine of a launched gateway; more than one while it is replaced.
-        standbys: Machines that are stopped.
-    """
+    """All inputs of a plan besides the spec: the pool as observed at `now`."""
 
     now: float
-    machines: tuple[Machine, ...] | None
-    links: tuple[LinkReport, ...] | None = None
+    machines: tuple[Machine, ...] | None  # the cloud's own list; None when it could not tell
+    links: tuple[LinkReport, ...] | None = None  # None when there is no fresh report
     offers: tuple[Offer, ...] = ()
-    ending: frozenset[ReplicaId] = frozenset()
-    rtt_s: Mapping[str, float] = field(default_factory=dict)
-    doubt_s: float = 0.0
-    gateway: tuple[Machine, ...] = ()
-    standbys: tuple[Machine, ...] = ()
+    ending: frozenset[ReplicaId] = frozenset()  # already asked to end, and perhaps still listed
+    rtt_s: Mapping[str, float] = field(default_factory=dict)  # from the robot, by ``cloud/region``
+    doubt_s: float = 0.0  # by so much the clock was set just now: the time of day goes without it
+    gateway: tuple[Machine, ...] = ()  # that was launched; more than one while it is replaced
+    standbys: tuple[Machine, ...] = ()  # machines that are stopped
 
     def below(self, cap: float | None) -> float | None:
         """Return what a cap leaves for replicas."""
@@ -285,19 +230,13 @@ class Observed:
 
 @dataclass(frozen=True)
 class Member:
-    """A replica that the client proxy should hold a link to.
-
-    Attributes:
-        endpoint: ``host:port``; empty where it is not known yet, or the replica dials out.
-        gateway: The gateway's name, where that stands in place of replicas; empty for a replica.
-        version: What it runs (`Machine.spec_hash`); empty where it is not known.
-    """
+    """A replica that the client proxy should hold a link to, or a gateway in their place."""
 
     id: ReplicaId
-    endpoint: EndpointOrEmpty
+    endpoint: EndpointOrEmpty  # empty where it is not known yet, or the replica dials out
     draining: bool = False
-    gateway: str = ""
-    version: Annotated[str, only(_VERSION.fullmatch)] = ""
+    gateway: str = ""  # its name; empty for a replica
+    version: Annotated[str, only(_VERSION.fullmatch)] = ""  # `Machine.spec_hash`, if known
 
     @property
     def certificate_name(self) -> str:
@@ -312,16 +251,13 @@ class Member:
 class Membership:
     """The members of a pool and their endpoints; written by the manager, read by proxies.
 
-    Attributes:
-        epoch: The writing manager's lease; then `version` counts its writes. A lower
-            (epoch, version) never replaces a higher one.
-        revoked: Common names of certificates that are no good any more. Only ever grows.
+    A lower (epoch, version) never replaces a higher one.
     """
 
     pool: str
     pool_uid: PoolUid
-    epoch: Count
-    version: Count
-    members: tuple[Member, ...] = field(default_factory=tuple)
-    revoked: frozenset[str] = frozenset()
+    epoch: Count  # the writing manager's lease
+    version: Count  # counts its writes
+    members: tuple[Member, ...] = ()
+    revoked: frozenset[str] = frozenset()  # common names of certificates; only ever grows
     topology: Topology = field(default_factory=Topology)

@@ -262,15 +262,8 @@ class HealthSpec:
 class PoolSpec:
     """The contents of a pool file.
 
-    Attributes:
-        services: Names distinct; the services of actions are among them.
-        replicas: How many should be ready. With groups: their sum. With an availability
-            target: the fewest.
-        groups: Kinds of machines; none for one kind, the task's `resources`.
-        topics: What passes besides services; those of actions are among them.
-        task: The SkyPilot task: the file without its `fogft` section.
-        discovered: The services found where the file names none; `discovered_by` is the hash of
-            the replicas that told of them.
+    The services and topics of `actions` are among `services` and `topics`; with `groups`,
+    `replicas` is their sum.
     """
 
     name: str = ""
@@ -456,9 +449,9 @@ class PoolSpec:
         "down their machines, no later than `max_hours`.",
         default=24.0,
     )
-    task: Mapping[str, Any] = field(default_factory=dict)
-    discovered: tuple[ServiceSpec, ...] = ()
-    discovered_by: str = ""
+    task: Mapping[str, Any] = field(default_factory=dict)  # the file without its `fogft` section
+    discovered: tuple[ServiceSpec, ...] = ()  # where the file names no services
+    discovered_by: str = ""  # the hash of the replicas that told of them
 
     @cached_property
     def derived(self) -> dict[Any, Any]:

@@ -22,18 +22,14 @@ Fields = tuple[tuple[Line, Line], ...]
 
 @dataclass(frozen=True)
 class Definition:
-    """The definition of a service type on one machine.
+    """The definition of a service type on one machine. Hashes are empty where not known.
 
-    Attributes:
-        hash: Of request and response (``RIHS01_...+RIHS01_...``); empty where the distribution
-            has none.
-        fields: `REQUEST`, `RESPONSE` and each nested ``package/Message`` -> its fields, each a
-            name and a type as the generated Python code tells them, in order.
-        service_hash: Of the whole service, its event message included, as `rmw_zenoh` writes
-            it into names; empty where it is not known.
+    `fields` are of `REQUEST`, `RESPONSE` and each nested ``package/Message``: names and types, in
+    order, as the generated Python code tells them. `service_hash` is of the whole service, its
+    event message included, as `rmw_zenoh` writes it into names.
     """
 
-    hash: Line = ""
+    hash: Line = ""  # of request and response: ``RIHS01_...+RIHS01_...``
     fields: Mapping[Line, Fields] = field(default_factory=dict)
     trouble: Line = ""
     service_hash: Annotated[str, only(_HASH.fullmatch)] = ""  # it becomes part of a key

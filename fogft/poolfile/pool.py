@@ -28,17 +28,12 @@ class Checks:
     """Checks that depend on this machine, made when all else is valid.
 
     Each returns what is wrong, None if nothing is; what to do may follow after ``; ``.
-
-    Attributes:
-        types: Of a service or message type: why it cannot be loaded.
-        fields: Of a service type: why its response has no such boolean field.
-        tolerances: Of a service type, by field: why responses cannot be compared so.
     """
 
-    types: Callable[[str], str | None] = _nothing
-    fields: Callable[[str, str], str | None] = _nothing
+    types: Callable[[str], str | None] = _nothing  # why it cannot be loaded
+    fields: Callable[[str, str], str | None] = _nothing  # why a type's response has no such boolean
     states: Callable[[StateSpec], str | None] = _nothing
-    tolerances: Callable[[str, Mapping[str, float]], str | None] = _nothing
+    tolerances: Callable[[str, Mapping[str, float]], str | None] = _nothing  # of a type, by field
     workdir: Callable[[str], str | None] = _nothing
 
 

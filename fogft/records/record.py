@@ -68,20 +68,13 @@ _WRITERS = {
 
 @dataclass(frozen=True)
 class Record:
-    """One statement of one writer.
-
-    Attributes:
-        subject: The slot, the robot's or the gateway's name; empty where the pool is meant.
-        generation: The slot's, the manager's epoch, or that of the robot's or gateway's
-            certificate.
-        sequence: Counts what the writer wrote within a generation.
-    """
+    """One statement of one writer, about a slot, a robot, a gateway, or the whole pool."""
 
     pool_uid: PoolUid
     kind: RecordKind
     subject: Annotated[str, only(_SUBJECT.fullmatch, "a subject")]
-    generation: Count
-    sequence: Count
+    generation: Count  # of the slot or the certificate; the manager's epoch
+    sequence: Count  # counts what the writer wrote within a generation
     content: Mapping[str, Any] = field(default_factory=dict)
 
     @property

@@ -24,32 +24,21 @@ LEASE_LIMIT_S = 366 * 86_400.0
 
 @dataclass(frozen=True)
 class SlotState:
-    """A replica's own record.
+    """A replica's own record."""
 
-    Attributes:
-        endpoint: ``host:port`` where it can be reached, as it was told; empty if it was not.
-        observed_endpoint: The same as a rendezvous saw it: only a guess.
-        dials_out: It cannot be reached: it dials robots and gateways itself.
-    """
-
-    endpoint: EndpointOrEmpty = ""
-    observed_endpoint: EndpointOrEmpty = ""
-    dials_out: bool = False
+    endpoint: EndpointOrEmpty = ""  # where it can be reached, as it was told; empty if it was not
+    observed_endpoint: EndpointOrEmpty = ""  # the same as a rendezvous saw it: only a guess
+    dials_out: bool = False  # it cannot be reached: it dials robots and gateways itself
     services: tuple[Line, ...] = ()
     draining: bool = False
 
 
 @dataclass(frozen=True)
 class ServingLease:
-    """How long replicas keep serving without hearing from the manager again.
+    """How long replicas keep serving without hearing from the manager again."""
 
-    Attributes:
-        at: When it was signed, in seconds since the epoch by the manager's clock.
-        lasts_s: From then on; no longer than the pool itself may run (`max_hours`).
-    """
-
-    at: Moment
-    lasts_s: Annotated[float, within(0, LEASE_LIMIT_S)]
+    at: Moment  # when it was signed, by the manager's clock
+    lasts_s: Annotated[float, within(0, LEASE_LIMIT_S)]  # no longer than `max_hours` allows
 
 
 @dataclass(frozen=True)
