@@ -15,23 +15,23 @@ from tests.nightly import by_day
 
 def test_a_chunk_takes_its_size_over_the_rate_after_those_before_it_and_then_the_delay():
     shaper = Shaper()
-    shaper.set(delay_s=1.0, rate_bytes_per_s=100.0)
+    shaper.delay_s, shaper.rate = 1.0, 100.0
     assert [shaper.arrival(50, now=10.0), shaper.arrival(50, now=10.0)] == [11.5, 12.0]
     assert shaper.arrival(100, now=20.0) == 22.0, "an idle path does not save up"
 
 
 def test_a_path_without_a_rate_delays_all_alike():
     shaper = Shaper()
-    shaper.set(delay_s=0.5, rate_bytes_per_s=None)
+    shaper.delay_s = 0.5
     assert shaper.arrival(1 << 30, now=1.0) == 1.5
-    shaper.set(0.0, None)
+    shaper.delay_s = 0.0
     assert (shaper.arrival(1 << 30, now=1.0), shaper.room_bytes) == (1.0, 0)
 
 
 @given(st.floats(1, 1e9), st.floats(0, 100))
 def test_a_slow_path_holds_no_more_than_it_carries(rate, delay_s):
     shaper = Shaper()
-    shaper.set(delay_s, rate)
+    shaper.delay_s, shaper.rate = delay_s, rate
     assert 1024 <= shaper.chunk_bytes <= max(1024, rate * 0.02 + 1)
     assert shaper.room_bytes <= min(MAX_HELD_BYTES, rate * (delay_s + 0.02) + (64 << 10) + 1)
 

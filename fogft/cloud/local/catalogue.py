@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from fogft.errors import SpecError
-from fogft.model.replica import Placement
 from fogft.poolfile.tree import Section, plain, shown
 
 CLOUD = "local"
@@ -58,17 +57,6 @@ class Catalogue:
         """Names of the regions, sorted."""
         return sorted({zone.region for zone in self.zones})
 
-    def zone_of(self, placement: Placement) -> Zone | None:
-        """Return the zone of a placement, if it is one of ours."""
-        return next((zone for zone in self.zones if zone.location == placement.location), None)
-
-
-INSTANCES = (
-    Instance("cpu4", 4, 16, 0.192, 0.066),
-    Instance("cpu8", 8, 32, 0.384, 0.131),
-    Instance("cpu16", 16, 64, 0.768, 0.259),
-    Instance("cpu32", 32, 128, 1.536, 0.515),
-)
 
 # Region: what its prices are multiplied by, and its boot time.
 REGIONS = {
@@ -85,7 +73,12 @@ BUILT_IN = Catalogue(
         for region, (factor, boot_s) in REGIONS.items()
         for zone, more in (("a", 1.0), ("b", 1.04))
     ),
-    instances=INSTANCES,
+    instances=(
+        Instance("cpu4", 4, 16, 0.192, 0.066),
+        Instance("cpu8", 8, 32, 0.384, 0.131),
+        Instance("cpu16", 16, 64, 0.768, 0.259),
+        Instance("cpu32", 32, 128, 1.536, 0.515),
+    ),
 )
 
 

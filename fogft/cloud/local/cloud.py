@@ -39,15 +39,11 @@ class LocalCloud:
 
     def __init__(self, root: Path, serve: Sequence[str] = SERVE) -> None:
         self.root = Path(os.path.abspath(root))
+        self.machines_folder = self.root / "machines"
         self._serve = tuple(serve)
         self._spawned: list[subprocess.Popen[bytes]] = []
         self._spawned_lock = threading.Lock()
         self._warned: set[str] = set()
-
-    @property
-    def machines_folder(self) -> Path:
-        """Where the machines' folders are."""
-        return self.root / "machines"
 
     def catalogue(self) -> Catalogue:
         """Return the catalogue: ``regions.yaml``, or the built-in one."""
@@ -82,7 +78,7 @@ class LocalCloud:
             if not self._is_new(folder):
                 return
             if not folder.exists:
-                self._check_room(zone, order.id)
+                self._check_room(zone, order)
                 record = Record(replace(order, files={}), zone, time.time(), self._serve)
                 write_new(folder, record, order.files)
             try:
@@ -154,7 +150,11 @@ class LocalCloud:
             if not folder.exists:  # it was ended while we looked
                 return None
             self._warn_once(folder.path.name, error.message)
-            return _damaged(folder, now, error) if folder.locked else None
+            if not folder.locked:
+                return None
+            # Its files cannot be read, but it lives: listed, it can be ended.
+            failure = Reason(Cause.ERROR, words=error.message)
+            return Machine(folder.id, _UNKNOWN, MachinePhase.FAILED, now, failure=failure)
         # Later, if the cloud is busy: a list never waits.
         with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
             ending.bury(self.root, folder)
@@ -195,25 +195,21 @@ class LocalCloud:
     # -- room -------------------------------------------------------------------------------
 
     def _zone(self, order: Launch) -> Zone:
-        catalogue = self.catalogue()
-        zone = catalogue.zone_of(order.placement)
-        if zone is None:
-            raise CloudError(
-                f"there is no zone `{order.placement.location}`",
-                nearest(order.placement.location, {z.location for z in catalogue.zones}),
-            )
-        return zone
+        location = order.placement.location
+        zones = {zone.location: zone for zone in self.catalogue().zones}
+        if location not in zones:
+            raise CloudError(f"there is no zone `{location}`", nearest(location, zones))
+        return zones[location]
 
-    def _check_room(self, zone: Zone, id: ReplicaId) -> None:
+    def _check_room(self, zone: Zone, order: Launch) -> None:
         """Raise `NoCapacity` unless one more fits. The cloud's lock is held."""
         wrong = faults.read_cloud(self.root)
-        place = Placement("local", zone.region, zone.name, "")
         for location in wrong.out(time.time()):
-            if place.within(location):
+            if order.placement.within(location):
                 raise NoCapacity(f"no capacity in `{zone.location}`: outage in `{location}`")
         limits = {zone.location: zone.capacity}
-        limits |= {where: n for where, n in wrong.capacity.items() if place.within(where)}
-        taken = [placement for folder, placement in self.living() if folder.id != id]
+        limits |= {where: n for where, n in wrong.capacity.items() if order.placement.within(where)}
+        taken = [placement for folder, placement in self.living() if folder.id != order.id]
         for location, limit in limits.items():
             here = sum(placement.within(location) for placement in taken)
             if here >= limit:
@@ -246,9 +242,3 @@ def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machi
         set_up_at=state.set_up_at,
         pool=order.pool,
     )
-
-
-def _damaged(folder: MachineFolder, now: float, error: StateError) -> Machine:
-    """List a machine that lives though its files cannot be read, so that it can be ended."""
-    failure = Reason(Cause.ERROR, words=error.message)
-    return Machine(folder.id, _UNKNOWN, MachinePhase.FAILED, now, failure=failure)

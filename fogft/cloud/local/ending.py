@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 
 LOGS_KEPT = 100
 _LOCK_LIMIT_S = 5.0
+_PATIENCE_S = 1.0
 _POLL_S = 0.01
 
 
@@ -63,13 +64,11 @@ def bury(root: Path, folder: MachineFolder) -> bool:
     return True
 
 
-def overdue(folder: MachineFolder, now: float, patience_s: float = 1.0) -> bool:
+def overdue(folder: MachineFolder, now: float) -> bool:
     """Return whether a machine should have ended by itself and has not: it is frozen."""
     try:
-        late = any(
-            at is not None and now > at + patience_s for at in map(folder.due, (NOTICE, END))
-        )
-        return late and folder.life(now) is Life.ALIVE
+        due = (at for at in map(folder.due, (NOTICE, END)) if at is not None)
+        return any(now > at + _PATIENCE_S for at in due) and folder.life(now) is Life.ALIVE
     except StateError:
         return False
 

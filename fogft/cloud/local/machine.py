@@ -21,16 +21,7 @@ from typing import TYPE_CHECKING
 from fogft import child, disk, logfile
 from fogft.cloud.local import faults, processes, task_commands
 from fogft.cloud.local.ending import sweep_shared_memory
-from fogft.cloud.local.folder import (
-    END,
-    LINK,
-    LOCK,
-    NOTICE,
-    STATE,
-    MachineFolder,
-    Record,
-    State,
-)
+from fogft.cloud.local.folder import END, LINK, LOCK, NOTICE, STATE, MachineFolder, Record, State
 from fogft.errors import FogftError, StateError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason

@@ -1,13 +1,8 @@
 """Find and end all processes of a machine or a pool, and tie a machine's together.
 
-All of them carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in their environment, which ``/proc``
-shows as it was when they began. One that was started with a clean environment is found as a
-descendant of one that was not.
-
-None outlives the others. The process that the cloud started forks: the child is the machine, the
-parent its guard, which waits and then kills whatever is left. Both are subreapers. The guard shares
-the machine's lock: the machine counts as alive until all of it is gone. If the guard is killed,
-the machine sees that its parent changed, and ends.
+All carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in the environment that they began with; one that
+began with a clean one is found as a descendant of one that did not. The machine's guard, its
+parent, shares its lock: it counts as alive until all of it is gone. See docs/design/local-cloud.md.
 """
 
 import contextlib

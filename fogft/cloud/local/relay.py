@@ -1,11 +1,8 @@
 """The simulated network path to one machine: a TCP relay with delay, rate and blackhole.
 
-A path is modelled as networks are: a chunk occupies it for its size over the rate, after those
-before it, and arrives the delay later, in order whatever changes meanwhile. What the other side
-does not take stops the reading, so backpressure is the kernel's own.
-
-As on a network, the server sees from which host who connects, and a host that floods the port costs
-the others little: of those that wait for the server, the newest are kept.
+A chunk occupies the path for its size over the rate, after those before it, and arrives the delay
+later, in order whatever changes meanwhile. What the other side does not take stops the reading.
+The server sees from which host who connects. A host that floods the port costs the others little.
 """
 
 import asyncio
@@ -32,17 +29,12 @@ _RESET = struct.pack("ii", 1, 0)  # SO_LINGER with no time: close sends RST
 
 
 class Shaper:
-    """One direction of the path, shared by its connections."""
+    """One direction of the path, shared by its connections. What is on it keeps its arrival."""
 
     def __init__(self) -> None:
         self.delay_s = 0.0
-        self.rate = math.inf
+        self.rate = math.inf  # bytes per second
         self._free_at = 0.0
-
-    def set(self, delay_s: float, rate_bytes_per_s: float | None) -> None:
-        """Change the path; data already on it keeps its arrival time."""
-        self.delay_s = delay_s
-        self.rate = rate_bytes_per_s or math.inf
 
     @property
     def chunk_bytes(self) -> int:
@@ -147,7 +139,8 @@ class Relay:
     def set_faults(self, faults: LinkFaults) -> None:
         """Change what is wrong with the path (deadlines already applied)."""
         for shaper in self._shapers:
-            shaper.set(faults.delay_s, faults.rate_bytes_per_s)
+            shaper.delay_s = faults.delay_s
+            shaper.rate = faults.rate_bytes_per_s or math.inf
         if faults.blackhole:
             self._passes.clear()
         else:
