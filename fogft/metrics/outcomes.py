@@ -119,10 +119,7 @@ class Outcomes:
             self.count["late"] += 1
 
     def report(self) -> dict[str, Any]:
-        """Return counters and latencies (seconds; quantiles None before the first answer).
-
-        ``buckets`` counts latencies between the bounds of `BUCKETS_S`; ``took_s`` is their sum.
-        """
+        """Return counters and latencies in seconds; ``buckets`` are those of `BUCKETS_S`."""
         ordered = sorted(self._latencies)
         return {
             **self.count,

@@ -1,10 +1,8 @@
 """Whether bytes are a well-formed message of a type, checked before a middleware reads them. Pure.
 
 A middleware that is given bytes it cannot read may fail, end its process, or read another message
-than was meant. Here nothing is decoded: whole runs of numbers are stepped over.
-
-Serialised messages are plain CDR: four bytes of header that tell the byte order, then each field
-at a multiple of its own size, counted from behind the header.
+than was meant. Here nothing is decoded: whole runs of numbers are stepped over. In plain CDR each
+field stands at a multiple of its own size, counted from behind the header of four bytes.
 """
 
 import re

@@ -3,9 +3,6 @@
 A field of a specification's dataclass is made by `key`. The reader of the pool file, the JSON
 Schema, the page `docs/reference/pool-file.md`, the ROS parameters and the proxies' configuration
 files all come from that.
-
-    class HealthSpec:
-        suspect_after_s: float = key(Number(3600, "seconds"), "Mark a replica ...", default=2.0)
 """
 
 import dataclasses

@@ -7,7 +7,6 @@ Source: FogROS2-SGC's construction of identifiers, extended to connections by Fo
 """
 
 import hashlib
-import ipaddress
 import re
 from collections.abc import Mapping
 from typing import Annotated
@@ -85,11 +84,6 @@ def is_endpoint(text: str) -> bool:
 def endpoint(hint: str) -> Text:
     """Return the form of a key that holds an endpoint."""
     return Text("`host:port`", hint, only(is_endpoint))
-
-
-def network(text: str) -> str:
-    """Return an address or a network (``203.0.113.0/24``) as a network. Raises ValueError."""
-    return str(ipaddress.ip_network(text))
 
 
 def host_and_port(endpoint: str) -> tuple[str, int]:

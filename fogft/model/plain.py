@@ -91,11 +91,7 @@ def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
 
 
 def from_plain(cls: type[T], raw: Any) -> T:
-    """Return the value that JSON data describes.
-
-    Raises:
-        ValueError: It describes none of this class; the message begins with the key.
-    """
+    """Return the value that JSON data describes. Raises ValueError, which begins with the key."""
     try:
         made: T = _reader(cls)(raw)
     except RecursionError as error:

@@ -87,11 +87,6 @@ def is_field_name(name: str) -> bool:
     return bool(_FIELD.fullmatch(name))
 
 
-def is_field_path(name: str) -> bool:
-    """Whether this has the form of a path to a field, such as ``plan.cost``."""
-    return all(map(is_field_name, name.split(".")))
-
-
 def service_name(hint: str, what: str = "a service name") -> Text:
     """Return the form of a key that holds the name of a service, topic or action."""
     return Text(what, hint, absolute_service_name)
@@ -106,5 +101,6 @@ def service_type(hint: str, *, has_parts: bool = False) -> Text:
 
 
 def field_path(hint: str) -> Text:
-    """Return the form of a key that holds the path of a field."""
-    return Text("the path of a field", hint, only(is_field_path))
+    """Return the form of a key that holds the path of a field, such as ``plan.cost``."""
+    is_path = only(lambda written: all(map(is_field_name, written.split("."))))
+    return Text("the path of a field", hint, is_path)

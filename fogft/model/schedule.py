@@ -1,9 +1,6 @@
 """Replicas and cap by the time of the week. Pure: `now` is an argument.
 
 Windows are told by the clock on the wall, so they follow daylight-saving time.
-
-    now ──► window that holds now ───────────► replicas, cap
-        └─► window that holds now + prelaunch ─► the more replicas, with its cap
 """
 
 import datetime

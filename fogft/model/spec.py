@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import ipaddress
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -44,7 +45,7 @@ from fogft.model.keys import (
     key,
     only,
 )
-from fogft.model.names import LINK_PORT, endpoint, network
+from fogft.model.names import LINK_PORT, endpoint
 from fogft.model.ros_names import field_path, is_field_name, service_name, service_type
 from fogft.model.state import StateSpec
 from fogft.model.topic import ActionSpec, TopicSpec
@@ -376,7 +377,7 @@ class PoolSpec:
             Text(
                 "an address or a network",
                 "write a list, such as `allow_from: [203.0.113.7, 198.51.100.0/24]`",
-                network,
+                lambda written: str(ipaddress.ip_network(written)),
             ),
             20,
         ),

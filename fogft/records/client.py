@@ -51,9 +51,7 @@ class Known:
 class RendezvousClient:
     """The records of one process.
 
-    Args:
-        cache: File that the records are kept in; None for nowhere.
-        changed: Called on the client's thread after anything changed; must not block.
+    `changed` is called on the client's thread after anything changed; it must not block.
     """
 
     def __init__(

@@ -51,9 +51,7 @@ class Connection:
     async def messages(self) -> list[dict[str, Any]]:
         """Return the next messages; an empty list at the end of the stream.
 
-        Raises:
-            RecordError: Something else came.
-            asyncio.TimeoutError: Nothing came for `SILENCE_S`.
+        Raises asyncio.TimeoutError if nothing came for `SILENCE_S`.
         """
         found = list(self._unframer.feed(b""))  # what came along with a greeting
         while not found:

@@ -34,13 +34,7 @@ Order = tuple[int, int]
 
 
 class RecordError(ValueError):
-    """Not a record, or not one that its writer may write.
-
-    Args:
-        reason: One word for counters: ``malformed``, ``version``, ``pool``, ``forged``,
-            ``writer``, ``authority``, ``expired``, ``revoked``.
-        detail: The same for people.
-    """
+    """Not a record, or not one that its writer may write; `reason` is one word, for counters."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(detail)
@@ -94,7 +88,7 @@ class SignedRecord:
 
     body: bytes
     certificate: bytes  # DER
-    signature: bytes  # over `signed_bytes(body)`, with that certificate's key
+    signature: bytes  # over the body behind `_SIGNED_PREFIX`, with that certificate's key
 
 
 @dataclass(frozen=True)
@@ -111,18 +105,13 @@ Verify = Callable[[bytes, bytes, bytes], Writer]
 Sign = Callable[[bytes], tuple[bytes, bytes]]
 
 
-def signed_bytes(body: bytes) -> bytes:
-    """Return the bytes that a record's signature covers."""
-    return _SIGNED_PREFIX + body
-
-
 def sign_record(record: Record, sign: Sign) -> SignedRecord:
     """Sign a record. Raises ValueError for one that could not be read back, such as too large."""
     value = {"v": VERSION, **plain.to_plain(record)}
     body = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     if _decode(body) != record:
         raise ValueError("a record that does not survive its own encoding")
-    certificate, signature = sign(signed_bytes(body))
+    certificate, signature = sign(_SIGNED_PREFIX + body)
     return SignedRecord(body, certificate, signature)
 
 
@@ -135,7 +124,7 @@ def read_body(signed: SignedRecord) -> Record:
 
 def verified_writer(record: Record, signed: SignedRecord, verify: Verify) -> Writer:
     """Return a record's writer after checking signature, certificate and right to write."""
-    writer = verify(signed.certificate, signed.signature, signed_bytes(signed.body))
+    writer = verify(signed.certificate, signed.signature, _SIGNED_PREFIX + signed.body)
     expected = expected_writer(record)
     if (writer.role, writer.common_name) != (expected.role.value, expected.common_name):
         what = f"{record.kind.value} record {record.subject}".rstrip()

@@ -89,9 +89,8 @@ class Signer:
 class Verifier:
     """Verifies signatures by currently valid certificates of the pool's CA.
 
-    Args:
-        any_time: Accept certificates out of their time: for what was verified before.
-        lazy: Read the CA on first use; one that cannot be used is a `RecordError` then.
+    With `any_time` also by others: for what was verified before. With `lazy` the CA is read on
+    first use; one that cannot be used is a `RecordError` then.
     """
 
     def __init__(

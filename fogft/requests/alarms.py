@@ -1,8 +1,4 @@
-"""Which replicas are believed when they report that a request crashed a service. Pure.
-
-One that is broken, or lies, says so of requests that others answer. Were it believed, the others
-would run each of those alone. What follows from a death is `pending`'s.
-"""
+"""Crash reports of replicas that are broken, or lie, and those that count. Pure."""
 
 from collections.abc import Iterable
 
@@ -13,8 +9,8 @@ ALARM_S = 1.0  # what is said within it, counted from the first time, is about o
 class Alarms:
     """Which replicas are believed when they report that a request crashed a service.
 
-    A service that dies ends all that it has, so what one says in the same moment is one alarm. It
-    is false where another replica answered one of those requests.
+    What one says in the same moment is one alarm, and false where another replica answered one of
+    those requests. Were it believed, the others would run each of them alone.
     """
 
     def __init__(self) -> None:

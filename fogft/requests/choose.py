@@ -126,10 +126,7 @@ class Learning(Choose):
 class Failover(Learning):
     """The policy `failover`: one replica gets every request until it fails.
 
-    It fails when it is no longer able to answer (suspected, not ready, drained), when an
-    attempt of its ends without an answer, and when it lets a deadline pass. A request that takes
-    unusually long, while the one has answered nothing since, goes to another as well, and so do
-    those that come until it answers.
+    While it answers nothing, requests that are long overdue, and new ones, go to another as well.
     """
 
     def __init__(self) -> None:

@@ -1,15 +1,10 @@
 """How many requests a service may have concurrently, given or learned from latency. Pure.
 
 What waits inside a service nobody can take back or overtake. How many it works on shows in its
-throughput, limit / latency: under demand, half the limit is tried for some answers, and kept if
-throughput stays near what it was; once in a while the double is, and kept if it gains.
-
-A service that answers every 3 ms or more often is not limited: what waits in it is over before it
-matters. One that takes up to 0.1 s has one more in hand than it works on, or it would stand still
-between two. Who waits is `fair_queue`'s.
+throughput, limit / latency: docs/design/server-proxy.md. Who waits is `fair_queue`'s.
 """
 
-QUICK_S = 0.003
+QUICK_S = 0.003  # one that answers as often is not limited: what waits is over before it matters
 IN_HAND_S = 0.1  # below this, one more is in hand
 _NEAR = 0.85
 _SAMPLES = 30

@@ -1,12 +1,10 @@
 """Decide what an answer means for its request: first success, or what a quorum agrees on. Pure.
 
 An answer goes through `read` first, which may be slow: no lock is held. Then `judge` says what it
-means. What decides for actions and stateful services says, too, what else replicas must have:
-goals, cancellations, an order.
+means.
 
-Owns: the interface of every decision; the first success, and the first that is ok. Not here: votes
-(`requests.votes`), actions and stateful services (`proxy.robot`), which requests await an answer
-(`pending`).
+Not here: votes (`requests.votes`), actions and stateful services (`proxy.robot`), which requests
+await an answer (`pending`).
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence

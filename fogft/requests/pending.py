@@ -2,14 +2,9 @@
 
 Each step of a request's life keeps the table, the policy and the decision in step, and returns what
 is to be done. Called under its owner's lock. The first success takes the request out of the table,
-so that whatever comes later is LATE by construction: a late answer can never reach another request,
-and no request is answered twice.
+so that whatever comes later is LATE by construction. A replica that declined a request, failed it
+or came after it may be asked even while others work on it: they may be frozen.
 
-A rejection is kept, and is returned only when nothing better can come. A replica that declined a
-request, failed it or came after it may be asked (again) even while others work on it, because those
-others may be frozen. Whether it is, is the policy's to say.
-
-Owns: which answer is returned, who may be asked, and when a request has nobody working on it.
 Not here: what an answer means (`decide`), who is asked (`choose`), when the fallback is
 (`fallback`), sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
 """
@@ -112,12 +107,6 @@ class PendingRequests:
         self.held_bytes += len(payload)
         self.decide.began(request, pending, able)
         return chosen
-
-    def fallback_from(self, request: bytes, now: float, *, able: bool) -> float:
-        """Register a request with the fallback; return when that may have to be called next."""
-        assert self.fallback is not None
-        self.fallback.submitted(request, now)
-        return self.fallback.look_at(able=able)
 
     def more(
         self, able: Sequence[int], now: float, *, newest_first: bool
@@ -291,10 +280,7 @@ class PendingRequests:
         counts: bool,
         bar: bool,
     ) -> Verdict:
-        """Note a failed attempt. The replica is avoided for a moment, longer each time.
-
-        It is asked no more if `bar`, or once it has failed too often in a way that `counts`.
-        """
+        """Note a failed attempt: the replica is avoided for a moment, longer each time."""
         if pending is None or replica not in pending.open:
             return Verdict.LATE
         failures = pending.failures[replica] = pending.failures.get(replica, 0) + counts

@@ -104,7 +104,8 @@ def test_an_answer_that_is_about_no_request_changes_nothing():
 def test_the_fallback_ends_a_request_once():
     requests, spy = made()
     requests.fallback = FallbackTimer(FallbackSpec("/f", after_s=1.0))
-    assert requests.fallback_from(A, 0.0, able=True) == 1.0
+    requests.fallback.submitted(A, 0.0)
+    assert requests.fallback.look_at(able=True) == 1.0
     assert requests.fallback.due(1.0, able=True) == [A]
     pending, overdue = requests.fallback_answered(A, 2.0, ok=True)
     assert (pending is not None, overdue, spy.ended) == (True, False, [A])

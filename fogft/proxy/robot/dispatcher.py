@@ -150,7 +150,8 @@ class Dispatcher:
                 pending.trace = Trace(dict.fromkeys(chosen, now), {})
             soon = min(requests.choose.look_at, deadline)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
-                soon = min(soon, requests.fallback_from(request, now, able=bool(able)))
+                requests.fallback.submitted(request, now)
+                soon = min(soon, requests.fallback.look_at(able=bool(able)))
             if len(requests) == 1:
                 self._next_look, self._usual_s = soon, soon - now
             self._next_look, self._asked_at = min(self._next_look, soon), now
