@@ -287,5 +287,5 @@ class Buyer:
     def next_generation(self, slot: int) -> int:
         """Return the generation of a slot's next launch."""
         listed = [s.id.generation for s in self.machines.everyone() if s.slot == slot]
-        known = [self.history.generation(slot), self.intent.drained.get(slot, 0)]
+        known = [self.history.generations[slot], self.intent.drained.get(slot, 0)]
         return max([*known, *listed]) + 1

@@ -9,12 +9,12 @@ Not here: why a replica should go (`classification`, `health`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import ReplicaId
-from fogft.planning.classification import Classification
+from fogft.planning import fallback
 from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.observed.history import History
 from fogft.planning.placement import crowding
@@ -37,44 +37,36 @@ class Endings:
         """The machines to end now."""
         return {s.id for s, _ in self.now}
 
-    def add(self, other: Endings) -> None:
-        """Add another group's endings."""
-        self.now += other.now
-        self.draining += other.draining
-        self.notes += other.notes
-
 
 def choose_endings(
-    wanted: int,
-    machines: Classification,
+    part: fallback.Part,
     health: Health,
     history: History,
+    out: Endings,
     *,
     now: float,
-    dear_first: bool = False,
-    held: Collection[ReplicaId] = (),
-    first: Assessment | None = None,
-    standing_in: Sequence[Assessment] = (),
-    spare: int = 0,
-) -> Endings:
-    """Choose which lost, replaced and surplus machines end.
+    dear_first: bool,
+    held: Collection[ReplicaId],
+    first: Assessment | None,
+) -> None:
+    """Add to `out` which lost, replaced and surplus machines of a group end.
 
     Args:
-        standing_in: On-demand machines that serve for others, and are not among `machines`.
-        spare: So many of those that stand in are no longer needed.
         held: Outdated ones that stay until a newcomer has proved itself.
         first: One that makes room for its successor: it ends although it is missed.
         dear_first: The pool is over its cap: of those that are too many the dearest go first.
     """
+    wanted, machines, standing_in = part.wanted, part.others, part.standing_in
+    spare = fallback.spare(part, now)
     surplus = len(machines.good) + len(machines.replaced) - wanted
     unwanted = [s for s in standing_in if s.unwanted]
     if surplus <= 0 and not machines.lost and first is None and not unwanted and spare <= 0:
-        return Endings()
-    chooser = _Chooser(wanted, (*machines.good, *machines.replaced, *standing_in), now)
+        return
+    chooser = _Chooser(out, wanted, (*machines.good, *machines.replaced, *standing_in), now)
     if health.uplink_suspected or not health.links_known:
         if surplus > 0 or machines.lost or unwanted or spare > 0:
-            chooser.out.notes.append(Reason(Cause.NOBODY_HEARD))
-        return chooser.out
+            out.notes.append(Reason(Cause.NOBODY_HEARD))
+        return
     for replica in machines.lost:
         chooser.end_lost(replica, history)
     if len(machines.good) > wanted:
@@ -89,7 +81,7 @@ def choose_endings(
         (s for s in machines.replaced if s is not first and s.id not in held),
         key=lambda s: (s.may_serve, s.marked_at, s.slot not in ready_slots, s.id),
     )
-    ended = chooser.out.ids
+    ended = out.ids
     coming = sum(not s.ever_ready for s in machines.good if s.id not in ended)
     chooser.end_some(replaced, left, Cause.REPLACED, coming=coming)
     if unwanted:
@@ -99,7 +91,6 @@ def choose_endings(
         kept = [s for s in standing_in if not s.unwanted]
         kept.sort(key=lambda s: (s.ever_ready, s.marked_at, -s.machine.usd_per_hour, -s.slot))
         chooser.end_some(kept, spare, Cause.ENOUGH_SPOT)
-    return chooser.out
 
 
 def _by_expendability(replicas: Iterable[Assessment], *, dear_first: bool) -> list[Assessment]:
@@ -125,8 +116,10 @@ def _by_expendability(replicas: Iterable[Assessment], *, dear_first: bool) -> li
 
 
 class _Chooser:
-    def __init__(self, wanted: int, working: Iterable[Assessment], now: float) -> None:
-        self.out = Endings()
+    def __init__(
+        self, out: Endings, wanted: int, working: Iterable[Assessment], now: float
+    ) -> None:
+        self._out = out
         self.counted_out = 0
         self._wanted = wanted
         self._now = now
@@ -135,7 +128,7 @@ class _Chooser:
     def end_lost(self, replica: Assessment, history: History) -> None:
         """A lost one ends once it is replaced, or at once when it cannot serve."""
         enough = len(self._pillars) >= self._wanted
-        later_served = history.served(replica.slot) > replica.id.generation
+        later_served = history.served[replica.slot] > replica.id.generation
         superseded = later_served and replica.verdict is Verdict.UNRESPONSIVE
         if enough or superseded or not replica.ever_ready:
             self.go(replica, replica.why or Reason(Cause.NOT_WANTED))
@@ -161,9 +154,9 @@ class _Chooser:
     def go(self, replica: Assessment, why: Reason) -> None:
         self._pillars.discard(replica.id)
         if self._must_drain_first(replica):
-            self.out.draining.append(replica)
+            self._out.draining.append(replica)
         else:
-            self.out.now.append((replica, why))
+            self._out.now.append((replica, why))
 
     def _must_drain_first(self, replica: Assessment) -> bool:
         link = replica.link

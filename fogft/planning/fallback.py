@@ -10,6 +10,7 @@ Not here: where they are bought (`buying`) and the two steps of an ending (`endi
 
 from bisect import bisect_right
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from fogft.model.groups import Group
 from fogft.planning.classification import Classification
@@ -24,6 +25,17 @@ STAYS_S = 600.0
 # and without one all that are left may go at once.
 OFTEN = 2
 OFTEN_S = 1800.0
+
+
+class Part(NamedTuple):
+    """A group's share of what is wanted and of the machines."""
+
+    group: Group
+    wanted: int
+    others: Classification  # its machines but for `standing_in`
+    standing_in: Sequence[Assessment]
+    held: int  # so many of those that stand in are kept in place of spot machines
+    surge: int  # so many more stand-ins boot while nobody serves
 
 
 def held(
@@ -48,60 +60,41 @@ def losses_of_late(history: History, now: float) -> list[float]:
     ]
 
 
-def surge_of(group: Group, wanted: int, surge: int) -> int:
-    """Return how many more boot while nobody serves: none where stopped standbys start sooner."""
-    return 0 if group.on_demand.standbys >= wanted else surge
-
-
 def is_first(slot: int, generation: int, history: History, *, safe: bool) -> bool:
     """Whether a spot machine is the first of its slot, or the first since that last served."""
-    return generation == (history.served(slot) if safe else 0) + 1
+    return generation == (history.served[slot] if safe else 0) + 1
 
 
-def missing(
-    wanted: int,
-    here: Classification,
-    standing_in: Sequence[Assessment],
-    history: History,
-    *,
-    surge: int,
-    safe: bool,
-) -> int:
-    """Return how many more stand-ins a group needs; `safe`: one serves that is not preempted."""
-    kept = (*here.good, *here.replaced)
+def missing(part: Part, begun: int, history: History, *, safe: bool) -> int:
+    """Return how many more stand-ins a group needs.
+
+    So many of its slots get their first machine now (`begun`); one serves that is not preempted
+    (`safe`).
+    """
+    wanted, kept = part.wanted - begun, (*part.others.good, *part.others.replaced)
+    standing_in = [s for s in part.standing_in if not s.unwanted]
     covered = sum(
         s.ever_ready or is_first(s.slot, s.id.generation, history, safe=safe) for s in kept
     )
-    ever_served = any(map(history.served, history.generations))
-    racing = _racing(wanted, surge, standing_in) if ever_served and not covered else 0
+    racing = _racing(part, wanted, standing_in) if history.served and not covered else 0
     return wanted + racing - covered - len(standing_in)
 
 
-def spare(
-    wanted: int,
-    here: Classification,
-    standing_in: Sequence[Assessment],
-    now: float,
-    *,
-    surge: int,
-    held: int = 0,
-) -> int:
+def spare(part: Part, now: float) -> int:
     """Return how many stand-ins are no longer needed, given enough others that have settled.
 
     Beside one that is held, and serves, a spot machine needs no time to settle.
     """
-    settled_s = 0.0 if held and any(s.serving for s in standing_in) else SETTLED_S
-    settled = sum(has_served(s, settled_s, now) for s in (*here.good, *here.replaced))
-    kept = sum(not s.unwanted for s in standing_in)
-    racing = 0 if settled else _racing(wanted, surge, standing_in)
-    return kept - max(0, wanted + racing - settled)
+    settled_s = 0.0 if part.held and any(s.serving for s in part.standing_in) else SETTLED_S
+    others = (*part.others.good, *part.others.replaced)
+    settled = sum(s.serving and s.was_ready_for(settled_s, now) for s in others)
+    kept = sum(not s.unwanted for s in part.standing_in)
+    racing = 0 if settled else _racing(part, part.wanted, part.standing_in)
+    return kept - max(0, part.wanted + racing - settled)
 
 
-def _racing(wanted: int, surge: int, standing_in: Sequence[Assessment]) -> int:
+def _racing(part: Part, wanted: int, standing_in: Sequence[Assessment]) -> int:
     """Return how many more boot where none serves yet: of many at once the fastest decides."""
-    return 0 if any(s.serving for s in standing_in) else min(surge, 2 * wanted - 1)
-
-
-def has_served(replica: Assessment, for_s: float, now: float) -> bool:
-    """Whether a replica serves, and was first ready at least this long ago."""
-    return replica.serving and replica.was_ready_for(for_s, now)
+    if part.group.on_demand.standbys >= part.wanted or any(s.serving for s in standing_in):
+        return 0  # stopped standbys start sooner
+    return min(part.surge, 2 * wanted - 1)

@@ -123,7 +123,7 @@ def _chosen(
     good = [o for o in offers if not intent.is_excluded(o.placement.location)]
     if not good:
         return None, Reason(Cause.NOTHING_OFFERED)
-    last = history.generation(GATEWAY_SLOT)
+    last = history.generations[GATEWAY_SLOT]
     in_vain = 0
     while record := history.record(GATEWAY_SLOT, last - in_vain):
         if record.first_ready_at is not None:

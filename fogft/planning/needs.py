@@ -81,7 +81,7 @@ def _missing(
     for _ in range(missing):
         slot = _lowest_free(group.first_slot, used)
         used.add(slot)
-        before = history.generation(slot)
+        before = history.generations[slot]
         follows = Reason(Cause.FOLLOWS, replica=f"{slot}.{before}")
         yield Need(slot, follows if before else Reason(Cause.NEW_SLOT), group)
 

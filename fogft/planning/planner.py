@@ -9,17 +9,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from fogft.model.groups import Group, group_of, is_stand_in, replica_hash
+from fogft.model.groups import group_of, is_stand_in, replica_hash
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Observed, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning import fallback, migration, rollout
 from fogft.planning.buying import Buyer, PlannedLaunch
-from fogft.planning.classification import Classification, classify
+from fogft.planning.classification import classify
 from fogft.planning.endings import Endings, choose_endings
 from fogft.planning.needs import Need, needed_launches, stand_in
-from fogft.planning.observed.health import Assessment, Health, judge
+from fogft.planning.observed.health import Assessment, Health, Verdict, judge
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.placement import EPSILON_USD
 from fogft.planning.sizing import Size, size
@@ -75,7 +75,8 @@ def plan(
     if observed.machines is None:
         return decided
     for _ in range(MOST_PASSES):
-        if latest.closed or not _changes(latest, history):
+        changes = latest.launches or latest.terminations or _newly_marked(latest, history)
+        if latest.closed or not changes:
             break
         world, memory = _under_way(pool_uid, spec, observed, history, decided)
         health = judge(pool_uid, spec, world, memory)
@@ -93,11 +94,6 @@ def plan(
         if is_done:
             break
     return decided
-
-
-def _changes(decided: Plan, history: History) -> bool:
-    """Whether a plan makes any difference to what the next one is based on."""
-    return bool(decided.launches or decided.terminations or _newly_marked(decided, history))
 
 
 def _newly_marked(decided: Plan, history: History) -> list[ReplicaId]:
@@ -136,17 +132,6 @@ def _under_way(
     return later, history.followed_by(events) if events else history
 
 
-class _Part(NamedTuple):
-    """A group's share of what is wanted and of the machines."""
-
-    group: Group
-    wanted: int
-    others: Classification  # its machines but for `standing_in`
-    standing_in: Sequence[Assessment]
-    held: int  # so many of those that stand in are kept in place of spot machines
-    surge: int  # so many more stand-ins boot while nobody serves
-
-
 def plan_once(
     spec: PoolSpec,
     intent: Intent,
@@ -159,9 +144,12 @@ def plan_once(
         known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
         return Plan(known, notes=(Reason(Cause.CLOUD_UNREACHABLE),))
     if intent.stopping:
-        return _stopping(health, observed)
+        left = [judged.id for judged in health.replicas if judged.id not in observed.ending]
+        ends = [PlannedEnd(id, Reason(Cause.DOWN)) for id in left]
+        return Plan(0, terminations=tuple(ends), notes=(Reason(Cause.STOPPING),), health=health)
 
-    sized = size(spec, intent, observed, health.running if spec.availability else 0)
+    running = sum(judged.verdict is not Verdict.FAILED for judged in health.replicas)
+    sized = size(spec, intent, observed, running)
     machines = classify(spec, intent, observed, health=health, size=sized)
     standing_in = [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
     others = machines.without(standing_in) if standing_in else machines
@@ -199,22 +187,14 @@ def plan_once(
         needs = needed_launches(sized.groups, counts, machines, history)
     room = wanted + spec.max_surge - machines.live
     first: Assessment | None = None
-    working = (*machines.good, *machines.replaced)
-    safe = any(s.serving and not s.placement.spot for s in working)
+    safe = any(s.serving and not s.placement.spot for s in (*machines.good, *machines.replaced))
     begun = [
         need
         for need in needs
         if fallback.is_first(need.slot, buyer.next_generation(need.slot), history, safe=safe)
     ]
     parts = [
-        _Part(
-            group,
-            count,
-            others.part(sized.groups, group),
-            mine,
-            kept,
-            fallback.surge_of(group, count, spec.max_surge),
-        )
+        fallback.Part(group, count, others.part(sized.groups, group), mine, kept, spec.max_surge)
         for group, count, mine, kept in zip(sized.groups, counts, of_groups, held, strict=True)
     ]
     kept_free = _urgent_first(buyer, _stand_ins_missing(parts, begun, history, safe), room)
@@ -230,52 +210,39 @@ def plan_once(
         if need.slot not in ordered:
             buyer.buy(need, room=room)
     outdated = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
-    staying = outdated if settling else []
     endings = Endings()
     # No group's surplus is another's.
     for part in parts:
         makes_room = first is not None and group_of(sized.groups, first.slot) is part.group
-        endings.add(
-            choose_endings(
-                part.wanted,
-                part.others,
-                health,
-                history,
-                now=observed.now,
-                dear_first=bool(excess),
-                held=staying,
-                first=first if makes_room else None,
-                standing_in=part.standing_in,
-                spare=fallback.spare(
-                    part.wanted,
-                    part.others,
-                    part.standing_in,
-                    observed.now,
-                    surge=part.surge,
-                    held=part.held,
-                ),
-            )
+        choose_endings(
+            part,
+            health,
+            history,
+            endings,
+            now=observed.now,
+            dear_first=bool(excess),
+            held=outdated if settling else (),
+            first=first if makes_room else None,
         )
     going = [
         *((s, s.why or Reason(Cause.NOT_WANTED)) for s in (*machines.failed, *machines.aborted)),
         *endings.now,
         *((s, why) for s, why in buyer.ended_for_room if s.id not in endings.ids),
     ]
-    ends = [PlannedEnd(s.id, why) for s, why in going]
     notes = [*sized.notes, *excess, *buyer.notes, *endings.notes]
     if health.uplink_suspected:
         notes.insert(0, Reason(Cause.UPLINK_SUSPECTED))
     return Plan(
         wanted=wanted,
         launches=tuple(buyer.launches),
-        terminations=tuple(ends),
+        terminations=tuple(PlannedEnd(s.id, why) for s, why in going),
         draining=tuple(s.id for s in endings.draining),
         notes=tuple(dict.fromkeys(notes)),
         health=health,
         # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
         # Who moves is not to go before the one that comes serves: all others do, and are needed.
         # Room kept for stand-ins that they did not take is left for the next pass.
-        closed=not (ends or endings.draining or machines.ending or excess)
+        closed=not (going or endings.draining or machines.ending or excess)
         and (found is not None or not machines.replaced)
         and not (kept_free and waits),
         waits=waits,
@@ -299,27 +266,19 @@ def _urgent_first(buyer: Buyer, short: Sequence[Need], room: int) -> int:
 
 
 def _stand_ins_missing(
-    parts: Sequence[_Part], begun: Sequence[Need], history: History, safe: bool
+    parts: Sequence[fallback.Part], begun: Sequence[Need], history: History, safe: bool
 ) -> list[Need]:
     """Return the stand-ins called for, where some slots get their first machine now."""
     needs: list[Need] = []
-    for group, wanted, others, standing_in, _, surge in parts:
-        if not group.on_demand.fallback:
+    for part in parts:
+        if not part.group.on_demand.fallback:
             continue
-        here = [s for s in standing_in if not s.unwanted]
-        used = {s.slot for s in (*others.everyone(), *standing_in)}
-        first = sum(need.group is group for need in begun)
-        count = fallback.missing(wanted - first, others, here, history, surge=surge, safe=safe)
-        for _ in range(count):
-            needs.append(stand_in(group, used))
+        used = {s.slot for s in (*part.others.everyone(), *part.standing_in)}
+        first = sum(need.group is part.group for need in begun)
+        for _ in range(fallback.missing(part, first, history, safe=safe)):
+            needs.append(stand_in(part.group, used))
             used.add(needs[-1].slot)
     return needs
-
-
-def _stopping(health: Health, observed: Observed) -> Plan:
-    left = [judged.id for judged in health.replicas if judged.id not in observed.ending]
-    ends = tuple(PlannedEnd(id, Reason(Cause.DOWN)) for id in left)
-    return Plan(0, terminations=ends, notes=(Reason(Cause.STOPPING),), health=health)
 
 
 def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Assessment | None:
@@ -354,7 +313,7 @@ def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessm
         return None
     for replica in buyer.standing_in:
         here = group_of(buyer.groups, replica.slot) is need.group
-        stayed = here and fallback.has_served(replica, fallback.STAYS_S, buyer.observed.now)
+        stayed = here and replica.was_ready_for(fallback.STAYS_S, buyer.observed.now)
         if stayed and buyer.fits_instead(need, replica):
             buyer.notes.append(Reason(Cause.OLD_BEFORE_NEW, slot=need.slot))
             return replica

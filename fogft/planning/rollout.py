@@ -156,9 +156,7 @@ def _launches_fail(history: History, began_at: float) -> Reason | None:
     return Reason(Cause.LAUNCHES_FAIL, count=len(causes), because=each)
 
 
-def is_whole(
-    spec: PoolSpec, health: Health, history: History, *, wanted: int, now: float, settle_s: float
-) -> bool:
+def is_whole(spec: PoolSpec, health: Health, *, wanted: int, now: float, settle_s: float) -> bool:
     """Whether exactly the wanted replicas run this file's version and have served for so long."""
     if not health.links_known or health.uplink_suspected:
         return False
@@ -169,15 +167,10 @@ def is_whole(
         judged.serving
         and judged.verdict is Verdict.GOOD
         and is_current(spec, judged.machine)
-        and not _settles(history, judged, now, settle_s)
+        and judged.ready_at is not None
+        and not 0 <= now - judged.ready_at < settle_s
         for judged in stay
     )
-
-
-def _settles(history: History, judged: Assessment, now: float, settle_s: float) -> bool:
-    record = history.record(judged.id.slot, judged.id.generation)
-    ready_at = record.first_ready_at if record is not None else None
-    return ready_at is None or 0 <= now - ready_at < settle_s
 
 
 def describe(

@@ -94,7 +94,7 @@ def test_generation_is_never_reused(world: World) -> None:
     planned = world.plan()
     assert len({launch.slot for launch in planned.launches}) == len(planned.launches)
     for launch in planned.launches:
-        assert launch.generation > world.history.generation(launch.slot)
+        assert launch.generation > world.history.generations[launch.slot]
         listed = [
             m.id.generation for m in world.machines or () if m.id.slot == launch.slot
             and m.id.pool_uid == UID

@@ -137,7 +137,7 @@ def test_more_evidence_makes_surer(hits: int, others: int) -> None:
 
 def whole(world: World, settle_s: float = 5.0) -> bool:
     health = judge(UID, NEW, world.observed, world.history)
-    return is_whole(NEW, health, world.history, wanted=2, now=NOW, settle_s=settle_s)
+    return is_whole(NEW, health, wanted=2, now=NOW, settle_s=settle_s)
 
 
 def test_a_pool_is_whole_when_all_that_is_wanted_serves_and_nothing_else_is_there() -> None:

@@ -27,7 +27,11 @@ _DECAY = math.log(2.0) / HALF_LIFE_S
 
 def hazards(history: History, now: float) -> Mapping[str, float]:
     """Return the losses per hour at each location that was asked for spot machines."""
-    return history.of_lives(hazard, as_of(now))
+    at, rates = as_of(now), history.rates
+    for location, lives in history.lives.items():
+        if rates.get(location, (None, 0.0))[0] != at:
+            rates[location] = at, _hazard(lives, history.failures.get(location, ()), at)
+    return {location: rates[location][1] for location in history.lives}
 
 
 def as_of(now: float) -> float:
@@ -35,8 +39,7 @@ def as_of(now: float) -> float:
     return now // EVERY_S * EVERY_S
 
 
-def hazard(lives: Iterable[Record], failures: Iterable[Failure], at: float) -> float:
-    """Return the losses per hour of a location, by its spot machines and failures, as of a time."""
+def _hazard(lives: Iterable[Record], failures: Iterable[Failure], at: float) -> float:
     losses, lived_s = PRIOR_LOSSES, PRIOR_S
     losses += REFUSED * sum(
         _weight(max(at - failure.at, 0.0))

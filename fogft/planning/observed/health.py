@@ -124,11 +124,6 @@ class Health(NamedTuple):
     uplink_suspected: bool  # all links that once answered are silent together
     links_known: bool  # there is a fresh report; without one nobody is doubted
 
-    @property
-    def running(self) -> int:
-        """The number of replicas that have not failed."""
-        return sum(judged.verdict is not Verdict.FAILED for judged in self.replicas)
-
 
 def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
     """Judge the observed replicas. Machines of other pools are left out."""

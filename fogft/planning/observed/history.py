@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import copy
 from bisect import insort
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from operator import itemgetter
@@ -134,18 +135,21 @@ class History:
     def __init__(self, events: Iterable[Event] = ()) -> None:
         self._records: dict[tuple[int, int], Record] = {}
         self._open: dict[tuple[int, int], Record] = {}
-        self.generations: dict[int, int] = {}  # slot -> highest ever used
-        self._served: dict[int, int] = {}  # slot -> the highest generation that was ever ready
+        # Slot -> the highest generation ever used, and that was ever ready; 0 for none.
+        self.generations: Counter[int] = Counter()
+        self.served: Counter[int] = Counter()
         self.failures: dict[str, list[Failure]] = {}  # by supply, oldest first
         self._proven_at: dict[str, float] = {}
         self.losses: dict[str, list[float]] = {}  # when, by location, oldest first
-        self._lives: dict[str, tuple[Record, ...]] = {}  # of spot machines, by location
-        self._of_lives: dict[str, tuple[float, float]] = {}  # what follows from them, as of when
+        self.lives: dict[str, tuple[Record, ...]] = {}  # of spot machines, by location
+        # What `hazard` makes of lives and failures, and as of when; until either changes.
+        self.rates: dict[str, tuple[float, float]] = {}
         self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
         self.version = 0  # of all facts: counts events
         self._fruitless: dict[str, list[Record]] = {}  # by version: failed for a reason of its own
         self._ready_versions: set[str] = set()
-        self._launches: dict[bool, list[Record]] = {False: [], True: []}  # by market, of late
+        # Whether on demand -> those of the last hour before the latest one.
+        self.launches: dict[bool, list[Record]] = {False: [], True: []}
         for event in events:
             self.add(event)
 
@@ -166,11 +170,11 @@ class History:
             record.on_demand, record.version = event.on_demand, event.version
             self._records[key] = record
             if starts:
-                kept = self._launches[record.on_demand]
+                kept = self.launches[record.on_demand]
                 lately = [r for r in kept if r.launched_at > record.launched_at - LAUNCHES_KEPT_S]
-                self._launches[record.on_demand] = [*lately, record]
+                self.launches[record.on_demand] = [*lately, record]
             if not record.on_demand:
-                self._lives[record.location] = (*self._lives.get(record.location, ()), record)
+                self.lives[record.location] = (*self.lives.get(record.location, ()), record)
         if starts:  # a second one: it was thought gone, and is listed
             record.closed, record.ending = None, False
         else:
@@ -193,7 +197,7 @@ class History:
         }
         self.losses = {p: [at + by_s for at in losses] for p, losses in self.losses.items()}
         self._proven_at = {supply: at + by_s for supply, at in self._proven_at.items()}
-        self._of_lives = {}
+        self.rates = {}
 
     def by_clock(self, instant: float) -> float:
         """Convert a recorded time to today's clock, which may have been set since."""
@@ -206,8 +210,8 @@ class History:
         later = copy.copy(self)
         # Launches and marks change nothing else.
         later._records, later._open = dict(self._records), dict(self._open)
-        later.generations, later._launches = dict(self.generations), dict(self._launches)
-        later._lives, later._of_lives = dict(self._lives), dict(self._of_lives)
+        later.generations, later.launches = self.generations.copy(), dict(self.launches)
+        later.lives, later.rates = dict(self.lives), dict(self.rates)
         for event in events:
             key = (event.slot, event.generation)
             if key in later._records:
@@ -225,8 +229,7 @@ class History:
             record.unready_since = None
             if record.version:
                 self._ready_versions.add(record.version)
-            if record.generation > self._served.get(record.slot, 0):
-                self._served[record.slot] = record.generation
+            self.served[record.slot] = max(self.served[record.slot], record.generation)
             self._proven_at[record.supply] = event.at
         elif kind is EventKind.UNREADY:
             record.unready_since = event.at
@@ -245,12 +248,12 @@ class History:
 
     def _close(self, record: Record, event: Event) -> None:
         kind = event.kind
-        self._of_lives.pop(record.location, None)
+        self.rates.pop(record.location, None)
         if kind is EventKind.REFUSED:
             self._fail(record, event)
-            if record.location in self._lives:
-                kept = self._lives[record.location]
-                self._lives[record.location] = tuple([r for r in kept if r is not record])
+            if record.location in self.lives:
+                kept = self.lives[record.location]
+                self.lives[record.location] = tuple([r for r in kept if r is not record])
         elif kind is EventKind.GONE:
             ready_at = record.first_ready_at
             if ready_at is None or event.at - ready_at < YOUNG_S:
@@ -261,7 +264,7 @@ class History:
 
     def _fail(self, record: Record, event: Event) -> None:
         failure = Failure(event.at, fault_of(event.reason))
-        self._of_lives.pop(record.location, None)
+        self.rates.pop(record.location, None)
         insort(self.failures.setdefault(record.supply, []), failure, key=_AT)
 
     def record(self, slot: int, generation: int) -> Record | None:
@@ -276,21 +279,13 @@ class History:
         """Return the facts about locations alone, as for a new pool."""
         anew = History()
         anew.failures, anew._proven_at = self.failures, self._proven_at
-        anew._lives, anew.losses = self._lives, self.losses
+        anew.lives, anew.losses = self.lives, self.losses
         return anew
 
     @property
     def locations(self) -> frozenset[str]:
         """Every location with a launch."""
         return frozenset(record.location for record in self._records.values())
-
-    def generation(self, slot: int) -> int:
-        """Return the highest generation ever used in a slot; 0 for none."""
-        return self.generations.get(slot, 0)
-
-    def served(self, slot: int) -> int:
-        """Return the highest generation of a slot that was ever ready; 0 for none."""
-        return self._served.get(slot, 0)
 
     def fruitless(self, version: str) -> Sequence[Record]:
         """Return the launches of a version that failed by its own fault, oldest first."""
@@ -307,26 +302,9 @@ class History:
                  and r.first_ready_at is not None}  # fmt: skip
         return {(record.slot, record.generation) for record in (*failed, *ready.values())}
 
-    def launches(self, *, on_demand: bool) -> Sequence[Record]:
-        """Return the launches of one market of the last hour before its latest one."""
-        return self._launches[on_demand]
-
     def proven_at(self, supply: str) -> float:
         """Return when a replica there last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
-
-    def of_lives(
-        self, work_out: Callable[[Sequence[Record], Sequence[Failure], float], float], at: float
-    ) -> Mapping[str, float]:
-        """Return the cached summary of spot machines' lives and failures at each location.
-
-        `work_out` is asked again for another time, and after a machine has ended there.
-        """
-        for location, lives in self._lives.items():
-            if self._of_lives.get(location, (None, 0.0))[0] != at:
-                failures = self.failures.get(location, ())
-                self._of_lives[location] = at, work_out(lives, failures, at)
-        return {place: self._of_lives[place][1] for place in self._lives}
 
 
 def compacted(
@@ -362,7 +340,7 @@ def compacted(
         dropped |= set(indices) - {*first_ready, *indices[-2:]}
     out: list[Event] = []
     for index, e in enumerate(events):
-        is_last = e.generation == history.generation(e.slot)
+        is_last = e.generation == history.generations[e.slot]
         if (
             e.kind is EventKind.CLOCK
             or (e.kind is EventKind.SLEPT and out)

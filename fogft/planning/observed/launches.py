@@ -34,7 +34,7 @@ def within_an_hour(history: History, now: float, *, on_demand: bool) -> Sequence
     """Return the launches of one market within the last hour that got a machine."""
     return [
         record
-        for record in history.launches(on_demand=on_demand)
+        for record in history.launches[on_demand]
         if 0 <= now - record.launched_at < HOUR_S and not _was_refused(record)
     ]
 
@@ -47,6 +47,5 @@ def _was_refused(record: Record) -> bool:
 
 def next_change(history: History, now: float) -> float:
     """Return when a launch is an hour old next; infinity for never."""
-    both = (*history.launches(on_demand=False), *history.launches(on_demand=True))
-    ends = [record.launched_at + HOUR_S for record in both]
+    ends = [record.launched_at + HOUR_S for both in history.launches.values() for record in both]
     return min([at for at in ends if at > now], default=float("inf"))

@@ -183,7 +183,7 @@ class Reconciler:
         update = None
         if decided.health is not None and not intent.stopping:
             update = self._updating.settle(
-                spec, trial, decided.health, history, wanted=decided.wanted, now=observed.now
+                spec, trial, decided.health, wanted=decided.wanted, now=observed.now
             )
         trouble += [update.reason] if update is not None else []
         decided = decided._replace(notes=tuple(map(self._with_log, decided.notes)))
@@ -301,7 +301,7 @@ class Reconciler:
                 self._remember.add(EventKind.FAILED, id, reason=reason)
             self._terminate(id, reason, history)
         if step.launch is not None:
-            generation = history.generation(GATEWAY_SLOT) + 1
+            generation = history.generations[GATEWAY_SLOT] + 1
             order = self._gateway.order(spec, step.launch, generation)
             self._order(order, Reason(Cause.NEW_SLOT))
         there = step.host and spec.dial_in == spec.gateway.endpoints(step.host)[2]

@@ -56,22 +56,14 @@ class Updating:
             self._store.write_trial(replace(trial, began_at=trial.began_at + by_s))
 
     def settle(
-        self,
-        spec: PoolSpec,
-        trial: Trial,
-        health: Health,
-        history: History,
-        *,
-        wanted: int,
-        now: float,
+        self, spec: PoolSpec, trial: Trial, health: Health, *, wanted: int, now: float
     ) -> Update | None:
         """Store the file as good once all replicas run it; return the update's state."""
         good = self._store.good()
         if not trial.fault and spec is not good and spec != good:
             settle_s = rollout.SETTLE_S if good is not None else 0.0
-            if rollout.is_whole(
-                spec, health, history, wanted=wanted, now=now, settle_s=settle_s
-            ) and self._store.keep_good(spec):
+            is_whole = rollout.is_whole(spec, health, wanted=wanted, now=now, settle_s=settle_s)
+            if is_whole and self._store.keep_good(spec):
                 log.info("file_good file=%s", trial.file)
                 good = spec
         return rollout.describe(spec, good, trial, health, wanted)

@@ -52,9 +52,9 @@ def test_generations_never_go_back(found: list[Event]) -> None:
     """The highest generation of a slot only grows as events come in."""
     history = History()
     for event in found:
-        before = history.generation(event.slot)
+        before = history.generations[event.slot]
         history.add(event)
-        assert history.generation(event.slot) == max(before, event.generation)
+        assert history.generations[event.slot] == max(before, event.generation)
 
 
 @given(events)

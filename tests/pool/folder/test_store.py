@@ -39,7 +39,7 @@ def test_history_outlives_the_process(pool: Scene) -> None:
     pool.store.append(READY)
     other = store_of(pool.home)
     assert other.recent() == [LAUNCH, READY]
-    assert other.history().generation(0) == 1
+    assert other.history().generations[0] == 1
     assert pool.paths.history.stat().st_mode & 0o777 == 0o600
 
 
@@ -68,7 +68,7 @@ def test_full_disk_is_an_error_and_nothing_has_happened(
         patch.setattr(os, "write", full)
         with pytest.raises(StateError, match="No space left"):
             pool.store.append(replace(LAUNCH, generation=2))
-    assert pool.store.history().generation(0) == 1
+    assert pool.store.history().generations[0] == 1
     assert store_of(pool.home).recent() == [LAUNCH]
 
 

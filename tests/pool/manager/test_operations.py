@@ -176,7 +176,7 @@ def test_machine_that_history_lacks_is_adopted() -> None:
     )
     tick = reconciler.tick()
     assert (tick.plan.launches, tick.plan.terminations) == ((), ())
-    assert successor.store.history().generation(0) == 1
+    assert successor.store.history().generations[0] == 1
 
 
 def test_order_that_cannot_be_built_launches_nothing() -> None:

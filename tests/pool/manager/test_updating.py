@@ -44,7 +44,7 @@ def tick(store: PoolStore, world: World) -> PoolSpec:
     updating, observed = Updating(store), world.observed
     spec, trial = updating.look(UID, observed, world.history)
     health = judge(UID, spec, observed, world.history)
-    updating.settle(spec, trial, health, world.history, wanted=1, now=world.now)
+    updating.settle(spec, trial, health, wanted=1, now=world.now)
     return spec
 
 
