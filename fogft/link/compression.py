@@ -5,8 +5,6 @@ pays is measured for each service. What does not shrink is left alone, and tried
 
 A few kilobytes may become 64 MiB. Zenoh's thread, which brings the bytes of all links, must not
 spend that time, nor may one peer wait behind another: a thread of each peer's own decompresses.
-
-Not here: rates (`socket_progress`), headers (`frame`).
 """
 
 import contextlib

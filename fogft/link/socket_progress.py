@@ -5,8 +5,6 @@ The kernel counts what the peer has acknowledged, so no time-out has to be guess
 
 What would be too late at the rate that was seen is declined at once, and may go elsewhere. The rate
 is known for ten seconds only: then a request is let through, by which the link is measured anew.
-
-`now` is an argument. Not here: where the counts come from (`sockets`), the bounds (`window`).
 """
 
 import logging
@@ -162,13 +160,10 @@ log = logging.getLogger(__name__)
 
 
 class DeadlineFilter:
-    """Judges the requests of one connection. Any thread.
+    """Judges the requests to `timed` services, of no use after their time. Any thread.
 
-    Args:
-        timed: Services whose requests are of no use after their time.
-        carries: Returns what the link carries, by the clock, in bytes a second; None for not known.
-        left: Returns how many bytes sent before have not arrived, by the clock and that rate.
-        packs: Returns a service's compression, if any.
+    `carries` returns the bytes a second that the link carries at a moment, None for not known;
+    `left` the bytes that have not arrived by then at that rate; `packs` a service's compression.
     """
 
     def __init__(

@@ -6,8 +6,6 @@ offering thread, the sender thread and Zenoh's threads meet here: each step hold
 To tell a replica that a request was cancelled costs a message. So it is told at once only if the
 request has been out for `WORTH_S` and the replica was told nothing for `EVERY_S`, else with the
 next flush, and not at all if the answer comes first.
-
-Not here: sending (`attempts`), deadlines.
 """
 
 import heapq

@@ -3,8 +3,6 @@
 A replica dials the door, proves who it is, and waits. A link to that replica dials a port on this
 machine's loopback; the door then joins both connections. The robot is the TLS client, the replica
 the TLS server, end to end, so the door can neither read nor change what passes.
-
-Not here: the replica's side (`replica`), links (`link`).
 """
 
 import contextlib

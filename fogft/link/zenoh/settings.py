@@ -8,8 +8,6 @@ thread: a round trip of 8 bytes over loopback took 168 us with one and 257 to 27
 Sending and closing have threads of their own. Whoever sends something large holds a lock of its
 link while he waits for room; when that link breaks, Zenoh's sending and closing wait for that lock,
 for up to `wait_before_close`: in the one thread, all other links would stand still as long.
-
-Not here: sessions, and the certificates' contents (`fogft.pool.credentials.authority`).
 """
 
 from __future__ import annotations
@@ -60,7 +58,7 @@ def robot_settings(
     # Of an IPv6 address in brackets Zenoh makes a name for TLS that is none; without, it reads it.
     endpoint = peer.endpoint.replace("[", "").replace("]", "")
     return {
-        **_common(settings),
+        **_common(settings, "connect", credentials),
         "mode": "client",
         "connect/endpoints": [
             f"tls/{endpoint}" + (f"#iface={peer.interface}" if peer.interface else "")
@@ -69,16 +67,6 @@ def robot_settings(
         "connect/timeout_ms": 0,
         "connect/exit_on_failure": True,
         "listen/endpoints": [],
-        "transport/link/tls": {
-            "root_ca_certificate": str(credentials.ca),
-            "connect_certificate": str(credentials.certificate),
-            "connect_private_key": str(credentials.key),
-            "enable_mtls": True,
-            # Replicas have no names in the DNS: their common name is checked instead, by the
-            # connection after opening and by the list below whenever Zenoh reconnects by itself.
-            "verify_name_on_connect": False,
-            "close_link_on_expiration": True,
-        },
         # To any other common name nothing at all goes out. Kept true by
         # tests/link/zenoh/test_trust.py::test_nothing_is_sent_to_an_impostor_after_a_reconnect.
         "access_control": _access(
@@ -93,7 +81,7 @@ def replica_settings(
     """Return the settings of a replica's session, which listens at ``host:port``."""
     keys = names.slot_key(id.pool_uid, id.slot, "**")
     return {
-        **_common(settings),
+        **_common(settings, "listen", credentials),
         # Not `router`: that would carry robots' messages to each other.
         "mode": "peer",
         "connect/endpoints": [],
@@ -101,13 +89,6 @@ def replica_settings(
         "listen/exit_on_failure": True,
         "transport/unicast/max_sessions": SESSIONS_LIMIT,
         "transport/unicast/accept_pending": _HANDSHAKES_LIMIT,
-        "transport/link/tls": {
-            "root_ca_certificate": str(credentials.ca),
-            "listen_certificate": str(credentials.certificate),
-            "listen_private_key": str(credentials.key),
-            "enable_mtls": True,
-            "close_link_on_expiration": True,
-        },
         # Any name: the handshake has proved that the CA made its holder a robot.
         "access_control": _access(keys, "ingress", "egress", {}),
     }
@@ -124,13 +105,23 @@ def to_zenoh(settings: dict[str, Any]) -> zenoh.Config:
     return config
 
 
-def _common(settings: LinkSettings) -> dict[str, Any]:
+def _common(settings: LinkSettings, side: str, credentials: CredentialPaths) -> dict[str, Any]:
     return {
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "adminspace/enabled": False,
         "transport/shared_memory/enabled": False,
         "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(credentials.ca),
+            f"{side}_certificate": str(credentials.certificate),
+            f"{side}_private_key": str(credentials.key),
+            "enable_mtls": True,
+            # Replicas have no names in the DNS: their common name is checked instead, by the
+            # connection after opening and by the access list whenever Zenoh reconnects by itself.
+            "verify_name_on_connect": False,
+            "close_link_on_expiration": True,
+        },
         "transport/link/tx/lease": round(settings.lease_s * 1e3),
         # So many in a lease: a peer that is out of reach leaves something unacknowledged.
         "transport/link/tx/keep_alive": max(4, round(settings.lease_s / _SIGN_OF_LIFE_EVERY_S)),

@@ -4,14 +4,12 @@ A connection's answers are the replies to one query of its own, which it asks on
 in, and which stays open. Zenoh's threads only decode and hand over. Replies leave through one
 thread for each connection, because replying to a frozen robot can block; probes are answered by one
 more thread, ahead of all replies.
-
-Not here: what a request is worth (`fogft.proxy.replica.responder`), duplicates included.
 """
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import zenoh
 from zenoh import handlers
@@ -43,20 +41,15 @@ from fogft.records.signing import Verifier
 
 log = logging.getLogger(__name__)
 
-Heard = TypeVar("Heard", zenoh.Query, zenoh.Sample)
-
 _CLOSE_WAIT_S = 1.0
 
 
 class ZenohListener:
     """A replica's end: receives requests and probes of robots that its CA admits.
 
-    Args:
-        listen: ``host:port``; port 0 for any that is free. Raises WireError: it is not that.
-        credentials: The replica's certificate and key, and the pool's CA.
-        id: Which replica this is: it hears the keys of its slot only.
-        handshakes: Tells which handshakes were refused; None where they need not be counted.
-        certificate_name: The common name of its certificate, where that is not the replica's.
+    `listen` is ``host:port``, port 0 for any that is free. Raises WireError: it is not that.
+    `handshakes` tells those refused; None where they need not be counted. `certificate_name` is
+    the common name of its certificate, where that is not the replica's.
     """
 
     def __init__(
@@ -176,10 +169,10 @@ class ZenohListener:
         callback = self._callback(f"message at {key}", heard)
         self._declared.append(session.declare_subscriber(key, callback))
 
-    def _callback(self, what: str, heard: Callable[[Heard], None]) -> Any:
+    def _callback(self, what: str, heard: Callable[[Any], None]) -> Any:
         """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
 
-        def guarded(one: Heard) -> None:
+        def guarded(one: Any) -> None:
             self._turns.came()
             threads.note()
             try:
@@ -219,11 +212,11 @@ class ZenohListener:
                 log, "not_admitted", "robot_not_admitted reason=%r", "it did not greet"
             )
             if stream is not None:
-                self._refuse_all(requests, stream, Refusal.NOT_ADMITTED)
+                self._refuse(stream, Refusal.NOT_ADMITTED, *requests)
             return
         service = self._services.get(key)
         if service is None:
-            self._refuse_all(requests, stream, Refusal.NOT_READY)
+            self._refuse(stream, Refusal.NOT_READY, *requests)
             return
         robot = self._sessions.robot(token)
         if robot not in ("", requests[0][0].robot):  # it asks in its own name, whatever it says
@@ -233,7 +226,7 @@ class ZenohListener:
             if not header.packed:
                 hand_over(payload)
             elif not self._unpacker.put(self._sessions.holder(token), payload, hand_over):
-                self._refuse(header, stream, Refusal.OVERLOADED)
+                self._refuse(stream, Refusal.OVERLOADED, (header, payload))
         stream.seen(requests[0][0].seen)
 
     def _hand_over(
@@ -246,7 +239,7 @@ class ZenohListener:
     ) -> None:
         if request is None:
             self._malformed("a payload that cannot be decompressed")
-            self._refuse(header, stream, Refusal.MALFORMED)
+            self._refuse(stream, Refusal.MALFORMED, (header, b""))
             return
         incoming = ZenohIncoming(service, header, request, stream, self._queues)
         try:
@@ -256,16 +249,12 @@ class ZenohListener:
             log.exception("request_not_taken service=%s", service)
             incoming.refuse(Refusal.LOST)
 
-    def _refuse_all(
-        self, requests: Sequence[tuple[frame.RequestHeader, bytes]], stream: Stream, reason: str
+    def _refuse(
+        self, stream: Stream, reason: str, *requests: tuple[frame.RequestHeader, bytes]
     ) -> None:
         for header, _ in requests:
-            self._refuse(header, stream, reason)
-
-    def _refuse(self, header: frame.RequestHeader, stream: Stream, reason: str) -> None:
-        self._queues.put(
-            header.token, header.robot, Reply(stream, header.request_id, b"", reason), more=True
-        )
+            refusal = Reply(stream, header.request_id, b"", reason)
+            self._queues.put(header.token, header.robot, refusal, more=True)
 
     def _malformed(self, error: ValueError | str) -> None:
         self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))

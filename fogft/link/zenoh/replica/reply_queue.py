@@ -5,8 +5,6 @@ Zenoh gives that robot's session up, so each connection has its own queue and th
 block (`reply_streams`) leaves at once, from the thread that brings it, unless that is Zenoh's.
 Queries that are to be ended take the same way. What sends raises `zenoh.ZError` where the session
 is closed.
-
-Not here: what is replied (`fogft.proxy.replica`).
 """
 
 import logging
@@ -307,10 +305,7 @@ class ZenohIncoming:
         self._queues.put(header.token, header.robot, reply, more=more)
 
     def __del__(self) -> None:
-        """Refuse what its owner forgot: the robot must not wait for it until its deadline.
-
-        The collector may call this while a lock of ours is held; a `SimpleQueue` may be put into.
-        """
+        """Refuse what its owner forgot, by a `SimpleQueue`: a lock of ours may be held now."""
         if self._streams:
             forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)
             header = self._header

@@ -9,8 +9,7 @@ All connections of a robot count together: they may share one socket. What was s
 counts for a minute after it was sent, since that one may be gone.
 
 Whoever asks again under one token, or whose connection is the oldest of too many, has its former
-query ended, and opens another connection. Not here: who is let in (`sessions`), the threads that
-may block (`reply_queue`).
+query ended, and opens another connection.
 """
 
 from __future__ import annotations

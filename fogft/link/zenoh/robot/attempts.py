@@ -69,8 +69,7 @@ class Callbacks:
     answered: Callable[[Answer], None]
     late: Callable[[Answer], None]
     room: Callable[[], None]  # a window that was full has room again
-    large: Callable[[], None]  # something large is sent, and `Attempts.watched` was not set
-    lost: Callable[[], None]  # the connection is of no more use; perhaps more than once
+    wake: Callable[[], None]  # `Attempts.watched` was set, or the connection is lost; perhaps again
 
 
 class Attempts:
@@ -101,7 +100,7 @@ class Attempts:
         self._answered = tell.answered
         self._late = tell.late
         self._room = tell.room
-        self._on_large = tell.large
+        self._wake = tell.wake
         self._ended = ended
         self.window = LinkWindow(standing=len(self._services))
         self.watched = False  # something large was sent lately: the link's thread looks often
@@ -318,7 +317,7 @@ class Attempts:
             self._large_since = self._sending_since = began
             if not self.watched:  # have the link's thread look whether it flows, for a while
                 self.watched = True
-                self._on_large()
+                self._wake()
         try:
             if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
                 attempt.payload = None

@@ -6,8 +6,6 @@ time-out at the replica would be sent by the one thread that all else there need
 
 What can block (`put`, `close`) is called by the sender thread of its attempts, so a peer that takes
 nothing costs nobody else. What sends raises `zenoh.ZError` where the session is closed.
-
-Not here: the requests open on it (`attempts`), when to open and when to give up (`link`).
 """
 
 import secrets
@@ -77,16 +75,10 @@ _TELL_RECORDS_TIMEOUT_S = 5.0
 
 
 class Connection:
-    """An open session whose peer has been verified.
+    """An open session whose peer has been verified; of no more use once `lost_because` says why.
 
-    Attributes:
-        certificate: Ours (DER), which it uses.
-        lost_because: Why it is of no more use; empty while it is.
-
-    Raises:
-        zenoh.ZError: Nothing was reached.
-        WireError: Somebody else was reached. Nothing was sent to them.
-        CredentialError: Our own certificate or key cannot be used.
+    Raises zenoh.ZError: Nothing was reached. WireError: Somebody else was; nothing was sent to
+    them. CredentialError: Our own certificate (`certificate`, DER) or key cannot be used.
     """
 
     def __init__(
@@ -97,7 +89,7 @@ class Connection:
         shared: Shared,
         tell: Callbacks,
     ) -> None:
-        self._on_lost = tell.lost
+        self._wake = tell.wake
         self._begun = False
         self._token = secrets.token_bytes(frame.TOKEN_BYTES)
         self.certificate, signature = shared.signer(
@@ -182,7 +174,7 @@ class Connection:
     def lose(self, because: str) -> None:
         """Note that the connection is lost. Any thread, perhaps more than once."""
         self.lost_because = self.lost_because or because
-        self._on_lost()
+        self._wake()
 
     # -- Zenoh's threads ------------------------------------------------------------------
 

@@ -20,10 +20,8 @@ _CLOSE_WAIT_S = 3.0
 class ZenohDialer:
     """Creates links over Zenoh; see `port.Dialer`. Peers of another pool are refused.
 
-    Args:
-        credentials: The robot's certificate and key, and the pool's CA.
-        suspect_after_s: Probes unanswered for so long make a link suspect.
-        tell_losers: Whether replicas are told which requests are no longer wanted.
+    Probes unanswered for `suspect_after_s` make a link suspect. With `tell_losers`, replicas are
+    told which requests are no longer wanted.
     """
 
     def __init__(

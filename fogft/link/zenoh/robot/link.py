@@ -2,9 +2,6 @@
 
 A thread of each link (`fogft-keep-...`) replaces the connection when it is lost or when probes go
 unanswered: never because a service is slow.
-
-Not here: sessions (`connection`), attempts (`attempts`), what a replica's silence means for the
-pool (`fogft.planning`).
 """
 
 from __future__ import annotations
@@ -69,8 +66,7 @@ class ZenohLink:
             answered=self._answered,
             late=self._late,
             room=self._changed,
-            large=self._wake.set,
-            lost=self._wake.set,
+            wake=self._wake.set,
         )
         # Written by the link's thread only; `_live` is set exactly while the state is UP.
         self._live: Connection | None = None
