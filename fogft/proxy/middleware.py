@@ -2,9 +2,6 @@
 
 With rclpy a type is what its installed package says. Over Zenoh it is known by the hash that
 nodes write into their names; where its package is installed too, its fields are known besides.
-
-Owns: which implementation of `fogft.ros.port.RosNode` a process gets.
-Not here: the implementations, and what the node is for.
 """
 
 import contextlib
@@ -80,15 +77,12 @@ def join(
     noticed: Callable[[], None] = lambda: None,
     environ: Mapping[str, str] = os.environ,
 ) -> Joined:
-    """Create a node.
+    """Create a node. Raises RosError: ROS, or Zenoh, is not usable here.
 
     Args:
         told: Returns the definitions of types as each replica tells them.
         noticed: Called, from any thread, when a type may be known that was not.
         environ: Where the variables of ROS and Zenoh are, for Zenoh.
-
-    Raises:
-        RosError: ROS, or Zenoh, is not usable here.
     """
     from fogft.ros.types import definition
 

@@ -1,4 +1,1 @@
-"""The gateway between a robot with a thin uplink and the replicas.
-
-Not here: choosing a replica (`fogft.requests`), hearing requests (`fogft.link`).
-"""
+"""The gateway between a robot with a thin uplink and the replicas."""

@@ -1,11 +1,7 @@
 """A gateway: a replica to its robots, backed by a dispatcher over its own links.
 
-A request's id, the time that is left, and word that it is no longer wanted go on unchanged, so a
-copy that came on another way joins the one under way, here or at the replica. While no replica
-behind it can answer, it refuses what it holds, so that a robot asks another gateway.
-
 Owns: which requests of robots are under way, and whom each answer goes to.
-Not here: fanning out (`dispatcher`), links (`client`), files and signals (`process`).
+Design: docs/design/gateways.md.
 """
 
 import logging

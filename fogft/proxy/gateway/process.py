@@ -1,8 +1,4 @@
-"""``fogft gateway --config FILE``: a gateway as a process. It needs no ROS.
-
-It follows its membership as a client proxy does, and listens as a replica does. Started
-again with a new certificate it is the same gateway, under its next generation.
-"""
+"""``fogft gateway --config FILE``: a gateway as a process. It needs no ROS."""
 
 from __future__ import annotations
 
@@ -50,9 +46,7 @@ _REPORT_EVERY_S = 0.5
 def run(config_path: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
     """Run until a signal ends it; each option replaces a key of the file.
 
-    Raises:
-        PoolBusy: This gateway runs already.
-        FogftError: The configuration or the credentials cannot be used, or the port is taken.
+    Raises PoolBusy: This gateway runs already.
     """
     start_log()
     stop = stop_on_signal()

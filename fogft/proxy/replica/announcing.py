@@ -1,8 +1,4 @@
-"""A replica's exchange with the rendezvous: its own record, and the members it learns.
-
-Owns: the replica's record, when it is written anew, and the doors that it dials.
-Not here: what is told with each probe (`server`), records (`fogft.records.record`).
-"""
+"""A replica's exchange with the rendezvous: its own record, and the members it learns."""
 
 import logging
 
@@ -20,11 +16,7 @@ log = logging.getLogger(__name__)
 class Presence:
     """A replica's connections to the rendezvous and to dial-in ports.
 
-    Args:
-        listening: ``host:port`` of its own listener.
-
-    Raises:
-        CredentialError: The credentials cannot be used.
+    `listening`: ``host:port`` of its own listener. Raises CredentialError.
     """
 
     def __init__(self, config: ServerProxyConfig, listening: str) -> None:

@@ -1,9 +1,7 @@
 """Ensure that a replica's action server gets each goal once, however often it is sent.
 
 To be asked twice for one goal harms some action servers: rclcpp's ends its process. So copies of a
-goal wait for the answer to the first, for as long as each may; the first is waited for until the
-action server dies, and who comes after it was accepted gets the same answer. Like any service, an
-action server is given no more at once than its queue holds.
+goal wait for the answer to the first, and who comes after it was accepted gets the same answer.
 
 Owns: `send_goal` requests, from the wire to the answer, and which goals the present action server
 has. Not here: the action's other services (`responder`).

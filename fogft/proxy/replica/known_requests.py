@@ -1,9 +1,8 @@
 """Requests known to a replica or gateway: each id once, its answer kept for a while. Pure.
 
 A robot that lost its link sends what was in flight again, under the same id. So an id is known
-until its deadline, and its answer is kept for copies as long as there is room.
-
-Owns: ids, their deadlines, kept answers and their bounds. Called under the owner's lock.
+until its deadline, and its answer is kept for copies as long as there is room. Called under the
+owner's lock.
 """
 
 import heapq

@@ -2,9 +2,7 @@
 
 Where the configuration lists none, every service that an application offers in the replica's ROS
 graph is taken up, under the name that ROS gives it.
-
-Owns: which services there are, since when, and the definitions of their types.
-Not here: whether they answer (`server`), which the robot proxies (`fogft.pool.folder.discovered`).
+Not here: which of them the robot proxies (`fogft.pool.folder.discovered`).
 """
 
 from collections.abc import Callable, Mapping
@@ -20,11 +18,7 @@ _TOLD = 8  # names in a sentence
 
 
 class Offering:
-    """The services of one replica.
-
-    Args:
-        services: Those of the configuration; none to find them out.
-    """
+    """The services of one replica: those of the configuration, or what is found out."""
 
     def __init__(
         self,

@@ -2,9 +2,6 @@
 
 Orders come from the wire's threads, responses from the ROS thread. The lock is held while a
 decision is made, never while something is sent.
-
-Owns: the calls of the service, of its snapshot and of its restore. Not here: decisions
-(`fogft.ordering.replica`), what the bytes of a state service mean (`fogft.ros.state_bytes`).
 """
 
 import logging

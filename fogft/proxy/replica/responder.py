@@ -1,15 +1,11 @@
 """The replica's side of its services: run each request once, answer every copy of it.
 
-At most `OUTSTANDING` requests a service are passed on at a time; the others wait here, and what
-waits past its deadline is never begun, nor what its robot no longer wants.
-
 A cancel service says "stop what you are doing" and names no request, because a ROS service does not
 know our ids. So a service that has one is given one request at a time, and nothing more until the
 cancel service has answered: else what stops might be the next request.
 
-Owns: what becomes of the requests that this replica holds.
-Not here: which ids are known (`known_requests`), in what order they run and how many
-(`service_queue`), readiness and the command (`supervisor`), links, ROS.
+Owns: what becomes of the requests that this replica holds. Not here: which ids are known
+(`known_requests`), in what order they run and how many (`service_queue`).
 """
 
 import logging

@@ -1,11 +1,9 @@
 """The server proxy: passes requests from the link to the replica's local services.
 
-It says "ready" for a service only while the user's command lives and discovery finds the service.
 When the command dies, it leaves ROS and joins it anew: discovery would go on listing the dead
 service. When a service goes and the command lives, what was passed on to it is refused.
 
-Owns: the replica's state as probes tell it. Not here: requests (`responder`), the command
-(`supervisor`), files and signals (`process`). Design: docs/design/server-proxy.md.
+Owns: the replica's state as probes tell it. Design: docs/design/server-proxy.md.
 """
 
 from __future__ import annotations
@@ -58,7 +56,6 @@ class ServerProxy:
         services: What it answers; none for whatever the command offers.
         make_node: Joins ROS; called again after each death of the command.
         spare: A second process of the command, to take over when the first dies.
-        make_state: Says how the state of a stateful service travels.
         define: Returns the definition of a service type here, for the robot to compare.
         topics: What passes besides services; needs nodes that publish and subscribe.
         answered: As for `Responder`.
@@ -157,13 +154,10 @@ class ServerProxy:
             ordered.tick(self.command.alive)
 
     def _poll(self) -> bool:
-        """See whether the command died, and start it again, or have the spare process take over.
-
-        That is started once this replica is ready: two that start at once both take twice as long.
-        Nothing asks it, in a ROS domain of its own, which the proxy joins when it takes over.
-        """
+        """See whether the command died; start it again, or have the spare process take over."""
         died = self.command.poll(at_work=self.responder.at_work > 0)
         spare = self._spare
+        # Not before this replica is ready: two that start at once both take twice as long.
         if spare is not None and (spare.alive or self.complete):
             spare.poll()
         if died and spare is not None and spare.alive:
@@ -271,11 +265,7 @@ class ServerProxy:
         return left_s is not None and left_s <= 0
 
     def noticed(self, notice: Notice) -> None:
-        """Take a preemption notice of this machine. Any thread; never withdrawn.
-
-        A preemption asks the robot to prefer the others, and the manager to replace this
-        replica; a rebalance is a hint, and the replica serves on as before.
-        """
+        """Take a preemption notice of this machine. Any thread; never withdrawn."""
         if notice.kind is NoticeKind.PREEMPTION:
             self.draining = True
         else:

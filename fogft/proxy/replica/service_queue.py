@@ -1,10 +1,7 @@
 """The jobs of one service at a replica: waiting ones, running ones, and the limit of those.
 
 In what order requests run is decided here and nowhere else (`take`). Called under the
-responder's lock.
-
-Owns: a service's queue, its limit, and the room that is taken.
-Not here: request ids and copies (`responder`), the order itself (`requests.fair_queue`).
+responder's lock. Not here: the order itself (`requests.fair_queue`).
 """
 
 from collections import deque

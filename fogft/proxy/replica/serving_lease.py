@@ -3,8 +3,6 @@
 The manager signs leases, and signs a new one every minute or sooner: each says when it was signed
 and how long it lasts. Robots and rendezvous pass them on, and nothing else that they say or do
 keeps a machine alive.
-
-Owns: when the lease is over. Not here: signatures (`fogft.records`), ending (`process`).
 """
 
 from collections.abc import Callable

@@ -2,8 +2,6 @@
 
 The command gets a session of its own and dies with this process, whatever ends it
 (`fogft.child`). It is started through ``bash -c``, as SkyPilot does.
-
-Owns: one child process. Not here: whether its services answer (`server`).
 """
 
 import contextlib

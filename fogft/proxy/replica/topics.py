@@ -1,10 +1,7 @@
 """Topics at a replica: publishes robots' messages, and holds its nodes' messages for them.
 
-A robot's message is a request that is answered when it was published. What nodes here publish waits
-in a ring; a robot pulls what comes after the last number that it has.
-
 Owns: this replica's publishers and subscriptions, its rings, and the pulls that are held.
-Not here: which message a robot passes on (`fogft.proxy.robot.topics`), bytes (`topics.frames`).
+Design: docs/design/topics.md.
 """
 
 from __future__ import annotations

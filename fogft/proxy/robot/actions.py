@@ -1,11 +1,7 @@
 """An action on the robot: three services whose requests go to all replicas.
 
-A goal goes to every replica, and to those that come while it is under way. The first that succeeds
-is the result; the others are told to cancel. What a client cancels is cancelled everywhere.
-
-Owns: what decides for the three services, and what replicas must have of them.
-Not here: a request's life (`dispatcher`), what a goal is (`fogft.topics.goals`), feedback and
-status (`topics`).
+Owns: what decides for the three services, and what replicas must have of them. Not here: what a
+goal is (`fogft.topics.goals`), feedback and status (`topics`). Design: docs/design/topics.md.
 """
 
 import logging
@@ -47,10 +43,7 @@ class _ToCancel:
 
 
 class _Action:
-    """What the three services of one action share, under a lock that is taken last.
-
-    `began` is called, without the lock, with a goal and a replica that has taken it.
-    """
+    """What the three services of one action share, under a lock that is taken last."""
 
     def __init__(self, clock: Callable[[], float], wake: Callable[[], None]) -> None:
         self.lock = threading.Lock()
@@ -59,6 +52,7 @@ class _Action:
         self.goals = Goals()
         self.to_cancel: deque[_ToCancel] = deque(maxlen=_CANCELS_KEPT)
         self.replicas: Collection[int] = ()
+        # Called, without the lock, with a goal and a replica that has taken it.
         self.began: Callable[[bytes, int], None] = lambda goal, replica: None
 
     def cancel(self, goal: bytes, replicas: Iterable[int], now: float) -> None:
@@ -69,10 +63,7 @@ class _Action:
 
 
 class _CancelPart(Decide):
-    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile.
-
-    What a replica cancels is begun on none that comes later.
-    """
+    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile."""
 
     replicates = True
 
@@ -222,12 +213,7 @@ class _GoalPart(Decide):
 
 
 class _ResultPart(Decide):
-    """`get_result`: the first replica that succeeds; the others are told to cancel the goal.
-
-    Where a replica does not know the goal, it may be about to be given it, or has lost it: it is
-    asked again. It may have refused it: it is not asked again. Or it has forgotten what became
-    of it: then that is its result.
-    """
+    """`get_result`: the first replica that succeeds; the others are told to cancel the goal."""
 
     def __init__(self, action: _Action) -> None:
         super().__init__(partial(goals.is_success, Part.RESULT))

@@ -1,8 +1,5 @@
 """The client proxy: the robot's side of every proxied service.
 
-It follows the membership (one link a member), advertises each service as if it were local
-once a replica can answer it, and hands requests to that service's `Dispatcher`.
-
 Owns: the services, and which links each of them uses now.
 Not here: which links there are (`links`), files and signals (`process`), requests (`dispatcher`).
 """
@@ -128,10 +125,7 @@ class ClientProxy:
         service.adopt(self._here(service.spec), self._node)
 
     def _here(self, spec: ServiceSpec) -> ServiceSpec:
-        """Return a service's policy as it is here: a request goes to one gateway, not to all.
-
-        The gateway sends it to replicas. Another gateway is asked where the first is late.
-        """
+        """Return a service's policy as it is here: a request goes to one gateway, not to all."""
         if self._through_gateways:
             return replace(spec, hedging=HedgingMode.FAILOVER)
         return spec

@@ -1,7 +1,6 @@
 """Delivers a request's outcome to its caller: a response, the fallback's, an empty one or none.
 
-Owns: calls of the fallback service. Not here: where a caller is (the function that responds), which
-answer is returned (`dispatcher`), when the fallback is asked (`requests.fallback`).
+Owns: calls of the fallback service. Not here: when it is asked (`requests.fallback`).
 """
 
 import logging
@@ -46,10 +45,7 @@ class Delivery:
         self.adopt(ledger.spec, None)
 
     def adopt(self, spec: ServiceSpec, client: RosClient | None) -> None:
-        """Apply a spec's fallback, with its client. Under the lock.
-
-        Without a fallback nothing more is asked before the deadline.
-        """
+        """Apply a spec's fallback, with its client; without one, ask no more. Under the lock."""
         self._client, requests = client, self._ledger.requests
         if requests.fallback is None and spec.fallback is not None:
             requests.fallback = FallbackTimer(spec.fallback)

@@ -1,13 +1,9 @@
 """One proxied service on the robot: send a request to replicas, return the answer.
 
-What differs between services is put in: whom to ask (`requests.choose`), what an answer means
-(`requests.decide`), how the end reaches the caller (`delivery`).
-
 `submit` is called by the thread that takes ROS requests and never blocks. Answers come from the
 links' threads, which may not send: that is left to the next `tick`, which `wake` brings about.
 
-Owns: a request's life, and which policy a service has.
-Not here: sending (`sending`), links (`fogft.link`), ROS. Design: docs/design/dispatcher.md.
+Owns: a request's life, and which policy a service has. Design: docs/design/dispatcher.md.
 """
 
 import logging

@@ -2,9 +2,6 @@
 
 The later one counts. Where replicas are is corrected by what they say of themselves, and those that
 dial in are reached through the door.
-
-Owns: the record client and the door of a client proxy.
-Not here: links (`links`), files and signals (`process`).
 """
 
 import logging

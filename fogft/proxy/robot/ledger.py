@@ -1,7 +1,4 @@
-"""The ledger of one service on the robot: its requests and counters, and the lock over them.
-
-Not here: what happens to them (`dispatcher`).
-"""
+"""The ledger of one service on the robot: its requests and counters, and the lock over them."""
 
 import threading
 from collections import deque

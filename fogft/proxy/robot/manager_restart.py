@@ -1,7 +1,4 @@
-"""Restart the pool's manager after it was killed, or hangs.
-
-Owns: when. Not here: which manager wants it, and how it is started (its own file says so).
-"""
+"""Restart the pool's manager after it was killed, or hangs. Its own file says how it is started."""
 
 import logging
 import subprocess

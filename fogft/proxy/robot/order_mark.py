@@ -2,8 +2,6 @@
 
 Four numbers in a memory-mapped file. A write is one store into memory that belongs to the
 kernel: it survives SIGKILL, and costs less than a microsecond.
-
-Owns: the file. Not here: what the numbers mean (`fogft.ordering.sequencer`).
 """
 
 import mmap

@@ -1,9 +1,6 @@
 """Offer one service's requests to links, and cancel requests at links.
 
-This is the one place where a request leaves for a replica.
-
-Owns: which links may be asked. Not here: whom to ask, and when (`requests.choose`), links
-(`fogft.link`), answers (`dispatcher`).
+Owns: which links may be asked. This is the one place where a request leaves for a replica.
 """
 
 import threading

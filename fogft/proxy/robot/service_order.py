@@ -1,10 +1,7 @@
 """The order of one stateful service on a robot, term after term.
 
-It decides which answers count, and brings replicas to the same numbers in the same order. All
-that it decides is `ordering.sequencer`'s; here are the requests that have a number, those that
+All that it decides is `ordering.sequencer`'s; here are the requests that have a number, those that
 wait for one, and the mark that survives this process. Protocol: docs/design/state.md.
-
-Owns: terms and the mark's file. Not here: callers, deadlines and links (`dispatcher`).
 """
 
 import logging

@@ -3,8 +3,6 @@
 The standby has loaded everything and its DDS participant is known, but it offers nothing and no
 node of it is seen. It waits for the lock, which the kernel gives it when the holder ends. Behind it
 a spare waits for its place, which has no thread of ROS's or Zenoh's yet, so that it can fork.
-
-Owns: the place in line, and the order of a hand-over. Not here: a client proxy's work (`process`).
 """
 
 import contextlib

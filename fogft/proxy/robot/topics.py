@@ -1,7 +1,6 @@
 """Topics on the robot: sends its messages to every replica, publishes the replicas' here.
 
-Owns: subscriptions and publishers of the robot's side, what each replica still has to get, and
-the pulls that are out. Not here: links (`client`), which message passes (`topics.select`).
+Owns: the robot's subscriptions and publishers, what each replica still has to get, and pulls.
 """
 
 from __future__ import annotations
