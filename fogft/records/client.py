@@ -1,7 +1,6 @@
 """A process's membership records: kept on disk, exchanged with every rendezvous it can reach.
 
-It dials all endpoints and keeps on dialling; nothing waits for it. So a process goes on with what
-it knows, and knows everything again moments after one rendezvous is back.
+It dials all endpoints and keeps on dialling; nothing waits for it.
 
 Not here: what records mean (`fogft.records.roster`).
 """

@@ -1,7 +1,6 @@
 """Keep a set of records in sync with all connected peers. On one event loop.
 
-Both ends of a connection do the same: tell what they have, send what the other lacks, pass
-on at once what is new. So a rendezvous that comes back empty is filled by whoever connects.
+Both ends do the same: tell what they have, send what the other lacks, pass on at once what is new.
 
 Not here: making connections (`server`, `dialling`).
 """

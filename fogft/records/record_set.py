@@ -1,8 +1,5 @@
 """Records merged by (generation, sequence): the same set, whatever order they came in. Pure.
 
-Offering a record again, late or out of order changes nothing, so any two processes that meet can
-simply exchange what the other lacks.
-
 Not here: a record's bytes (`record`), its meaning (`roster`), how it travels (`exchange`).
 """
 
@@ -76,10 +73,11 @@ class RecordSet:
         if record.pool_uid != self.pool_uid:
             raise RecordError("pool", "a record of another pool")
         held = self._held.get(record.key)
-        if held is not None and held.signed.body == signed.body:
-            return Verdict.KNOWN
-        if held is not None and not _replaces(record, signed, held):
-            return Verdict.OLDER
+        if held is not None:
+            # Of two that a writer said under one number, all must settle on the same one.
+            new, old = (record.order, signed.body), (held.record.order, held.signed.body)
+            if new <= old:
+                return Verdict.KNOWN if new == old else Verdict.OLDER
         READERS[record.kind](record)
         if held is None and len(self._held) >= self._limit:
             raise RecordError("full", f"a record beyond the {self._limit} that are kept")
@@ -121,13 +119,6 @@ class RecordSet:
     def of(self, kind: RecordKind) -> list[Record]:
         """Return all records of a kind, by subject."""
         return [held.record for key, held in sorted(self._held.items()) if key[0] == kind.value]
-
-
-def _replaces(record: Record, signed: SignedRecord, held: Held) -> bool:
-    if record.order != held.record.order:
-        return record.order > held.record.order
-    # A writer that said two things under one number: all must settle on the same one.
-    return signed.body > held.signed.body
 
 
 def _urgency(key: Key) -> tuple[bool, bool, Key]:

@@ -1,8 +1,7 @@
 """Combine records into a membership: the replicas and their endpoints. Pure.
 
-The manager's admission says which generation of which slot is in. A replica's own record
-says where it is: it counts only while its generation is the one admitted. A content that is
-none raises `RecordError`.
+A replica's own record counts only while its generation is the one that the manager admitted. What
+is no content of its kind raises `RecordError`.
 
 Not here: who may write them (`record`) and which one stands (`record_set`).
 """

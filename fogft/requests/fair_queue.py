@@ -1,8 +1,7 @@
 """The queue at a replica: by deadline within a robot, fair between robots. Pure.
 
-Whose turn it is goes by a count of what each robot was given (start-time fair queueing): the one
-that was given least is next, and one that comes back after a pause begins where the others are. So
-it can neither save up turns nor lose them.
+The robot that was given least is next, and one that comes back after a pause begins where the
+others are (start-time fair queueing): it can neither save up turns nor lose them.
 
 Laws: what is put in comes out once, or is removed; a robot with something waiting is served
 at least every n-th time, with n robots waiting; of two requests of one robot the earlier
