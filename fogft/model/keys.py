@@ -9,7 +9,6 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field
 from enum import Enum
-from functools import cache
 from typing import Any, NamedTuple
 
 DAY_S = 86_400.0
@@ -230,8 +229,12 @@ def entries_of(cls: Any) -> list[Entry]:
     return found
 
 
-@cache
+_KNOWN: dict[type, tuple[Entry, ...]] = {}
+
+
 def keys_of(cls: type) -> tuple[Entry, ...]:
     """Return the keys of a dataclass, in order; required ones first."""
-    found = [entry for entry in entries_of(cls) if entry.key is not ORDINARY]
-    return tuple(sorted(found, key=lambda entry: not entry.required))
+    if cls not in _KNOWN:
+        found = [entry for entry in entries_of(cls) if entry.key is not ORDINARY]
+        _KNOWN[cls] = tuple(sorted(found, key=lambda entry: not entry.required))
+    return _KNOWN[cls]
