@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from statistics import median_high
 
-from fogft.counters import worth_logging
+from fogft.counters import Counters
 from fogft.link.compression import Compression
 from fogft.link.window import OpenAttempt
 
@@ -173,7 +173,7 @@ class DeadlineFilter:
         left: Callable[[float, float], float],
         packs: Callable[[str], Compression | None],
     ) -> None:
-        self.declined = 0
+        self._counters = Counters()
         self._timed = timed
         self._carries = carries
         self._left = left
@@ -195,12 +195,10 @@ class DeadlineFilter:
         )
         if size <= rate * remaining_s:
             return True
-        self.declined += 1
-        if worth_logging(self.declined):
-            log.warning(
-                "request_too_slow service=%s bytes=%d bytes_per_s=%d remaining_s=%.3f count=%d",
-                attempt.service, size, rate, remaining_s, self.declined,
-            )  # fmt: skip
+        self._counters.warn(
+            log, "declined", "request_too_slow service=%s bytes=%d bytes_per_s=%d remaining_s=%.3f",
+            attempt.service, size, rate, remaining_s,
+        )  # fmt: skip
         return False
 
     def _on_the_way(self, attempt: OpenAttempt) -> float:

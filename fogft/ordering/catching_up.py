@@ -140,7 +140,7 @@ class CatchingUp:
         log = self.log
         if self.base is None:
             return None
-        if not log.has_room(len(payload)) and not self._make_room(log, len(payload)):
+        if not log.has_room(len(payload)) and not self._make_room(len(payload)):
             return None
         index = log.append(payload)
         for replica, peer in self.peers.items():
@@ -178,15 +178,12 @@ class CatchingUp:
             peer.open.add(index)
             self._out.append(Order(replica, Op.RECALL, index))
 
-    def _make_room(self, log: OrderedLog, size: int) -> bool:
-        """No checkpoint came in time: drop what every member has applied, and no more.
-
-        Each of them alone can then go on; only if all are lost at once, the state is.
-        """
+    def _make_room(self, size: int) -> bool:
+        """No checkpoint came in time: drop what every member has applied: each can go on alone."""
         members = [peer.acked for peer in self.peers.values() if peer.member]
         if members:
-            log.drop(min(members))
-        return log.has_room(size)
+            self.log.drop(min(members))
+        return self.log.has_room(size)
 
     # -- replicas that lack some ----------------------------------------------------------
 

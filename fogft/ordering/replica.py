@@ -3,12 +3,11 @@
 What happens comes in by methods; what to do comes out as effects, in their order. The service works
 on one thing at a time, under a serial number; what ends under an older one is of no interest.
 
-Not here: calling the service and answering (`fogft.proxy.replica.ordered_responder`).
 Protocol: docs/design/state.md.
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 from fogft.model.refusal import Refusal
@@ -56,12 +55,6 @@ class _Work(Generic[T]):
     waiting: list[T]
 
 
-@dataclass
-class _Queued(Generic[T]):
-    payload: bytes
-    waiting: list[T] = field(default_factory=list)
-
-
 class OrderedReplica(Generic[T]):
     """One stateful service on one replica."""
 
@@ -77,7 +70,8 @@ class OrderedReplica(Generic[T]):
         self.applied = 0  # how many requests were applied here
         self._serial = 0
         self._work: _Work[T] | None = None
-        self._queue: OrderedDict[int, _Queued[T]] = OrderedDict()
+        # By number: the request, and whom to answer.
+        self._queue: OrderedDict[int, tuple[bytes, list[T]]] = OrderedDict()
         self._queued_bytes = 0
         self._claims: list[T] = []
         self._snapshots: list[T] = []
@@ -193,7 +187,7 @@ class OrderedReplica(Generic[T]):
             work.waiting.append(to)
             return []
         if index in self._queue:
-            self._queue[index].waiting.append(to)
+            self._queue[index][1].append(to)
             return []
         return None
 
@@ -210,7 +204,7 @@ class OrderedReplica(Generic[T]):
         full = len(self._queue) >= self.queue_limit or held_bytes > self.queue_bytes
         if full and self._queue:
             return [Refuse(to, Refusal.GAP, str(index))]  # send it again, a little later
-        self._queue[index] = _Queued(payload, [to])
+        self._queue[index] = payload, [to]
         self._queued_bytes += len(payload)
         return self._go_on()
 
@@ -237,9 +231,9 @@ class OrderedReplica(Generic[T]):
         out += [Refuse(to, Refusal.NOT_JOINED) for to in self._snapshots]
         self._snapshots = []
         while self._queue and self._work is None:
-            index, queued = self._queue.popitem(last=False)
-            self._queued_bytes -= len(queued.payload)
-            out.append(self._begin(Op.APPLY, index, queued.waiting, queued.payload))
+            index, (payload, waiting) = self._queue.popitem(last=False)
+            self._queued_bytes -= len(payload)
+            out.append(self._begin(Op.APPLY, index, waiting, payload))
         return out
 
     def _tell(self) -> list[Effect[T]]:
@@ -316,7 +310,7 @@ class OrderedReplica(Generic[T]):
 
     def _give_up(self, reason: Refusal, detail: str = "") -> list[Effect[T]]:
         out: list[Effect[T]] = [
-            Refuse(to, reason, detail) for queued in self._queue.values() for to in queued.waiting
+            Refuse(to, reason, detail) for _, waiting in self._queue.values() for to in waiting
         ]
         out += [Refuse(to, reason, detail) for to in self._snapshots]
         if self._restore is not None:

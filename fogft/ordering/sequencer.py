@@ -3,10 +3,7 @@
 A term begins from the state of one replica, never from one before the mark. From then on it numbers
 requests, and the first answer counts. When most of the replicas that stay run another version, that
 takes over at one point of the order. The owner sends what `take` returns, and reports each order's
-end, once, by `replied`, `refused` or `declined`.
-
-Not here: what each replica is to be sent (`catching_up`), callers and deadlines
-(`fogft.proxy.robot.service_order`). Protocol and its argument: docs/design/state.md.
+end, once, by `replied`, `refused` or `declined`. Protocol and its argument: docs/design/state.md.
 """
 
 from collections.abc import Iterable, Mapping
@@ -32,13 +29,10 @@ class Handover:
 
 
 class Sequencer:
-    """One term of a sequencer.
+    """One term of a sequencer: `epoch`, above every earlier one.
 
-    Args:
-        epoch: This term, above every earlier one.
-        mark: The position of the last answer that was returned, in whatever term.
-        holder: The version that returned it; None where nobody knows.
-        begin: What the term begins from, where a version takes over from another.
+    `mark` is the position of the last answer that was returned, in whatever term, and `holder` the
+    version that returned it, None where nobody knows. With `begin`, another version takes over.
     """
 
     def __init__(
@@ -287,10 +281,7 @@ class Sequencer:
         self._look_whom_most_obey()
 
     def _look_whom_most_obey(self) -> None:
-        """End the term where more replicas obey a later one; one alone may lie.
-
-        Before the first number nothing is lost by it: as many are enough then.
-        """
+        """End the term where more replicas obey a later one, or as many before the first number."""
         others = [peer for replica, peer in self._peers.items() if replica not in self._fenced]
         silent = any(one.phase is Phase.ASKED and one.promise is None for one in others)
         if not self._fenced or silent:

@@ -6,8 +6,6 @@ for all but nodes ``/name/type/hash/QoS``, with ``%`` for each slash within a pa
 request and its response go the client's sequence number, the time of sending and the client's
 identifier (GID), by which the client knows its own response.
 
-Owns: keys, tokens, attachments, who is there. Not here: sessions (`fogft.rmw_zenoh.node`).
-
 Source: the design document and `attachment_helpers.cpp` of ros2/rmw_zenoh.
 """
 

@@ -3,9 +3,6 @@
 Its session is configured as theirs are: a peer that finds the others by the router of its machine.
 ``ZENOH_SESSION_CONFIG_URI`` (a file) takes the place of all settings, ``ZENOH_CONFIG_OVERRIDE``
 (``key=value;key=value``) of some. Design: docs/design/serialised-services.md.
-
-Owns: the session and its settings, the graph, what is offered and called. Not here: requests
-(`entities`), names (`rmw_zenoh.naming`), settings of links (`fogft.link.zenoh.settings`).
 """
 
 import functools
@@ -41,16 +38,11 @@ FaultOf = Callable[[str, str], Callable[[bytes], str]]
 class RmwZenohNode:
     """Serialised services and clients among the `rmw_zenoh` nodes of one ROS domain.
 
-    Args:
-        domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
-        hashes_of: Returns the hashes of a service type that are told elsewhere, each as often as
-            somebody tells it. The one told most counts, of equal ones that which a client has.
-        fault_of: Returns what says why bytes are no request, or response, of a service type; no
-            others are passed on.
-        noticed: Called, from Zenoh's thread, when a client has come. Must not block.
-
-    Raises:
-        RosError: Zenoh cannot be configured or opened as the variables say.
+    Without a `domain_id` it is ``ROS_DOMAIN_ID``, else 0. `hashes_of` returns the hashes of a
+    service type that are told elsewhere, each as often as somebody tells it: the one told most
+    counts, of equal ones that which a client has. `fault_of` returns what says why bytes are no
+    request, or response, of a type; no others are passed on. Zenoh's thread calls `noticed`, which
+    must not block, when a client has come. Raises RosError: the variables cannot be followed.
     """
 
     def __init__(

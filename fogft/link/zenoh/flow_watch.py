@@ -71,15 +71,12 @@ class FlowWatch:
                 elif time.monotonic() - quiet_since > _QUIET_S:
                     break
             time.sleep(_LOOK_AGAIN_S)
-        self._end(sending=sending(), asked=asked())
-
-    def _end(self, *, sending: bool, asked: bool) -> None:
         connection = self._socket.borrow()
         if connection is None:
             return
         with connection:
             flow = sockets.flow(connection)
-            if sending or (flow is not None and flow.outstanding >= BULK_BYTES):
+            if sending() or (flow is not None and flow.outstanding >= BULK_BYTES):
                 sockets.end_sending(connection)
-            elif asked:
+            elif asked():
                 sockets.abort(connection)

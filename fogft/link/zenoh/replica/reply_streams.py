@@ -131,12 +131,9 @@ OF_ONE_LIMIT = 32  # of one holder: nobody's connections push out another's
 class Stream:
     """One connection's open query, with `ReplyCredit`'s methods for that connection. Any thread."""
 
-    def __init__(
-        self, query: zenoh.Query, credit: ReplyCredit | None = None, holder: str = ""
-    ) -> None:
+    def __init__(self, query: zenoh.Query, credit: ReplyCredit, holder: str) -> None:
         self.query = query
         self.holder = holder
-        credit = credit or ReplyCredit()
         self.slow = credit.slow
         name = object()  # of this connection: it must not keep the query, which ends with us
         self.seen = partial(credit.seen, name)

@@ -75,8 +75,8 @@ class Callbacks:
 class Attempts:
     """The attempts of one connection.
 
-    `origin` is what the headers of all its requests say. The replica is told of `cancellations`;
-    None to tell of nobody.
+    `origin` is what the headers of all its requests say. With `tell_losers`, the replica is told
+    which are no longer wanted.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Attempts:
         *,
         options: SendOptions,
         gate: LargeSendGate,
-        cancellations: Cancellations | None,
+        tell_losers: bool,
         tell: Callbacks,
         ended: Callable[[], None],
         name: str,
@@ -96,7 +96,8 @@ class Attempts:
         self._services = frozenset(services)
         self._origin = origin
         self._gate = gate
-        self._cancellations = cancellations
+        self._tell_losers = tell_losers
+        self._cancellations = Cancellations()
         self._answered = tell.answered
         self._late = tell.late
         self._room = tell.room
@@ -160,18 +161,14 @@ class Attempts:
         if together and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
             self._send_together(self._batch.add(attempt))
         else:
-            self._send_at_once(attempt, payload, remaining_s)
+            attempt.payload = None
+            try:
+                self._publish(attempt, payload, max(remaining_s, 0.0))
+            except Exception as error:  # whatever it is, the attempt must end
+                self._lose(error, attempt)
         if together and not more:
             self.send()
         return True
-
-    def _send_at_once(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
-        """Send something small that was just offered, and cannot block."""
-        attempt.payload = None
-        try:
-            self._publish(attempt, payload, max(remaining_s, 0.0))
-        except Exception as error:  # whatever it is, the attempt must end
-            self._lose(error, attempt)
 
     def send(self) -> None:
         """Send attempts offered with `more`. Never blocks: they are small and have credit."""
@@ -226,12 +223,9 @@ class Attempts:
         attempt = self.window.forget(request_id)
         if attempt is None:
             return
-        sent, cancellations, now = attempt.payload is None, self._cancellations, time.monotonic()
-        if (
-            sent
-            and cancellations is not None
-            and cancellations.add(request_id, attempt.offered, now)
-        ):
+        sent, now = attempt.payload is None, time.monotonic()
+        tell = sent and self._tell_losers
+        if tell and self._cancellations.add(request_id, attempt.offered, now):
             self.flush()
         attempt.payload = None
         attempt.elsewhere = sent and now < attempt.deadline
@@ -275,7 +269,7 @@ class Attempts:
     def _tell(self) -> None:
         self._telling = False
         try:
-            if self._cancellations is not None and (ids := self._cancellations.take()):
+            if ids := self._cancellations.take():
                 self._outlet.cancel(ids)
         except Exception as error:
             self._lose(error)
@@ -387,8 +381,7 @@ class Attempts:
     def _take_plain(self, attempt: OpenAttempt, answer: Answer) -> None:
         if self._close(attempt, answer):
             return
-        if self._cancellations is not None:  # it was forgotten, or has ended
-            self._cancellations.answered(answer.request_id)
+        self._cancellations.answered(answer.request_id)  # it was forgotten, or has ended
         self._late(answer._replace(service=attempt.service))
 
     # -- the link's thread ----------------------------------------------------------------

@@ -22,7 +22,6 @@ from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
 from fogft.link.credit import LargeSendGate
 from fogft.link.port import DEFAULT_OPTIONS, Answer, Peer, SendOptions
-from fogft.link.window import Cancellations
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.flow_watch import FlowWatch
@@ -126,7 +125,7 @@ class Connection:
             frame.origin(shared.robot, self._token),
             options=shared.options,
             gate=shared.gate,
-            cancellations=Cancellations() if shared.tell_losers else None,
+            tell_losers=shared.tell_losers,
             tell=tell,
             ended=partial(threads.close_session, self._session),
             name=f"fogft-send-{peer.id.short}",

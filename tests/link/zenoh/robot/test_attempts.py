@@ -16,7 +16,6 @@ from fogft.link import batch_frames, compression, frame
 from fogft.link.credit import LARGE_BYTES, LargeSendGate
 from fogft.link.port import DEFAULT_OPTIONS, Answer, SendOptions
 from fogft.link.socket_progress import SocketProgress
-from fogft.link.window import Cancellations
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.model.refusal import Refusal
 from tests.link.wire_pool import request_id, wait_for
@@ -73,7 +72,7 @@ class Scene:
             frame.origin("ada", bytes(frame.TOKEN_BYTES)),
             options=options,
             gate=self.gate,
-            cancellations=Cancellations(),
+            tell_losers=True,
             tell=Callbacks(
                 answered=self.answers.append,
                 late=lambda answer: self.late.append(answer.request_id),
