@@ -225,22 +225,17 @@ def _slug(name: str) -> str:
 
 def action_services(action: ActionSpec) -> tuple[ServiceSpec, ...]:
     """Return the three services of an action."""
-
-    def one(end: str, type: str, part: Part, seconds: float, concurrency: int) -> ServiceSpec:
-        name = f"{action.name}/_action/{end}"
-        return ServiceSpec(name, type, seconds, concurrency=concurrency, part=part)
-
-    accepted_s, type = action.timeout_s, action.type
+    name, type, soon_s = f"{action.name}/_action", action.type, action.timeout_s
     return (
-        one("send_goal", f"{type}_SendGoal", Part.GOAL, accepted_s, 0),
-        one("cancel_goal", "action_msgs/srv/CancelGoal", Part.CANCEL, accepted_s, 0),
-        # It is answered when its goal ends: many wait there without being at work.
-        one(
-            "get_result",
+        ServiceSpec(f"{name}/send_goal", f"{type}_SendGoal", soon_s, part=Part.GOAL),
+        ServiceSpec(f"{name}/cancel_goal", "action_msgs/srv/CancelGoal", soon_s, part=Part.CANCEL),
+        ServiceSpec(
+            f"{name}/get_result",
             f"{type}_GetResult",
-            Part.RESULT,
             action.result_timeout_s,
-            CONCURRENCY_LIMIT,
+            # It is answered when its goal ends: many wait there without being at work.
+            concurrency=CONCURRENCY_LIMIT,
+            part=Part.RESULT,
         ),
     )
 

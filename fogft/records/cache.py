@@ -1,8 +1,4 @@
-"""A cache of records on disk, so that a process can start while no peer can be reached.
-
-The file has a version and a checksum, and each record in it keeps its signature, which is checked
-again. A damaged file is told and costs only itself.
-"""
+"""A cache of records on disk, so that a process can start while no peer can be reached."""
 
 import logging
 from collections.abc import Sequence

@@ -1,7 +1,6 @@
 """The rendezvous server, which stores and passes on a pool's records.
 
-TLS proves the rendezvous to its callers; a caller proves itself by signing a challenge. What
-comes from anybody else, or is no message, ends that connection and is counted by reason.
+What comes from nobody of the pool, or is no message, ends that connection and is counted by reason.
 
 Not here: records (`exchange`), the process (`fogft.pool.commands.rendezvous`).
 """

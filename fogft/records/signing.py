@@ -75,10 +75,9 @@ class Signer:
                 f"`{self._certificate_path}` or its key cannot be used",
                 "`fogft up` writes the pool's certificates",
             ) from None  # the cause could quote the key
-        same = isinstance(key, ec.EllipticCurvePrivateKey) and (
-            key.public_key() == certificate.public_key()
-        )
-        if not same or not isinstance(key, ec.EllipticCurvePrivateKey):
+        if not isinstance(key, ec.EllipticCurvePrivateKey) or (
+            key.public_key() != certificate.public_key()
+        ):
             if self._key is not None:
                 return
             raise CredentialError(f"`{self._key_path}` does not belong to its certificate")

@@ -1,9 +1,6 @@
 """When the fallback service is called, and how long its answer is awaited. Pure.
 
-A fallback is a service on the robot itself. It is asked for a request once: at the deadline, or
-after a delay, or at once while no replica is ready. After the deadline only its answer counts.
-
-Law: a request is handed to the fallback at most once, and ends exactly once.
+Law: a request is handed to the fallback, a service on the robot, at most once, and ends once.
 """
 
 from fogft.model.choices import FallbackSpec

@@ -1,8 +1,5 @@
 """Quorum: the answer that k replicas agree on, and replicas that keep disagreeing. Pure.
 
-Once k ballots agree, every ballot is judged by that answer, also those that come later. Without
-agreement nobody is blamed: two that differ do not tell who is wrong.
-
 Not here: what agreeing means (`fogft.ros.messages`), requests and deadlines (`pending`).
 """
 
@@ -51,32 +48,28 @@ class Quorum(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
-        """Take a vote; it is a success if it completes a quorum."""
-        if pending is None and id not in self._final:
+        """Take a vote; it is a success if it completes a quorum. Flagged replicas do not count."""
+        if id in self._final:
+            self._judge(replica, reading, self._final[id])
+            return Means.UNDECIDED
+        if pending is None:
             return Means.UNDECIDED  # it has expired
-        return Means.SUCCESS if self.vote(id, replica, reading) else Means.UNDECIDED
-
-    def vote(self, request: bytes, replica: int, answer: Any) -> bool:
-        """Take an answer; return whether it decides. Answers of flagged replicas do not count."""
-        if request in self._final:
-            self._judge(replica, answer, self._final[request])
-            return False
-        ballots = self._open.setdefault(request, {})
+        ballots = self._open.setdefault(id, {})
         if replica in ballots:
-            return False  # a copy: one replica has one vote
-        ballots[replica] = answer
+            return Means.UNDECIDED  # a copy: one replica has one vote
+        ballots[replica] = reading
         if replica in self.flagged:
-            return False
+            return Means.UNDECIDED
         counted = [other for voter, other in ballots.items() if voter not in self.flagged]
-        if sum(self._agree(other, answer) for other in counted) < self._quorum:
-            return False
-        del self._open[request]
-        self._final[request] = answer
+        if sum(self._agree(other, reading) for other in counted) < self._quorum:
+            return Means.UNDECIDED
+        del self._open[id]
+        self._final[id] = reading
         if len(self._final) > self.kept:
             self._final.popitem(last=False)
         for voter, other in ballots.items():
-            self._judge(voter, other, answer)
-        return True
+            self._judge(voter, other, reading)
+        return Means.SUCCESS
 
     def _judge(self, replica: int, answer: Any, final: Any) -> None:
         agrees = self._agree(answer, final)
