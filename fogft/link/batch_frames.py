@@ -36,10 +36,7 @@ def is_batch(header: bytes) -> bool:
 def encode_requests(
     requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
 ) -> tuple[bytes, bytes]:
-    """Return header and payload for at most `LIMIT` requests.
-
-    `seen` is the stamp of the last answer that the connection has seen.
-    """
+    """Return header and payload for at most `LIMIT` requests; `seen` is the last answer's stamp."""
     parts = []
     for id, remaining_s, handling, payload in requests:
         parts.append(_REQUEST.pack(id, remaining_s, handling, len(payload)))

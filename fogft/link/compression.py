@@ -58,9 +58,7 @@ class Compression:
                 return None
         packed = self._compress(payload)
         self._pause = _FIRST_PAUSE
-        if len(packed) >= len(payload) * _GAIN:
-            return None
-        return packed
+        return packed if len(packed) < len(payload) * _GAIN else None
 
     def _compress(self, payload: bytes) -> bytes:
         began = self._clock()

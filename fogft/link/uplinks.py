@@ -207,13 +207,9 @@ class UplinksLink:
         """End every uplink's link. Attempts still open end with `Refusal.LOST`."""
         with self._lock:
             self._closed = True
-            waiting, self._again = self._again, []
         for link in self._links:
             link.close()
-        for request_id in waiting:
-            attempt = self._attempts.get(request_id)
-            if attempt is not None:
-                self._end(request_id, Answer(request_id, None, Refusal.LOST, attempt.service))
+        self.flush()  # what is on no uplink finds none
 
     # -- events of the uplinks' links (their threads) -------------------------------------
 

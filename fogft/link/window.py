@@ -44,10 +44,7 @@ class OpenAttempt:
 
 
 class LinkWindow:
-    """The attempts open on one connection.
-
-    `standing` more have room: pulls of topics, which are open all the time.
-    """
+    """The attempts open on one connection; `standing` more have room, for pulls of topics."""
 
     def __init__(self, standing: int = 0) -> None:
         self.limit = ATTEMPTS_LIMIT + standing

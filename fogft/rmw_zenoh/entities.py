@@ -154,10 +154,7 @@ class _Waiting(NamedTuple):
 
 
 class Client:
-    """A client of a service (`fogft.ros.port.RosClient`).
-
-    `servers` returns the type hash of each server that is there now.
-    """
+    """A client (`fogft.ros.port.RosClient`); `servers` returns the type hash of each server now."""
 
     def __init__(
         self, session: Any, token: Callable[[str], naming.Token],

@@ -112,10 +112,7 @@ def response_attachment(of_request: bytes, sent_ns: int) -> bytes:
 
 
 def sent_by(of_request: bytes) -> tuple[bytes, int]:
-    """Return the client's GID, and when it sent a request, in nanoseconds since 1970.
-
-    Of an attachment of no known form, nothing and 0.
-    """
+    """Return who sent a request (GID) and when (ns since 1970); nothing and 0 if not known."""
     if len(of_request) not in _ATTACHMENT_BYTES:
         return b"", 0
     return of_request[-_GID_BYTES:], struct.unpack("<q", of_request[_STAMP])[0]

@@ -219,10 +219,7 @@ SETTINGS: dict[str, Any] = {
 
 
 def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
-    """Return the Zenoh configuration of an environment.
-
-    Raises RosError: A variable names no configuration, or is none.
-    """
+    """Return an environment's Zenoh configuration. Raises RosError: a variable gives none."""
     path = environ.get(FILE)
     try:
         made = zenoh.Config.from_file(path) if path else settings.to_zenoh(SETTINGS)

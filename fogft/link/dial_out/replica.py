@@ -27,10 +27,7 @@ _CONNECT_TIMEOUT_S = 1.5
 
 
 class DialOut:
-    """Keeps connections open to the dial-in ports of robots, for them to use.
-
-    `local` is the ``host:port`` of this replica's own listener.
-    """
+    """Keeps connections from robots' dial-in ports to our listener, `local`: ``host:port``."""
 
     def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:
         host, port = host_and_port(local)

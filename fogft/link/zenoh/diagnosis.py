@@ -20,6 +20,7 @@ from fogft.model.names import host_and_port
 
 # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
 _OUT_OF_TIME = (9, 10)
+_TIMEOUT_S = 0.5  # of each step
 _ALERTS = {
     "unknown ca": "our certificate is from a different CA than the replica's",
     "decrypt error": "our certificate is from a different CA than the replica's",
@@ -31,18 +32,18 @@ _ALERTS = {
 }
 
 
-def explain(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> str:
-    """Return in words why `peer` cannot be reached; each step takes `timeout_s` at most."""
+def explain(peer: Peer, credentials: CredentialPaths) -> str:
+    """Return in words why `peer` cannot be reached."""
     try:
         context = _context(credentials)
     except CredentialError as error:
         return error.message
     try:
-        with socket.create_connection(host_and_port(peer.endpoint), timeout_s) as raw:
+        with socket.create_connection(host_and_port(peer.endpoint), _TIMEOUT_S) as raw:
             with context.wrap_socket(raw) as link:
                 return _after_handshake(link, peer)
     except ssl.SSLError as error:
-        return _clock_words(error, peer, credentials, timeout_s) or _tls_words(error)
+        return _clock_words(error, peer, credentials) or _tls_words(error)
     except TimeoutError:
         return f"`{peer.endpoint}` does not answer"
     except (OSError, ValueError) as error:
@@ -73,7 +74,7 @@ def _after_handshake(link: ssl.SSLSocket, peer: Peer) -> str:
         return wrong_name(found, peer)
     # In TLS 1.3 our own certificate is judged after our side of the handshake: the verdict
     # comes with the first read. No verdict in time means that it was accepted.
-    link.settimeout(min(0.3, link.gettimeout() or 0.3))
+    link.settimeout(0.3)
     with contextlib.suppress(TimeoutError):
         link.recv(1)
     return f"`{peer.endpoint}` accepts TLS but no Zenoh session"
@@ -84,15 +85,13 @@ def wrong_name(found: str | None, peer: Peer) -> str:
     return f"`{peer.endpoint}` has the certificate of `{found}`, not of `{peer.certificate_name}`"
 
 
-def _clock_words(
-    error: ssl.SSLError, peer: Peer, credentials: CredentialPaths, timeout_s: float
-) -> str:
+def _clock_words(error: ssl.SSLError, peer: Peer, credentials: CredentialPaths) -> str:
     """Return whose clock is wrong where a certificate was refused for its time, else nothing."""
     now = datetime.datetime.now(datetime.timezone.utc)
     if isinstance(error, ssl.SSLCertVerificationError):
         if error.verify_code not in _OUT_OF_TIME:
             return ""
-        validity = validity_of(_certificate_of(peer, credentials, timeout_s))
+        validity = validity_of(_certificate_of(peer, credentials))
         why = judged_here(validity, now) if validity is not None else ""
         return f"the replica's certificate is refused: {why}" if why else ""
     if "certificate expired" not in str(error).lower():
@@ -104,12 +103,12 @@ def _clock_words(
     return ""
 
 
-def _certificate_of(peer: Peer, credentials: CredentialPaths, timeout_s: float) -> bytes:
+def _certificate_of(peer: Peer, credentials: CredentialPaths) -> bytes:
     """Return the certificate (DER) that stands at an endpoint, whoever's it is; to look at only."""
     context = _context(credentials)
     context.verify_mode = ssl.CERT_NONE
     with contextlib.suppress(OSError, ValueError):
-        with socket.create_connection(host_and_port(peer.endpoint), timeout_s) as raw:
+        with socket.create_connection(host_and_port(peer.endpoint), _TIMEOUT_S) as raw:
             with context.wrap_socket(raw) as link:
                 return link.getpeercert(binary_form=True) or b""
     return b""
@@ -180,7 +179,6 @@ def _utc(time: datetime.datetime) -> str:
 
 
 _EXPLAIN_EVERY_S = 5.0
-_EXPLAIN_TIMEOUT_S = 0.5
 _NEARLY = 0.9  # of a time-out, as it is measured
 
 
@@ -218,4 +216,4 @@ class Opening:
         if now - self._explained_at < _EXPLAIN_EVERY_S:
             return ""
         self._explained_at = now
-        return explain(self._peer, credentials, _EXPLAIN_TIMEOUT_S)
+        return explain(self._peer, credentials)

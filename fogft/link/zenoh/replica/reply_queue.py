@@ -92,10 +92,7 @@ class ReplyQueue:
         self._taken: list[Reply | QueryEnd | None] = []  # it did not fit to what was taken before
 
     def next(self, timeout_s: float) -> list[Reply] | QueryEnd:
-        """Wait for the next replies to send together, or query to end; nothing once closed.
-
-        Raises queue.Empty: nothing came.
-        """
+        """Wait for replies to send together, or a query to end; none once closed. Raises Empty."""
         first = self._taken.pop() if self._taken else self.replies.get(timeout=timeout_s)
         if first is None:
             return []

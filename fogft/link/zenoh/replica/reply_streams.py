@@ -142,10 +142,7 @@ class Stream:
 
 
 class Streams:
-    """The open queries for answers, by the token of their connection.
-
-    `slow` tells whether the holder of a certificate is known to read slowly.
-    """
+    """The open queries for answers, by token. Known to read slowly is a holder who is `slow`."""
 
     limit = 1024  # a replica has 128 sessions; the others are those of connections that are gone
 

@@ -255,15 +255,12 @@ class Attempts:
     # -- the sender thread ----------------------------------------------------------------
 
     def _run(self) -> None:
-        while True:
-            attempt = self._queue.get()
-            if attempt is None:
-                break
+        while (attempt := self._queue.get()) is not None:
             if attempt is _TELL:
                 self._tell()
-                continue
-            self._send_or_lose(attempt)
-            self._credit.dequeued()
+            else:
+                self._send_or_lose(attempt)
+                self._credit.dequeued()
         self._ended()
 
     def _tell(self) -> None:
@@ -352,20 +349,17 @@ class Attempts:
         """Take answers and their stamp; `packed`: one answer, with a compressed payload."""
         self._seen = stamp
         for answer in answers:
-            self._take_answer(answer, packed=packed)
-
-    def _take_answer(self, answer: Answer, *, packed: bool) -> None:
-        attempt = self._unanswered.answered(answer.request_id)
-        if attempt is None:  # it was answered before
-            if self._unanswered.owed < 0:
-                self._outlet.lose("it sends more answers than it received requests")
-            return
-        if answer.payload is not None:
-            self._credit.heard(attempt.mark)  # requests of one connection arrive in order
-        if packed and self.window.holds(attempt):
-            self._unpack(attempt, answer)
-        else:
-            self._take_plain(attempt, answer)
+            attempt = self._unanswered.answered(answer.request_id)
+            if attempt is None:  # it was answered before
+                if self._unanswered.owed < 0:
+                    self._outlet.lose("it sends more answers than it received requests")
+                continue
+            if answer.payload is not None:
+                self._credit.heard(attempt.mark)  # requests of one connection arrive in order
+            if packed and self.window.holds(attempt):
+                self._unpack(attempt, answer)
+            else:
+                self._take_plain(attempt, answer)
 
     def _unpack(self, attempt: OpenAttempt, answer: Answer) -> None:
         """Decompress an answer that is still wanted, and was asked to be packed."""

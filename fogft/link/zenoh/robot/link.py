@@ -196,10 +196,7 @@ class ZenohLink:
         return was_up
 
     def _succeed(self, old: Connection) -> Connection:
-        """Open a connection beside one that is up, and return it once it is up too.
-
-        Whatever goes wrong with the new one, the old one stays, and it is tried again.
-        """
+        """Open a connection beside one that is up; return it once it is up too, else the old."""
         self._renew_at = NEVER
         new = self._open()
         if new is not None and self._attend(new, until_up=True) and new is self._live:
@@ -243,10 +240,7 @@ class ZenohLink:
         return connection
 
     def _attend(self, connection: Connection, *, until_up: bool = False) -> bool:
-        """Probe a connection until it is lost, suspect or not wanted; return whether it was up.
-
-        Also ends where another connection shall succeed it, and with `until_up` once it is up.
-        """
+        """Probe a connection until it has to go, or is up (`until_up`); return whether it was."""
         up = False
         self._woke_at = next_probe = time.monotonic()
         self._probing.another_connection()
