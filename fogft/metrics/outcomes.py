@@ -6,10 +6,8 @@ All methods are called under the dispatcher's lock, but `late`, which has its ow
 import bisect
 import threading
 from collections import defaultdict, deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from types import MappingProxyType
 from typing import Any
 
 from fogft.model.refusal import Effect, Refusal
@@ -59,7 +57,6 @@ class Outcomes:
         self._late_lock = threading.Lock()
         # When services last died over a request that was then given up; wall clock.
         self.poisoned_at: float | None = None
-        self.trace: deque[dict[str, Any]] | None = None  # until taken; None where not wanted
 
     def received(self, size_bytes: int) -> None:
         """Count a received request."""
@@ -76,31 +73,6 @@ class Outcomes:
         self._latencies.append(took_s)
         self._buckets[bisect.bisect_left(BUCKETS_S, took_s)] += 1
         self._took_s += took_s
-
-    def note(
-        self,
-        request: bytes,
-        outcome: Outcome,
-        *,
-        took_s: float,
-        at: float,
-        asked: Mapping[int, float] = MappingProxyType({}),
-        refused: Mapping[int, Refusal] = MappingProxyType({}),
-        replica: str = "",
-    ) -> None:
-        """Trace how and when a request ended (on the tracer's clock)."""
-        if self.trace is not None:
-            self.trace.append(
-                {
-                    "at": at,
-                    "request": request.hex(),
-                    "outcome": outcome.value,
-                    "replica": replica,
-                    "took_s": round(took_s, 6),
-                    "asked": {short(key): round(after_s, 6) for key, after_s in asked.items()},
-                    "refused": {short(key): reason.value for key, reason in refused.items()},
-                }
-            )
 
     def refusal(self, reason: Refusal, replica: int | None = None) -> None:
         """Count a refusal, also against the replica if it refused a request."""

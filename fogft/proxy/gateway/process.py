@@ -20,7 +20,7 @@ from fogft.link.port import Probe, ProbeAnswer
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
 from fogft.model import names
-from fogft.model.credentials import Holder, Role, holder_of
+from fogft.model.credentials import Holder, Role
 from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
@@ -33,7 +33,6 @@ from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.process import make_dialer, try_step
-from fogft.records.signing import Signer
 
 if TYPE_CHECKING:
     from fogft.link.zenoh.replica.listener import ZenohListener
@@ -72,7 +71,6 @@ class _Gateway:
         self._config = config
         self._status = disk.Report(config.status)
         self._incarnation = secrets.token_hex(8)
-        self._draining = False
         self._forwarder = Forwarder()
         dialer = make_dialer(config)
         self._proxy = ClientProxy(config.pool_uid, None, dialer, self._make_dispatcher)
@@ -91,8 +89,7 @@ class _Gateway:
         self._scrape = Scrape(lambda: proxies.of_gateway(self._told()), {"pool": config.pool})
 
     def _own_holder(self) -> Holder:
-        ours = self._config.credentials
-        holder = holder_of(Signer(ours.certificate, ours.key).common_name)
+        holder = self._following.holder()
         if holder.role is not Role.GATEWAY:
             raise CredentialError(
                 f"`{holder.common_name}` is not a gateway's certificate",
@@ -138,7 +135,6 @@ class _Gateway:
             generation=self._holder.generation,
             incarnation=self._incarnation,
             ready=ready,
-            draining=self._draining,
             in_flight=self._forwarder.in_flight,
             work=self._forwarder.work(),
             detail="" if ready else "no replica behind it answers",

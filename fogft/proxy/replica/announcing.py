@@ -41,17 +41,8 @@ class Presence:
         """Publish changes, dial new dial-in ports; return the known records."""
         if self._client is None:
             return Known()
-        self._announce(self._client, ready, draining=draining)
-        known = self._client.known
-        if known is not self._seen:
-            self._seen = known
-            if self._dial_out is not None:
-                self._dial_out.follow((*self._config.dial_out, *doors(known)))
-        return known
-
-    def _announce(self, client: RendezvousClient, ready: frozenset[str], *, draining: bool) -> None:
-        seen, id = client.known.seen_host, self._config.id
-        host = f"[{seen}]" if ":" in seen else seen
+        known, id = self._client.known, self._config.id
+        host = f"[{known.seen_host}]" if ":" in known.seen_host else known.seen_host
         state = SlotState(
             endpoint=self._config.advertise,
             observed_endpoint=f"{host}:{self._port}" if host else "",
@@ -61,7 +52,12 @@ class Presence:
         )
         if state != self._said:
             self._said = state
-            client.publish(RecordKind.SLOT, str(id.slot), id.generation, to_plain(state))
+            self._client.publish(RecordKind.SLOT, str(id.slot), id.generation, to_plain(state))
+        if known is not self._seen:
+            self._seen = known
+            if self._dial_out is not None:
+                self._dial_out.follow((*self._config.dial_out, *doors(known)))
+        return known
 
     def close(self) -> None:
         """Disconnect."""

@@ -9,7 +9,7 @@ Owns: a request's life, and which policy a service has. Design: docs/design/disp
 import logging
 import os
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection
 from typing import Any
 
@@ -26,7 +26,7 @@ from fogft.proxy.robot.ledger import Ledger
 from fogft.proxy.robot.sending import Sender, key_of
 from fogft.requests.auto import Auto
 from fogft.requests.choose import All, Choose, Failover
-from fogft.requests.decide import Accepts, Decide, Means, Trace
+from fogft.requests.decide import Accepts, Decide, Means, Pending, Trace
 from fogft.requests.load import NEVER
 from fogft.requests.pending import PendingRequests, Verdict
 from fogft.ros.port import RosClient
@@ -142,7 +142,7 @@ class Dispatcher:
             chosen = requests.begin(
                 request, payload, able, deadline=deadline, now=now, handle=handle
             )
-            if outcomes.trace is not None and (pending := requests.get(request)) is not None:
+            if self._ledger.traced is not None and (pending := requests.get(request)) is not None:
                 pending.trace = Trace(dict.fromkeys(chosen, now), {})
             soon = min(requests.choose.look_at, deadline)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
@@ -159,9 +159,9 @@ class Dispatcher:
 
     def _turn_away(self, request: bytes, size: int) -> None:
         """Count a request that is not taken. Under the lock."""
-        count = self.outcomes.count
+        now, count = self._clock(), self.outcomes.count
         count["turned_away"] += 1
-        self.outcomes.note(request, Outcome.TURNED_AWAY, took_s=0.0, at=self._clock())
+        self._ledger.trace(request, Pending(now, b"", None, now), Outcome.TURNED_AWAY, now)
         if worth_logging(count["turned_away"]):
             held = f"{size} B, beside {self._requests.held_bytes} B of {len(self._requests)}"
             limit = f"at most {self.max_pending_bytes} B and {self.max_pending} requests may wait"
@@ -224,8 +224,8 @@ class Dispatcher:
                 self._wake(now + _TICK_S)
             with self._lock:
                 outcomes.won(replica, now - pending.arrived, len(payload))
-                if outcomes.trace is not None:
-                    self._ledger.trace(request, pending, Outcome.ANSWERED, now, replica=id.short)
+                if self._ledger.traced is not None:
+                    self._ledger.trace(request, pending, Outcome.ANSWERED, now, id.short)
         elif means is Means.SUCCESS or means is Means.LATE:
             with self._lock:
                 outcomes.of[replica].well += 1
@@ -392,10 +392,9 @@ class Dispatcher:
     def trace(self) -> list[dict[str, Any]]:
         """Return the outcomes since the last call, if traced."""
         with self._lock:
-            trace = self.outcomes.trace
-            found = list(trace or ())
-            if trace:
-                trace.clear()
+            traced = self._ledger.traced or deque()
+            found = list(traced)
+            traced.clear()
             return found
 
     def report(self) -> dict[str, Any]:

@@ -92,7 +92,7 @@ class Following:
         self._changed.set()
 
     def _announce(self, client: RendezvousClient) -> None:
-        holder = self._holder()
+        holder = self.holder()
         kind = RecordKind.GATEWAY if holder.role is Role.GATEWAY else RecordKind.ROBOT
         content = {"dial_in": self._config.dial_in}
         client.publish(kind, holder.name, holder.generation, content)
@@ -126,11 +126,12 @@ class Following:
             return None
         slots = known.of(RecordKind.SLOT)
         located = roster.located(latest, slots) if slots else latest
-        gateways = roster.gateways_of(latest, self._holder())
+        gateways = roster.gateways_of(latest, self.holder())
         members = self._reached(located) if gateways is None else gateways
         return replace(located, members=members, revoked=located.revoked | known.revoked)
 
-    def _holder(self) -> Holder:
+    def holder(self) -> Holder:
+        """Return who holds the certificate now in its file. Raises CredentialError."""
         ours = self._config.credentials
         return holder_of(Signer(ours.certificate, ours.key).common_name)
 

@@ -3,8 +3,10 @@
 import threading
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from fogft.metrics.outcomes import Outcome, Outcomes
+from fogft.model.replica import short
 from fogft.model.spec import ServiceSpec
 from fogft.requests.decide import Pending, Trace
 from fogft.requests.pending import PendingRequests
@@ -22,13 +24,14 @@ class Ledger:
         self.requests = requests
         self.outcomes = Outcomes()
         self.clock = clock
+        self.traced: deque[dict[str, Any]] | None = None  # how each request ended
         self.adopt(spec)
 
     def adopt(self, spec: ServiceSpec) -> None:
         """Switch to another policy."""
         self.spec = spec
-        if spec.trace != (self.outcomes.trace is not None):
-            self.outcomes.trace = deque(maxlen=_TRACE_KEPT) if spec.trace else None
+        if spec.trace != (self.traced is not None):
+            self.traced = deque(maxlen=_TRACE_KEPT) if spec.trace else None
 
     def end(self, request: bytes, pending: Pending, outcome: Outcome) -> None:
         """Count the outcome of a request without a replica's answer."""
@@ -36,23 +39,20 @@ class Ledger:
         self.trace(request, pending, outcome, self.clock())
 
     def trace(
-        self,
-        request: bytes,
-        pending: Pending,
-        outcome: Outcome,
-        now: float,
-        *,
-        replica: str = "",
+        self, request: bytes, pending: Pending, outcome: Outcome, now: float, replica: str = ""
     ) -> None:
-        """Trace a request's outcome, if enabled."""
+        """Keep how and when a request ended, if it is traced."""
+        if self.traced is None:
+            return
         arrived, trace = pending.arrived, pending.trace or Trace({}, {})
-        asked = {key: begun - arrived for key, begun in trace.asked.items()}
-        self.outcomes.note(
-            request,
-            outcome,
-            took_s=now - arrived,
-            at=now,
-            asked=asked,
-            refused=trace.refused,
-            replica=replica,
+        self.traced.append(
+            {
+                "at": now,
+                "request": request.hex(),
+                "outcome": outcome.value,
+                "replica": replica,
+                "took_s": round(now - arrived, 6),
+                "asked": {short(key): round(at - arrived, 6) for key, at in trace.asked.items()},
+                "refused": {short(key): reason.value for key, reason in trace.refused.items()},
+            }
         )
