@@ -54,7 +54,7 @@ def _launched(paths: PoolPaths, manager: ManagerRecords | None = None) -> Server
     planned = PlannedLaunch(SLOT, GENERATION, Offer(Placement("c", "r", "z", "i"), 0.2), "because")
     manager = manager or ManagerRecords(paths, POOL_UID, 1)
     told = manager.announcements(ServingLease(1e9, 60.0))
-    order = configuration.build_order(paths, identity, SPEC, planned, announcements=told)
+    order = configuration.build_order(paths, identity, SPEC, planned, told)
     machine = paths.folder / "machine"
     machine.mkdir()
     for name, content in order.files.items():

@@ -34,6 +34,7 @@ class ManagerRecords:
 
     def __init__(self, paths: PoolPaths, pool_uid: str, epoch: int) -> None:
         self._paths = paths
+        self._files = CredentialPaths.of(paths.credentials, _STEM)
         self._pool_uid = pool_uid
         self._epoch = epoch
         self._endpoints: tuple[str, ...] = ()
@@ -59,11 +60,19 @@ class ManagerRecords:
         self._certify(datetime.datetime.now(datetime.timezone.utc))
         if self._client is None:
             self._client = RendezvousClient(
-                endpoints, self._files(), self._pool_uid, cache=self._paths.manager_records
+                endpoints, self._files, self._pool_uid, cache=self._paths.manager_records
             )
             self._client.start()
         if membership is not None and membership != self._said:
-            self._say(self._client, membership)
+            self._client.publish(
+                RecordKind.ADMISSION,
+                "",
+                membership.epoch,
+                admission_content(membership),
+                sequence=membership.version,
+            )
+            names = {"names": sorted(membership.revoked)}
+            self._client.publish(RecordKind.REVOCATION, "", self._epoch, names)
             self._said = membership
         if self._lease is not None and self._lease is not self._said_lease:
             self._client.publish(RecordKind.LEASE, "", self._epoch, to_plain(self._lease))
@@ -81,8 +90,7 @@ class ManagerRecords:
         if revoked == self._revoked and last is not None and abs(lease.at - last.at) < pause_s:
             return
         self._certify(datetime.datetime.now(datetime.timezone.utc))
-        files = self._files()
-        signer = Signer(files.certificate, files.key)
+        signer = Signer(self._files.certificate, self._files.key)
         self._leases += 1
         records = [self._record(RecordKind.LEASE, self._leases, to_plain(lease))]
         if revoked:  # they only grow, so their number counts the writings of one epoch
@@ -95,24 +103,10 @@ class ManagerRecords:
     def _record(self, kind: RecordKind, sequence: int, content: dict[str, Any]) -> Record:
         return Record(self._pool_uid, kind, "", self._epoch, sequence, content)
 
-    def _files(self) -> CredentialPaths:
-        return CredentialPaths.of(self._paths.credentials, _STEM)
-
-    def _say(self, client: RendezvousClient, membership: Membership) -> None:
-        client.publish(
-            RecordKind.ADMISSION,
-            "",
-            membership.epoch,
-            admission_content(membership),
-            sequence=membership.version,
-        )
-        names = {"names": sorted(membership.revoked)}
-        client.publish(RecordKind.REVOCATION, "", self._epoch, names)
-
     def _certify(self, now: datetime.datetime) -> None:
         if self._certified_at is not None and abs(now - self._certified_at) < _CERTIFY_EVERY:
             return
-        if not authority.is_good(self._files().certificate, now):
+        if not authority.is_good(self._files.certificate, now):
             issued = Ledger(self._paths.credentials).issue(manager_of(self._pool_uid))
             authority.write(issued, self._paths.credentials, _STEM)
         self._certified_at = now

@@ -126,19 +126,17 @@ def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder
 
 
 def build_order(
-    paths: PoolPaths,
-    identity: Identity,
-    spec: PoolSpec,
-    planned: PlannedLaunch,
-    *,
-    announcements: bytes = b"",
+    paths: PoolPaths, identity: Identity, spec: PoolSpec, planned: PlannedLaunch, signed: bytes
 ) -> Launch:
-    """Return the order of a planned launch, with all that its server proxy needs."""
+    """Return the order of a planned launch, with all that its server proxy needs.
+
+    `signed` is what the manager announces.
+    """
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
     holder = holder_of(id.certificate_name)
     issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
     bare = bare_order(identity, spec, planned)
-    config = replica_config(identity, spec, id, announcements=bool(announcements))
+    config = replica_config(identity, spec, id, announcements=True)
     return replace(
         bare,
         task=with_build(absolute(bare.task, Path(identity.file).parent)),
@@ -147,7 +145,7 @@ def build_order(
             "ca.crt": issued.authority_pem,
             "replica.crt": issued.certificate_pem,
             "replica.key": issued.key_pem,
-            **({paths.announcements.name: announcements} if announcements else {}),
+            paths.announcements.name: signed,
         },
     )
 
@@ -159,7 +157,7 @@ def gateway_order(
     offer: Offer,
     generation: int,
     *,
-    announcements: bytes = b"",
+    signed: bytes,
 ) -> Launch:
     """Return the order of the machine of the pool's own gateway, which also has a rendezvous.
 
@@ -174,7 +172,7 @@ def gateway_order(
         for e in ledger.entries()
         if (e.holder.role, e.holder.name) == (Role.GATEWAY, LAUNCHED) and e.holder != mine
     )
-    files: dict[str, bytes] = {}
+    files = {paths.announcements.name: signed}
     for stem, holder in (
         ("replica", holder_of(id.certificate_name)),
         ("gateway", mine),
@@ -216,14 +214,12 @@ def gateway_order(
         credentials=CredentialPaths.of(Path(), "replica"),
         rendezvous=(near,),
         records=Path("records.json"),
-        announcements=Path(paths.announcements.name) if announcements else None,
+        announcements=Path(paths.announcements.name),
         rmw=spec.rmw.replica,
     )
     files["replica.yaml"] = config_file.document(replica, _REPLICA_HEADING).encode()
     files["gateway.yaml"] = config_file.document(gateway, _CLIENT_HEADING).encode()
     files["rendezvous.yaml"] = config_file.document(meeting, _RENDEZVOUS_HEADING).encode()
-    if announcements:
-        files[paths.announcements.name] = announcements
     return Launch(
         id=id,
         pool=identity.name,

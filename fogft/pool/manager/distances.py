@@ -47,8 +47,6 @@ CONNECTS = 3
 CONNECT_LIMIT_S = 2.0
 REMEMBERED_RTTS = 31
 
-Endpoint = Callable[[str], "tuple[str, int] | None"]
-
 
 def endpoint(region: str) -> tuple[str, int] | None:
     """Return the host and port of an endpoint in a ``cloud/region``; None if none is known."""
@@ -110,7 +108,7 @@ class Latencies:
         file: Path,
         *,
         clock: Callable[[], float] = time.time,
-        endpoint: Endpoint = endpoint,
+        endpoint: Callable[[str], tuple[str, int] | None] = endpoint,
         connect: Callable[[str, int], float] | None = None,
     ) -> None:
         self._file = file

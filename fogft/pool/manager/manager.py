@@ -197,12 +197,12 @@ class Manager:
 
     def _build_order(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
         signed = self._records.announcements(self._serving_lease(spec))
-        return configuration.build_order(self._paths, identity, spec, planned, announcements=signed)
+        return configuration.build_order(self._paths, identity, spec, planned, signed)
 
     def _gateway_order(self, spec: PoolSpec, offer: Offer, generation: int) -> Launch:
         signed = self._records.announcements(self._serving_lease(spec))
         return configuration.gateway_order(
-            self._paths, self._identity, spec, offer, generation, announcements=signed
+            self._paths, self._identity, spec, offer, generation, signed=signed
         )
 
     def _gateway_up(self, now: float) -> bool:

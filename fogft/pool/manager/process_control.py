@@ -40,18 +40,17 @@ def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0)
     if pid is None or pid == os.getpid() or only not in (None, pid):
         return None
     with _opened(pid) as descriptor:
+
+        def gone() -> bool:
+            if _is_alive(descriptor):
+                return False
+            return not disk.is_locked(lock) or disk.holder(lock) not in (None, pid)
+
         for number in (signal.SIGTERM, signal.SIGKILL):
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 _send(pid, descriptor, number)
                 _send(pid, descriptor, signal.SIGCONT)  # one that is stopped would never hear of it
-            end = time.monotonic() + patience_s
-            while _is_alive(descriptor) or (
-                disk.is_locked(lock) and disk.holder(lock) in (None, pid)
-            ):
-                if time.monotonic() > end:
-                    break
-                time.sleep(POLL_S)
-            else:
+            if wait_for(gone, patience_s):
                 break
     return pid
 

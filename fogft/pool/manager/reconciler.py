@@ -319,11 +319,15 @@ class Reconciler:
         stops = standbys.stopped(spec, plan.terminations, observed) if self._stopping else {}
         for planned in plan.launches:
             started = starts.get(planned.slot)
-            self._launch(identity, spec, started or planned, slack, is_there=started is not None)
+            order = self._build_order(identity, spec, started or planned)
+            order = replace(order, is_there=started is not None)
+            if slack is not None:
+                order = replace(order, limit_usd_per_hour=order.usd_per_hour + slack)
+            self._order(order, (started or planned).reason)
         for end in plan.terminations:
             stopped = stops.get(end.id)
-            order = None if stopped is None else bare_order(identity, spec, stopped)
-            self._terminate(end.id, end.reason, history, stopped=order)
+            kept = None if stopped is None else bare_order(identity, spec, stopped)
+            self._terminate(end.id, end.reason, history, stopped=kept)
         for id, reason in standbys.superfluous(spec, observed, starts.values()):
             self._terminate(id, reason, history)
 
@@ -373,20 +377,6 @@ class Reconciler:
             self._store.write_membership(membership)
             self._membership = membership
         self._published_for = cause
-
-    def _launch(
-        self,
-        identity: Identity,
-        spec: PoolSpec,
-        planned: PlannedLaunch,
-        slack: float | None,
-        *,
-        is_there: bool = False,
-    ) -> None:
-        order = replace(self._build_order(identity, spec, planned), is_there=is_there)
-        if slack is not None:
-            order = replace(order, limit_usd_per_hour=order.usd_per_hour + slack)
-        self._order(order, planned.reason)
 
     def _order(self, order: Launch, reason: Reason) -> None:
         location = order.placement.location

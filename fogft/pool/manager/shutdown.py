@@ -65,7 +65,8 @@ def end(
         kept.enter_context(without_manager(paths, done))
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
-            store.write_intent(replace(_intent(store), stopping=True))
+            before = disk.read_or(paths.intent, Intent())
+            store.write_intent(replace(before, stopping=True))
         kept.enter_context(without_client_proxy(paths, done))
         teardown.end_machines(
             cloud_of(identity),
@@ -108,13 +109,6 @@ def without_orders(paths: PoolPaths, spec: PoolSpec, done: Callable[[str], None]
         if any(service.state is not None for service in spec.services):
             ended.enter_context(without_client_proxy(paths, done))
         yield
-
-
-def _intent(store: PoolStore) -> Intent:
-    try:
-        return store.intent()
-    except StateError:
-        return Intent()
 
 
 @contextlib.contextmanager

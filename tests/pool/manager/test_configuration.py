@@ -49,7 +49,7 @@ def test_each_side_is_told_how_it_speaks_ros(paths: PoolPaths) -> None:
     asked = replace(spec(), rmw=Middleware(robot=Speaks.ZENOH, replica=Speaks.RCLPY))
     configuration.write_proxy_config(paths, identity(paths.folder), asked)
     assert read_client(paths.proxy_config).rmw is Speaks.ZENOH
-    order = configuration.build_order(paths, identity(paths.folder), asked, planned())
+    order = configuration.build_order(paths, identity(paths.folder), asked, planned(), b"signed")
     for name, content in order.files.items():
         (paths.folder / name).write_bytes(content)
     assert read_server(paths.folder / "replica.yaml").rmw is Speaks.RCLPY
@@ -92,7 +92,7 @@ def test_where_each_process_answers_prometheus_is_passed_on(paths: PoolPaths) ->
 def test_the_server_proxy_reads_what_was_written(paths: PoolPaths, run: str) -> None:
     """The user's command and environment arrive as the pool file has them, whatever they hold."""
     asked = spec(run=run, envs={"KEY": NASTY, "EMPTY": None, "NUMBER": 3})
-    order = configuration.build_order(paths, identity(paths.folder), asked, planned())
+    order = configuration.build_order(paths, identity(paths.folder), asked, planned(), b"signed")
     for name, content in order.files.items():
         (paths.folder / name).write_bytes(content)
     config = read_server(paths.folder / "replica.yaml", listen="127.0.0.1:5", domain_id=4)
@@ -108,7 +108,7 @@ def test_the_server_proxy_reads_what_was_written(paths: PoolPaths, run: str) -> 
 
 def test_an_order_says_where_what_and_for_how_much(paths: PoolPaths) -> None:
     """The order carries the plan's placement, price and the spec's hash."""
-    order = configuration.build_order(paths, identity(paths.folder), spec(), planned())
+    order = configuration.build_order(paths, identity(paths.folder), spec(), planned(), b"signed")
     assert (order.id, order.pool) == (ReplicaId(UID, 3, 7), "pool")
     assert order.placement == planned().offer.placement
     assert (order.usd_per_hour, order.spec_hash) == (0.25, spec().replica_hash)
@@ -147,7 +147,7 @@ def test_a_replicas_certificate_outlives_the_pool_and_a_margin(
 ) -> None:
     """A manager that died at the launch stops no traffic until the pool was to end anyway."""
     asked = dataclasses.replace(spec(), max_hours=max_hours)
-    order = configuration.build_order(paths, identity(paths.folder), asked, planned())
+    order = configuration.build_order(paths, identity(paths.folder), asked, planned(), b"signed")
     said = authority.describe_pem(order.files["replica.crt"])
     lasts = said.not_after - datetime.datetime.now(datetime.timezone.utc)
     least = max(365.0, (max_hours or 0.0) / 24 + configuration.MARGIN_DAYS)
