@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fogft import disk
-from fogft.cli import options, output
+from fogft.cli import options, output, progress
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption, Slot
 from fogft.pool.commands import composition
@@ -48,7 +48,6 @@ def drain(slot: Slot, wait: Wait = False, pool: PoolOption = None) -> None:
 
     The old one finishes its requests and is then ended.
     """
-    from fogft.cli import progress
     from fogft.pool.commands import change
     from fogft.pool.commands.outcome import Settled
 
@@ -112,7 +111,6 @@ def retry(pool: PoolOption = None) -> None:
 
 
 def _scale(pool: str | None, by: int, *, wait: bool) -> None:
-    from fogft.cli import progress
     from fogft.model import intent
     from fogft.pool.commands.change import change
     from fogft.pool.commands.outcome import Settled

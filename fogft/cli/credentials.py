@@ -82,7 +82,6 @@ def issue(
 @credentials.command("list", cls=Command, epilog="fogft credentials list")
 def list_(as_json: AsJson = False, pool: PoolOption = None) -> None:
     """List the certificates that the pool's CA has issued, without their keys."""
-    from fogft.cli.table import table
     from fogft.model.plain import to_plain
     from fogft.pool.credentials.ledger import Ledger
 
@@ -98,7 +97,7 @@ def list_(as_json: AsJson = False, pool: PoolOption = None) -> None:
         for e in entries
     ]
     names = ("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL")
-    output.show(table(names, rows, width=output.width(sys.stdout)))
+    output.table(names, rows)
 
 
 @credentials.command(cls=Command, epilog="fogft credentials revoke robot ada")

@@ -198,7 +198,7 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     from fogft.ros import shared_memory
 
     name = pool or named
-    if not composition.pools() and not (name and composition.is_exported(name)):
+    if not composition.pools() and not (name and PoolPaths.of(name).exported.exists()):
         output.say("no pools on this machine")
         return
     store = composition.store_of(name)

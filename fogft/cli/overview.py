@@ -33,7 +33,6 @@ _ANSWERS = {True: ("yes", "green"), False: ("no", "bold red"), None: ("?", "yell
 
 def list(as_json: AsJson = False) -> None:
     """List the pools on this machine."""
-    from fogft.cli.table import table
     from fogft.pool.commands.status import every
 
     found: dict[str, dict[str, Any]] = {}
@@ -61,8 +60,7 @@ def list(as_json: AsJson = False) -> None:
         output.json_data([*found.values()])
     elif rows:
         names = ("POOL", "ANSWERS", "READY", "CLOUD", "$/H", "SEEN", "FILE")
-        width = output.width(sys.stdout)
-        output.show(table(names, rows, width=width, right=("$/H", "SEEN"), folds=("FILE",)))
+        output.table(names, rows, right=("$/H", "SEEN"), folds=("FILE",))
     else:
         output.say("no pools on this machine")
         output.hint("start one with `fogft up FILE`")
@@ -81,7 +79,6 @@ def events(
     Launches, losses, moves and updates, oldest first. Old events are dropped once no decision
     needs them.
     """
-    from fogft.cli.table import table
     from fogft.model.plain import to_plain
 
     store = composition.store_of(pool or named)
@@ -89,8 +86,7 @@ def events(
         output.json_data([to_plain(one) for one in _last_events(store, count)])
         return
     names = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
-    width = output.width(sys.stdout)
-    output.show(table(names, event_rows(store, count), width=width, folds=("LOCATION", "WHY")))
+    output.table(names, event_rows(store, count), folds=("LOCATION", "WHY"))
 
 
 def event_rows(store: PoolStore, count: int) -> Sequence[Sequence[str]]:
@@ -156,8 +152,6 @@ def _costs_json(costs: Costs) -> dict[str, Any]:
 
 
 def _show_costs(found: Sequence[Costs]) -> None:
-    from fogft.cli.table import table
-
     rows: MutableSequence[Sequence[str]] = []
     for costs in found:
         if costs.before_usd:
@@ -173,8 +167,7 @@ def _show_costs(found: Sequence[Costs]) -> None:
             for one in costs.spent
         )
     names = ("POOL", "DAY", "REPLICA", "LOCATION", "INSTANCE", "HOURS", "$")
-    width = output.width(sys.stdout)
-    output.show(table(names, rows, width=width, right=("HOURS", "$"), folds=("LOCATION",)))
+    output.table(names, rows, right=("HOURS", "$"), folds=("LOCATION",))
     output.data("")
     for costs in found:
         output.data(f"{costs.pool}: {price(costs.usd)}")

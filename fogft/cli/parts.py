@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -11,9 +11,7 @@ from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption
 from fogft.pool.commands import composition
-
-if TYPE_CHECKING:
-    from fogft.pool.commands.service import Unit
+from fogft.pool.commands import service as units
 
 
 def _endpoint(value: str | None) -> str | None:
@@ -134,9 +132,9 @@ def rendezvous(config: Config, listen: Listen = None, metrics: Metrics = None) -
 
     Needs a port that every member can reach, and carries no requests. Run two, on two machines.
     """
-    from fogft.pool.commands.rendezvous import read_config, run
+    from fogft.pool.commands.rendezvous import run
 
-    run(read_config(config, listen, metrics))
+    run(config, listen=listen, metrics=metrics)
 
 
 def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> None:
@@ -174,9 +172,7 @@ service = group("Let systemd start a pool's processes at boot, and restart them.
 
 def _units(
     pool: str | None, gateway: Path | None, rendezvous: Path | None, *, system: bool
-) -> list[Unit]:
-    from fogft.pool.commands import service as units
-
+) -> list[units.Unit]:
     if gateway is not None:
         return units.of_part("gateway", gateway, system=system)
     if rendezvous is not None:
@@ -196,8 +192,6 @@ def install(
 
     Units get the current environment, so source ROS 2 first. Running processes hand over.
     """
-    from fogft.pool.commands import service as units
-
     where = units.services(system=system)
     wanted = _units(pool, gateway, rendezvous, system=system)
     paths = None if gateway or rendezvous else composition.paths_of(pool)
@@ -219,8 +213,6 @@ def install(
 @service.command(cls=Command, epilog="fogft service status")
 def status(*, system: System = False) -> None:
     """Show the units and their state."""
-    from fogft.pool.commands import service as units
-
     where = units.services(system=system)
     found = units.installed(where)
     for name, state in units.states(where, found).items():
@@ -238,8 +230,6 @@ def remove(
     system: System = False,
 ) -> None:
     """Stop and delete the units. Replicas keep running; `fogft up` starts a manager."""
-    from fogft.pool.commands import service as units
-
     where = units.services(system=system)
     if pool is not None:  # it may have ended
         names = list(units.names_of(pool).values())

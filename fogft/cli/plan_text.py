@@ -26,8 +26,6 @@ _HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST"
 
 def show(shown: PlanShown, *, everything: bool = False) -> None:
     """Print the plan: the table of offers and a summary."""
-    from fogft.cli.table import table
-
     found = sorted(
         shown.explanation.considered,
         key=lambda x: (not x.slots, x.slots, x.offer.usd_per_hour, x.offer.placement.location),
@@ -35,14 +33,13 @@ def show(shown: PlanShown, *, everything: bool = False) -> None:
     listed = found if everything else _best_of_regions(found)
     rows = [_row(shown, one) for one in listed]
     folds = ("LOCATION", "PRICE", "WHY NOT")
-    right, width = ("$/H", "RTT", "LOST"), output.width(sys.stdout)
-    output.show(table(_HEADER, rows, right=right, folds=folds, width=width))
+    output.table(_HEADER, rows, right=("$/H", "RTT", "LOST"), folds=folds)
     if len(listed) < len(found):
         output.data(f"and {len(found) - len(listed)} more offers in these regions (--all)")
     output.data("")
     if everything and shown.clouds:
         clouds = [(name, "no" if why else "yes", why) for name, why in shown.clouds.items()]
-        output.show(table(("CLOUD", "FITS", "WHY NOT"), clouds, folds=("WHY NOT",), width=width))
+        output.table(("CLOUD", "FITS", "WHY NOT"), clouds, folds=("WHY NOT",))
         output.data("")
     for line in _summary(shown):
         by = 4 if line.startswith(" ") else _MARGIN

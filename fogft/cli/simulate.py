@@ -96,11 +96,7 @@ HEADER = (
 
 
 def _show(report: Report) -> None:
-    from fogft.cli.table import table
-
-    width = output.width(sys.stdout)
-    rows = [_cells(row, report) for row in report.rows]
-    output.show(table(HEADER, rows, right=HEADER[1:], width=width))
+    output.table(HEADER, [_cells(row, report) for row in report.rows], right=HEADER[1:])
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "simulated"
     output.data(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import TYPE_CHECKING, Annotated
 
@@ -68,8 +67,6 @@ def sweep(
 
 
 def _show(found: Swept) -> None:
-    from fogft.cli.table import table
-
     if found.cloud == "sky":
         asked = ", ".join(f"`{name}`" for name in sorted(found.asked)) or "no cloud"
         output.say(f"checked all of SkyPilot's clouds, and {asked} directly")
@@ -81,5 +78,4 @@ def _show(found: Swept) -> None:
         rows.append((str(machine.id), machine.placement.location, costs, age(age_s), one.why))
     if rows:
         names = ("MACHINE", "LOCATION", "$/H", "AGE", "WHY")
-        width = output.width(sys.stdout)
-        output.show(table(names, rows, width=width, folds=("WHY", "LOCATION"), titled=False))
+        output.table(names, rows, folds=("WHY", "LOCATION"), titled=False)

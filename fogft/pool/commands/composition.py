@@ -31,18 +31,13 @@ def pools() -> list[str]:
     return sorted(one.name for one in folders if PoolPaths(one).identity.exists())
 
 
-def is_exported(name: str) -> bool:
-    """Whether a pool of this machine was exported to another one."""
-    return PoolPaths.of(name).exported.exists()
-
-
 def paths_of(name: str | None = None) -> PoolPaths:
     """Return the paths of the named pool, or of the only one."""
     known = pools()
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
         raise PoolNotFound(f"there are {len(known)} pools: {listed}", "name one of them")
-    if name is not None and name not in known and not is_exported(name):
+    if name is not None and name not in known and not PoolPaths.of(name).exported.exists():
         hint = f"pools: {listed}" if known else "start one with `fogft up FILE`"
         raise PoolNotFound(f"there is no pool `{name}`", hint)
     if name is None and not known:

@@ -42,16 +42,12 @@ def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Pa
         for relative in names:
             (target / relative).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source / relative, target / relative)
-        write_schema(written[-1])
+        form = json.dumps(schema.pool_schema(), indent=2) + "\n"
+        written[-1].write_text(form, encoding="utf-8")  # which its first line names, for editors
     except OSError as error:
         what = f"`{error.filename or target}` cannot be written: {error.strerror}"
         raise FogftError(what, "choose another folder with `--into DIR`") from error
     return written
-
-
-def write_schema(path: Path) -> None:
-    """Write the JSON Schema that the first line of a pool file names, for editors."""
-    path.write_text(json.dumps(schema.pool_schema(), indent=2) + "\n", encoding="utf-8")
 
 
 def _files(source: Path) -> Iterator[Path]:

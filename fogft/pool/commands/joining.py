@@ -57,11 +57,10 @@ class Joined:
         alone: No rendezvous tells it of what changes, nor told whether it is the first to join.
     """
 
-    pool: str
     holder: Holder
     config: Path
     command: str
-    alone: bool = False
+    alone: bool
 
 
 def issue(
@@ -173,7 +172,7 @@ def join(
     destroy(file)
     config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
     alone = not endpoints and holder.role is not Role.RENDEZVOUS
-    return Joined(label.pool, holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
+    return Joined(holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
 
 
 @contextlib.contextmanager

@@ -28,15 +28,9 @@ log = logging.getLogger(__name__)
 _SAVE_EVERY_S = 0.5
 
 
-def read_config(
-    path: Path, listen: str | None = None, metrics: str | None = None
-) -> RendezvousConfig:
-    """Read a rendezvous's configuration; paths in it are relative to its folder."""
-    return config_file.read(RendezvousConfig, path, {"listen": listen, "metrics": metrics})
-
-
-def run(config: RendezvousConfig) -> None:
-    """Run until a signal ends it."""
+def run(path: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
+    """Run with a configuration file until a signal ends it."""
+    config = config_file.read(RendezvousConfig, path, {"listen": listen, "metrics": metrics})
     start_log()
     asyncio.run(_Rendezvous(config).live())
 
@@ -56,7 +50,6 @@ class _Rendezvous:
         )
 
     async def live(self) -> None:
-        """Serve until a signal comes."""
         loop = asyncio.get_running_loop()
         stop = asyncio.Event()
         for number in ENDING_SIGNALS:

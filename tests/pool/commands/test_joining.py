@@ -15,14 +15,16 @@ from hypothesis import strategies as st
 from fogft.errors import CredentialError
 from fogft.model.credentials import Role
 from fogft.model.membership import from_dict
+from fogft.model.proxy_config import RendezvousConfig
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.spec import PoolSpec, ServiceSpec
-from fogft.pool.commands import joining, rendezvous
+from fogft.pool.commands import joining
 from fogft.pool.credentials import authority, bundle
 from fogft.pool.credentials.bundle import Label
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, PoolStore, write_identity
+from fogft.poolfile import config_file
 from fogft.proxy.config import read_client, read_gateway, read_server
 from tests.nightly import by_day
 
@@ -68,7 +70,7 @@ def issued(store: PoolStore, role: Role, name: str) -> bytes:
 def test_a_robot_joins_from_one_file(file: Path, tmp_path: Path) -> None:
     """All that its proxy needs is there, private, and belongs together."""
     joined = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
-    assert (joined.command, joined.holder.short, joined.pool) == ("proxy", "ada.1", "pool")
+    assert (joined.command, joined.holder.short) == ("proxy", "ada.1")
     config = read_client(joined.config)
     assert (config.robot, config.pool_uid, config.services) == ("ada", UID, SPEC.services)
     assert from_dict(json.loads(config.membership.read_text())) == MEMBERSHIP
@@ -99,7 +101,7 @@ def test_a_rendezvous_joins_too(store: PoolStore, tmp_path: Path) -> None:
     path.write_bytes(issued(store, Role.RENDEZVOUS, "meet"))
     joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
     assert joined.command == "rendezvous"
-    config = rendezvous.read_config(joined.config)
+    config = config_file.read(RendezvousConfig, joined.config)
     said = authority.describe(config.credentials.certificate)
     assert (said.common_name, said.role) == (f"rendezvous.meet.1.{UID}", "rendezvous")
     assert config.credentials.key.exists()
