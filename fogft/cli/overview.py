@@ -15,7 +15,7 @@ from fogft.cli.options import AsJson, PoolArgument, PoolOption
 from fogft.cli.status_text import age, price
 from fogft.errors import PoolNotFound, StateError
 from fogft.pool.commands import composition
-from fogft.pool.folder.paths import home
+from fogft.pool.folder.paths import PoolPaths, home
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -33,14 +33,18 @@ _ANSWERS = {True: ("yes", "green"), False: ("no", "bold red"), None: ("?", "yell
 
 def list(as_json: AsJson = False) -> None:
     """List the pools on this machine."""
-    from fogft.pool.commands.status import every
+    from fogft.pool.commands.status import read
 
     found: dict[str, dict[str, Any]] = {}
     rows: MutableSequence[Sequence[str | Text]] = []
-    for name, seen in every(composition.pools(), time.time()):
-        if isinstance(seen, StateError):
-            found[name] = {"pool": name, "error": seen.message}
-            rows.append([name, output.cell("?", "bold red"), "?", "?", "?", "?", seen.message])
+    for name in composition.pools():
+        try:
+            seen = read(PoolPaths.of(name), time.time())
+        except PoolNotFound:  # it has just been ended
+            continue
+        except StateError as error:
+            found[name] = {"pool": name, "error": error.message}
+            rows.append([name, output.cell("?", "bold red"), "?", "?", "?", "?", error.message])
             continue
         status = seen.status
         said = {key: value for key, value in seen.to_json().items() if key in _LISTED}

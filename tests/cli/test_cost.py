@@ -6,13 +6,12 @@ import json
 from pathlib import Path
 
 from fogft.cli import main
-from fogft.pool.folder.costs import path_of
 from tests.pool.folder.test_costs import NOON, STEADY, UID, CostBook, machine
 
 
 def test_what_was_spent_is_shown_by_day_and_replica(home: Path, capsys):
     for name, price in (("perception", 0.5), ("planner", 0.25)):
-        kept = CostBook(path_of(home / "costs", name, UID), name, UID)
+        kept = CostBook(home / "costs", name, UID)
         kept.look(NOON + 18 * 3600, [machine(0, STEADY, usd_per_hour=price)], [], 600.0)
     assert main.run(["cost", "perception"]) == 0
     shown = capsys.readouterr().out

@@ -52,8 +52,6 @@ def test_every_status_is_valid(world: World) -> None:
         tick,
         history=world.history,
         recent=[Event(NOW, EventKind.FAILED, 0, 1, "c/r/a", FULL)],
-        epoch=3,
-        manager_pid=11,
     ).joined(None, proxy_alive=True, links=world.observed.links)
     check(Seen(seen, None, manager_alive=True).to_json())
     again = status.from_json(json.loads(json.dumps(seen.to_json())), Path("status.json"))

@@ -59,7 +59,8 @@ class Scene:
         source = FILE.format(replicas=replicas, timeout_s=timeout_s, max_hours=max_hours)
         self.file.write_text(source)
         spec = pool_file.read(self.file)
-        return startup.write(self.store, spec, source=source, file=self.file, cloud="folder")
+        startup.write(self.store, spec, source=source, file=self.file, cloud="folder")
+        return self.store.identity()
 
     def command(self, name: str = "pool") -> list[str]:
         return [sys.executable, "-m", "tests.pool.manager.manager_process", str(self.home), name]
@@ -102,8 +103,16 @@ class Scene:
 
     def end(self, warned: list[str] | None = None) -> list[str]:
         """Do what `down` does."""
+        ended: list[str] = []
         warnings = [] if warned is None else warned
-        return shutdown.end(self.store, lambda _: self.cloud, warned=warnings.append, limit_s=5)
+        shutdown.end(
+            self.store,
+            lambda _: self.cloud,
+            told=ended.append,
+            warned=warnings.append,
+            limit_s=5,
+        )
+        return ended
 
     def output(self) -> str:
         path = self.home / "manager-output"

@@ -1,10 +1,7 @@
 """Change a running pool besides its file: scale, drain, exclude, retry, certificates.
 
-The first five write the new intent under the pool's lock and return; the manager, now or when there
-is one again, acts on it. Certificates are waited for until they are revoked or in use.
-
-Not here: what the operations mean (`fogft.model.intent`), bundles (`joining`), the CA and its
-ledger (`fogft.pool.credentials`).
+All but the last write the new intent under the pool's lock and return; the manager, now or when
+there is one again, acts on it. Certificates are waited for until they are revoked or in use.
 """
 
 import time

@@ -3,8 +3,7 @@
 Everything is written before the identity, which comes last: a pool exists once that
 stands. So an `up` that was cut short is an `up` that never was.
 
-Owns: creating and changing a pool on disk, and starting its manager.
-Not here: judging the file (`pool_file`), waiting for the services (`fogft.cli.progress`).
+Not here: judging the file (`preview`), waiting for the services (`fogft.cli.progress`).
 """
 
 import secrets
@@ -41,7 +40,7 @@ def start(order: Preview) -> bool:
     return start_manager(store)
 
 
-def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: str) -> Identity:
+def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: str) -> None:
     """Create a pool, or apply a changed file to it."""
     paths = store.paths
     disk.make_folder(paths.folder)
@@ -51,7 +50,8 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
         try:
             identity = read_identity(paths)
         except PoolNotFound:
-            return _create(store, spec, source, file, cloud)
+            _create(store, spec, source, file, cloud)
+            return
         check_same(identity, spec, file, cloud)
         try:
             before, old_source = store.spec(), paths.spec.read_text()
@@ -62,10 +62,9 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
         store.write_intent(lifetime.revived(before, after, begun_at, time.time()))
         if old_source != source:
             disk.write_whole(paths.spec, source)
-        return identity
 
 
-def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> Identity:
+def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> None:
     paths = store.paths
     # Of an `up` that was cut short, or a pool whose identity was lost: what its client proxy would
     # go on to tell is not of this pool.
@@ -88,9 +87,7 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
         authority.create_authority(paths.credentials, uid)
         disk.write_whole(paths.spec, source)
         store.write_intent(Intent())
-        identity = Identity(spec.name, uid, cloud, str(file), time.time())
-        write_identity(paths, identity)
-        return identity
+        write_identity(paths, Identity(spec.name, uid, cloud, str(file), time.time()))
 
 
 def revive_client_proxy(paths: PoolPaths) -> None:

@@ -1,12 +1,7 @@
-"""The status of a pool now, each part from its best source.
-
-    status.json (manager) ──► machines, prices, what is wanted ──┐
-    proxy-status.json (client proxy) ──► links, counters ────────┼──► Seen
-    locks (processes) ──► who lives ─────────────────────────────┘
+"""The status of a pool now, each part from its best source: docs/design/command-line.md.
 
 What nobody has looked at lately is unknown, never as it was.
 
-Owns: reading and renewing a status.
 Not here: its schema (`fogft.pool.manager.status`), showing it (`fogft.cli`).
 """
 
@@ -14,14 +9,14 @@ import contextlib
 import os
 import time
 import typing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
 from types import NoneType, UnionType
 from typing import Any
 
 from fogft import disk
-from fogft.errors import PoolNotFound, StateError
+from fogft.errors import StateError
 from fogft.model.reason import Reason
 from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.folder.paths import PoolPaths
@@ -145,17 +140,6 @@ def checked(paths: PoolPaths, limit_s: float) -> Seen:
         if seen.links_known and [r.link for r in links[0]] == [r.link for r in links[1]]:
             return asked
         time.sleep(_LOOK_EVERY_S)
-
-
-def every(names: Iterable[str], now: float) -> Iterator[tuple[str, Seen | StateError]]:
-    """Yield the status of each pool; an error in one does not hide others."""
-    for name in names:
-        try:
-            yield name, read(PoolPaths.of(name), now)
-        except PoolNotFound:  # it has just been ended
-            continue
-        except StateError as error:
-            yield name, error
 
 
 def renewed(paths: PoolPaths, limit_s: float = 15.0) -> Seen:

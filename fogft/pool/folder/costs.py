@@ -69,11 +69,11 @@ class Costs:
 class CostBook:
     """Keeps the costs of one pool: one process writes them."""
 
-    def __init__(self, path: Path, pool: str, uid: str) -> None:
-        self._path = path
+    def __init__(self, folder: Path, pool: str, uid: str) -> None:
+        self._path = path_of(folder, pool, uid)
         self._written_at: float | None = None
         self._looked_at = 0.0
-        found = _read(path)
+        found = _read(self._path)
         self._kept = found if found is not None and found.uid == uid else Costs(pool, uid)
         self._days = {(one.day, one.replica): one for one in self._kept.spent}
         self._running = self._kept.running

@@ -2,9 +2,6 @@
 
 Without a rendezvous in the pool file only revocations and the lease are signed, for the client
 proxy to pass on.
-
-Owns: the manager's certificate for signing, and its record client.
-Not here: what the membership is (`reconciler`).
 """
 
 import datetime

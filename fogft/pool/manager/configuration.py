@@ -128,10 +128,7 @@ def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder
 def build_order(
     paths: PoolPaths, identity: Identity, spec: PoolSpec, planned: PlannedLaunch, signed: bytes
 ) -> Launch:
-    """Return the order of a planned launch, with all that its server proxy needs.
-
-    `signed` is what the manager announces.
-    """
+    """Return the order of a planned launch, with `signed` records and all else that it needs."""
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
     holder = holder_of(id.certificate_name)
     issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))

@@ -1,10 +1,7 @@
 """Round trips from the robot to regions, from the best known source.
 
-    the pool file's `rtt_s`, links to replicas, connects to regional endpoints, great circles
-
-A provider's public endpoint of a region ends TCP in that region, so the time to connect is one
-round trip; the fastest of a few counts. A link only refines what is known of a region otherwise:
-where nothing else is known, a region with a replica would look nearer than all others.
+A link only refines what is known of a region otherwise: where nothing else is known, a region with
+a replica would look nearer than all others.
 
 Not here: what they are for (`fogft.planning.listing`).
 """

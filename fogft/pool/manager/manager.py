@@ -29,7 +29,7 @@ from fogft.planning import lifetime
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.planner import PlannedLaunch
 from fogft.pool.credentials.ledger import Ledger
-from fogft.pool.folder.costs import CostBook, path_of
+from fogft.pool.folder.costs import CostBook
 from fogft.pool.folder.discovered import Discovery
 from fogft.pool.folder.lease import Lease, supersedes
 from fogft.pool.folder.paths import latency_file
@@ -115,8 +115,7 @@ class Manager:
         )
         self._metrics = metrics
         self._replicas: Sequence[status.ReplicaStatus] = ()
-        costs = path_of(self._paths.costs, self._identity.name, self._identity.uid)
-        self._costs = CostBook(costs, self._identity.name, self._identity.uid)
+        self._costs = CostBook(self._paths.costs, self._identity.name, self._identity.uid)
         self._reconciler = Reconciler(
             cloud,
             store,
@@ -303,13 +302,10 @@ class Manager:
             cause = Cause.STALE_PROXY_REPORT if report else Cause.NO_PROXY_REPORT
             notes.append(Reason(cause))
         ends_at = self._cloud.credentials_end_at() if isinstance(self._cloud, RealCloud) else None
-        seen = status.of_tick(
-            tick,
-            history=self._store.history(),
-            recent=self._store.recent(),
+        seen = replace(
+            status.of_tick(tick, self._store.history(), self._store.recent(), notes),
             epoch=self._lease.epoch,
             manager_pid=os.getpid(),
-            notes=notes,
             usd_to_date=self._costs.usd,
             credentials_end_at=ends_at,
         )

@@ -1,11 +1,9 @@
-"""Keep a client proxy, its standby and a spare running.
+"""Keep a client proxy, its standby and a spare running; they live on when the manager goes.
 
-Each is started in a session of its own and lives on when the manager goes. Who is in line takes
-over by itself, and the spare leaves another (`proxy.robot.standby`): here they are started where
-the line has no end, and adopted where they run already.
+Who is in line takes over by itself, and the spare leaves another (`proxy.robot.standby`): here they
+are started where the line has no end, and adopted where they run already.
 
-Owns: starting them again, with backoff, and killing what hangs; and `manager.json`, by which a
-client proxy starts a manager again that was killed (`fogft.proxy.robot.manager_restart`).
+Owns: killing what hangs, too, and `manager.json` (`fogft.proxy.robot.manager_restart`).
 Not here: its configuration (`configuration`).
 """
 

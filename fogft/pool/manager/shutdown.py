@@ -33,10 +33,8 @@ def end(
     told: Callable[[str], None] = lambda _: None,
     warned: Callable[[str], None] = lambda _: None,
     limit_s: float = LIMIT_S,
-) -> list[str]:
-    """Shut a pool down and return what was ended, in words, in order.
-
-    Of one that another machine manages, only what is left here.
+) -> None:
+    """Shut a pool down; of one that another machine manages, only what is left here.
 
     `told` hears of each thing as it has ended, `warned` of what could not be made certain.
 
@@ -46,33 +44,27 @@ def end(
         FogftError: Something did not end (the message says what); run it again.
     """
     paths = store.paths
-    ended: list[str] = []
-
-    def done(what: str) -> None:
-        ended.append(what)
-        told(what)
-
     if paths.exported.exists():
-        with without_client_proxy(paths, done):
+        with without_client_proxy(paths, told):
             shutil.rmtree(paths.folder)
-        return ended
+        return
     store.identity()
     with disk.locked(paths.intent_lock), contextlib.ExitStack() as kept:
         try:
             identity = store.identity()
         except PoolNotFound:
-            return ended  # another `down` was faster
-        kept.enter_context(without_manager(paths, done))
+            return  # another `down` was faster
+        kept.enter_context(without_manager(paths, told))
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             before = disk.read_or(paths.intent, Intent())
             store.write_intent(replace(before, stopping=True))
-        kept.enter_context(without_client_proxy(paths, done))
+        kept.enter_context(without_client_proxy(paths, told))
         teardown.end_machines(
             cloud_of(identity),
             identity.uid,
             known=teardown.known(store),
-            done=done,
+            done=told,
             warned=warned,
             limit_s=limit_s,
         )
@@ -80,7 +72,6 @@ def end(
         with contextlib.suppress(OSError):  # what stands in its place is no file
             paths.identity.unlink()
         shutil.rmtree(paths.folder, ignore_errors=True)
-    return ended
 
 
 def without_manager(

@@ -150,11 +150,7 @@ class ServiceStatus:
 
 @dataclass(frozen=True)
 class TopicStatus:
-    """One topic, possibly of an action.
-
-    Attributes:
-        heard_by: The replicas, as ``slot.generation``, that pass it on, or subscribe to it, now.
-    """
+    """One topic, possibly of an action; `heard_by`: replicas that pass it on, or subscribe, now."""
 
     name: str
     type: str
@@ -165,11 +161,9 @@ class TopicStatus:
 
 @dataclass(frozen=True)
 class UpdateStatus:
-    """An update in progress, or the last one if it was given up.
+    """An update in progress, or the last one if it was given up: for `fault`, in words.
 
-    Attributes:
-        done: Replicas of the version that is wanted now which serve.
-        fault: Why it was given up, in words; empty while it was not.
+    `done` are the replicas of the version that is wanted now which serve.
     """
 
     state: str
@@ -181,13 +175,7 @@ class UpdateStatus:
 
 @dataclass(frozen=True)
 class EventStatus:
-    """One event.
-
-    Attributes:
-        event: In a word or three; see `WORDS`.
-        replica: ``slot.generation``; empty for what is of no replica.
-        detail: Why, in words; `reason` is the same as ``{cause, ...}``.
-    """
+    """One event, of `replica` ``slot.generation`` or of none; `detail` is `reason` in words."""
 
     at: Moment
     event: str = field(metadata={"words": tuple(WORDS.values())})
@@ -344,15 +332,7 @@ def from_json(raw: Any, path: Path) -> PoolStatus:
 
 
 def of_tick(
-    tick: Tick,
-    *,
-    history: History,
-    recent: Sequence[Event],
-    epoch: int = 0,
-    manager_pid: int = 0,
-    notes: Sequence[Reason] = (),
-    usd_to_date: float = 0.0,
-    credentials_end_at: float | None = None,
+    tick: Tick, history: History, recent: Sequence[Event], notes: Sequence[Reason] = ()
 ) -> PoolStatus:
     """Return the status after a tick, as known to the manager and the cloud."""
     from fogft.model.groups import FIRST_BY_HAND
@@ -370,8 +350,6 @@ def of_tick(
         uid=tick.identity.uid,
         cloud=tick.identity.cloud,
         file=tick.identity.file,
-        epoch=epoch,
-        manager_pid=manager_pid,
         observed_at=observed.now,
         cloud_reachable=observed.machines is not None,
         stopping=tick.intent.stopping,
@@ -382,8 +360,6 @@ def of_tick(
             machine.usd_per_hour
             for machine in (*(one.machine for one in judged), *observed.gateway, *observed.standbys)
         ),
-        usd_to_date=usd_to_date,
-        credentials_end_at=credentials_end_at,
         excluded=sorted(tick.intent.excluded),
         notes=[words(note) for note in said],
         reasons=said,

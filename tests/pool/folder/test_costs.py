@@ -22,7 +22,7 @@ def machine(slot: int = 0, place: Placement = SPOT, **changes: object) -> Machin
 
 
 def book(folder: Path) -> CostBook:
-    return CostBook(path_of(folder, "perception", UID), "perception", UID)
+    return CostBook(folder, "perception", UID)
 
 
 def test_each_day_and_replica_is_charged_at_the_price_of_its_time(tmp_path: Path):

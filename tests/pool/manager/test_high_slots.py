@@ -128,7 +128,7 @@ def seen() -> status.PoolStatus:
     admitted = Membership("pool", UID, 1, 1, tuple(Member(id, "") for id in listed))
     tick = Tick(IDENTITY, wanted, world.intent, world.observed, world.plan(), admitted)
     report = proxy_report.ProxyReport(7, NOW)
-    found = status.of_tick(tick, history=world.history, recent=[], epoch=1, manager_pid=1)
+    found = status.of_tick(tick, history=world.history, recent=[])
     return found.joined(report, proxy_alive=True, links=world.observed.links)
 
 

@@ -62,7 +62,7 @@ def test_the_phases_of_a_launch_are_told_as_far_as_they_are_known() -> None:
         decided = plan(UID, spec(), Intent(), observed, history)
         identity = Identity("pool", UID, "sky", "/pool.yaml", NOW)
         tick = Tick(identity, spec(), Intent(), observed, decided, None)
-        seen = status.of_tick(tick, history=history, recent=[], epoch=1, manager_pid=1)
+        seen = status.of_tick(tick, history=history, recent=[])
         [one] = seen.replicas
         assert (one.provisioning_s, one.setup_s, one.starting_s, one.ready_after_s) == told
 
@@ -117,8 +117,6 @@ def status_of(world: World, **others: Any) -> status.PoolStatus:
         tick_of(world),
         history=world.history,
         recent=[Event(NOW, EventKind.LAUNCH, 0, 1, "c/r/a", Reason(Cause.NEW_SLOT))],
-        epoch=3,
-        manager_pid=11,
         **others,
     )
     report = proxy_report.parse(REPORT, UID)
