@@ -147,8 +147,6 @@ def gateway(config: Config, listen: Listen = None, metrics: Metrics = None) -> N
     process.run(config, listen=listen, metrics=metrics)
 
 
-# -- started by systemd ------------------------------------------------------------------
-
 System = Annotated[
     bool, typer.Option("--system", help="System units instead of user units; needs root.")
 ]

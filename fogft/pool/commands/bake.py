@@ -21,12 +21,7 @@ _DOCKER = "docker:"
 def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
     """Build an image of a pool file, and push it. Docker's own words go to this process's stderr.
 
-    Args:
-        base: What it is built on; None for the pool file's own image, else plain Ubuntu.
-
-    Raises:
-        SpecError: The pool file runs on no real cloud, or cannot be baked.
-        CloudError: Docker is not there, or fails.
+    `base` is what it is built on; None for the pool file's own image, else plain Ubuntu.
     """
     text = read_text(file)
     spec = parse(text, file=str(file))

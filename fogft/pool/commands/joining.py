@@ -31,7 +31,6 @@ from fogft.pool.credentials import bundle, claiming
 from fogft.pool.credentials.authority import Credential
 from fogft.pool.credentials.bundle import Label
 from fogft.pool.credentials.ledger import Ledger
-from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
 from fogft.pool.manager import configuration
 from fogft.poolfile import yaml_tree
@@ -50,11 +49,9 @@ _FLAT = (Role.REPLICA, Role.RENDEZVOUS)  # their credentials lie beside their co
 
 @dataclass(frozen=True)
 class Joined:
-    """The result of a `join`.
+    """The result of a `join`: ``fogft <command> --config <config>`` starts it.
 
-    Attributes:
-        config: The configuration to start with: ``fogft <command> --config <config>``.
-        alone: No rendezvous tells it of what changes, nor told whether it is the first to join.
+    `alone`: no rendezvous tells it of what changes, nor told whether it is the first to join.
     """
 
     holder: Holder
@@ -128,7 +125,7 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
         files["rendezvous.yaml"] = configuration.rendezvous_config(identity)
     else:
         files[f"{_COMMANDS.get(holder.role, 'proxy')}.yaml"] = configuration.proxy_config(
-            PoolPaths(Path()), identity, spec, name=holder.name, role=holder.role
+            identity, spec, name=holder.name, role=holder.role
         )
         membership = store.membership()
         if membership is not None:

@@ -54,12 +54,7 @@ def export(
     The client proxy of this machine goes on, so that requests are answered meanwhile; where a
     service is stateful it ends, since only one robot may order its requests.
 
-    Args:
-        root: The folder of all of fogft's state.
-        open_for_s: How long the file can be imported.
-
-    Raises:
-        FogftError: The file exists or cannot be written: the pool is managed here as before.
+    Where the file exists or cannot be written, the pool is managed here as before.
     """
     bundle.check_passphrase(passphrase)
     if file.exists():
@@ -120,9 +115,7 @@ def import_(
 ) -> PoolStore:
     """Take over a pool from its file, and delete the file; return it, still without a manager.
 
-    Args:
-        root: The folder of all of fogft's state.
-        pool_file: The pool file on this machine: relative paths in it start at its folder.
+    Relative paths in `pool_file`, the pool file on this machine, start at its folder.
     """
     label, content = bundle.open_sealed(joining.read(file), passphrase, now)
     if label.holder.role is not Role.MANAGER:

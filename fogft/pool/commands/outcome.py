@@ -80,12 +80,7 @@ class Awaited:
 
 @dataclass(frozen=True)
 class Settled:
-    """The condition that `scale` and `drain` wait for: all replicas ready, none leaving.
-
-    Attributes:
-        since: When the change was written, in seconds since the epoch.
-        gone: Slot and generation of the replica that was to be replaced; None for no one.
-    """
+    """What `scale` and `drain` wait for: all replicas ready, none leaving, and not `gone` there."""
 
     since: float
     gone: tuple[int, int] | None = None

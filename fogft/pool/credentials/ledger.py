@@ -4,8 +4,6 @@
 leaves this module, so nothing that the CA ever signed is missing from the list, and no generation
 of a name is used twice. What cannot be written down was not done, and raises `StateError`; what
 cannot be certified raises `CredentialError`.
-
-Not here: making certificates (`authority`), telling others of a revocation (`manager`).
 """
 
 import time

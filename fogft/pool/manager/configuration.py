@@ -29,6 +29,7 @@ from fogft.pool.folder.store import Identity
 from fogft.pool.manager.reconciler import bare_order
 from fogft.poolfile import config_file
 
+_BESIDE = PoolPaths(Path())  # files in the folder of a configuration
 # What a certificate lasts beyond the end of a pool that has one.
 MARGIN_DAYS = 30.0
 _CLIENT_HEADING = (
@@ -63,7 +64,7 @@ def robot_name() -> str:
 
 def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> bool:
     """Update the client proxy's configuration; return whether it changed."""
-    content = proxy_config(paths, identity, spec)
+    content = proxy_config(identity, spec)
     if disk.read_bytes(paths.proxy_config) == content.encode():
         return False
     disk.write_whole(paths.proxy_config, content)
@@ -71,31 +72,26 @@ def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> 
 
 
 def proxy_config(
-    paths: PoolPaths,
-    identity: Identity,
-    spec: PoolSpec,
-    *,
-    name: str = "",
-    role: Role = Role.ROBOT,
+    identity: Identity, spec: PoolSpec, *, name: str = "", role: Role = Role.ROBOT
 ) -> str:
     """Return a client proxy's configuration, or a gateway's; this robot's unless named."""
     config = ClientProxyConfig(
         pool=identity.name,
         pool_uid=identity.uid,
         robot=name or robot_name(),
-        membership=Path(paths.membership.name),
-        status=Path(paths.proxy_status.name),
-        lock=Path(paths.proxy_lock.name),
-        credentials=CredentialPaths.of(Path(paths.credentials.name), role.value),
+        membership=_BESIDE.membership,
+        status=_BESIDE.proxy_status,
+        lock=_BESIDE.proxy_lock,
+        credentials=CredentialPaths.of(_BESIDE.credentials, role.value),
         services=spec.proxied,
         suspect_after_s=spec.health.suspect_after_s,
         rendezvous=spec.rendezvous,
-        records=Path(paths.records.name),
+        records=_BESIDE.records,
     )
     if role is Role.ROBOT:  # a gateway's replicas hear the manager through a rendezvous
         config = replace(
             config,
-            announcements=Path(paths.announcements.name),
+            announcements=_BESIDE.announcements,
             rmw=spec.rmw.robot,
             topics=spec.topics,
         )
@@ -211,7 +207,7 @@ def gateway_order(
         credentials=CredentialPaths.of(Path(), "replica"),
         rendezvous=(near,),
         records=Path("records.json"),
-        announcements=Path(paths.announcements.name),
+        announcements=_BESIDE.announcements,
         rmw=spec.rmw.replica,
     )
     files["replica.yaml"] = config_file.document(replica, _REPLICA_HEADING).encode()
@@ -247,7 +243,7 @@ def replica_config(
         envs={str(k): "" if v is None else str(v) for k, v in envs.items()},
         rendezvous=spec.rendezvous,
         records=Path("records.json"),
-        announcements=Path(PoolPaths(Path()).announcements.name) if announcements else None,
+        announcements=_BESIDE.announcements if announcements else None,
         dial_out=(spec.dial_in,) if spec.dial_in else (),
         # Those that the manager launches may share an address; others have one of their own.
         metrics=spec.metrics.of_replica(id.slot if id.slot < FIRST_BY_HAND else 0),

@@ -71,11 +71,9 @@ def estimated_rtt_s(here: tuple[float, float], there: tuple[float, float]) -> fl
 
 @dataclass(frozen=True)
 class Distance:
-    """A round trip and its source.
+    """A round trip and its source: ``pool file``, ``links``, ``measured`` or ``estimated``.
 
-    Attributes:
-        source: ``pool file``, ``links``, ``measured`` or ``estimated``.
-        as_of: When it was measured, in seconds since the epoch; 0 where that means nothing.
+    `as_of` is when it was measured, in seconds since the epoch; 0 where that means nothing.
     """
 
     rtt_s: Annotated[float, within(1e-9, 60)]

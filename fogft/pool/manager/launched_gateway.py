@@ -24,13 +24,7 @@ ASK_EVERY_S = 10.0
 
 @dataclass
 class LaunchedGateway:
-    """The gateway of one pool, for its reconciler.
-
-    Attributes:
-        is_up: Whether the robot reaches it at a time.
-        order: Makes the order of its machine, with a generation.
-        place: Stores the host that it is at.
-    """
+    """The gateway of one pool; `is_up`: the robot reaches it at a time; `place` stores its host."""
 
     cloud: Cloud
     is_up: Callable[[float], bool]

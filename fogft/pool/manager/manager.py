@@ -323,8 +323,6 @@ class Manager:
         self._tally.seen(seen.replicas, tick.observed.now)
         self._report.write(seen.to_json())
 
-    # -- waiting ----------------------------------------------------------------------------
-
     def _rest(self, stop: threading.Event) -> None:
         """Wait for the next tick, or for something to react to."""
         end = time.monotonic() + TICK_S

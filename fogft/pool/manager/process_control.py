@@ -30,11 +30,8 @@ def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0)
     """End the process that holds a lock by SIGTERM, then SIGKILL; return its pid, or None.
 
     Returns when it is gone, not only its lock: a process lets go of what it holds, and may
-    hang only then. Another that waited for the lock may hold it by then.
-
-    Args:
-        only: End no other process than this one: then None is returned.
-        patience_s: How long each signal is given.
+    hang only then. Another that waited for the lock may hold it by then. `only` is the one process
+    that may be ended; each signal is given `patience_s`.
     """
     pid = disk.holder(lock)
     if pid is None or pid == os.getpid() or only not in (None, pid):

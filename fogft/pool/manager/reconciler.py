@@ -98,11 +98,8 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
 class Reconciler:
     """Reconciles one pool with its spec.
 
-    Args:
-        by_hand: Replicas that people start themselves, and that are still let in.
-        gateways: Name -> generations of its certificates that are good.
-        gateway: The gateway that the pool may launch; None where it cannot.
-        distances: Says how far regions are from the robot, of what is sold and what runs.
+    `by_hand` are the replicas that are still let in; `gateways` has the generations of each one's
+    good certificates, by name; `gateway` is the one that the pool may launch.
     """
 
     def __init__(
@@ -167,11 +164,13 @@ class Reconciler:
             self._remember.losses(observed)
             self._ask_about_silent(observed, history)
             health, judged_at = judge(identity.uid, spec, observed, history), history.version
-            self._remember.health(health, history, observed.now)
+            self._remember.health(health, history)
         if history.version != judged_at:  # it remembers more now: judge by all of it
             health = None
         begun_at = lifetime.begun_at(intent, identity.created_at, history)
-        trouble += [*lifetime.notes(spec, begun_at, observed.now), *self._time.notes]
+        trouble += lifetime.notes(spec, begun_at, observed.now)
+        if observed.doubt_s:
+            trouble.append(Reason(Cause.CLOCK_DOUBTED, seconds=observed.doubt_s))
         over = lifetime.is_over(spec, begun_at, observed.now)
         if over:
             intent = replace(intent, stopping=True)
@@ -197,8 +196,6 @@ class Reconciler:
         return Tick(
             identity, spec, intent, observed, decided, self._membership, over, update, trial.file
         )
-
-    # -- observe ----------------------------------------------------------------------------
 
     def _settle_outcomes(self) -> None:
         for outcome in self.operations.collect():
@@ -276,8 +273,6 @@ class Reconciler:
                     return ()
         return self._offers
 
-    # -- the launched gateway ---------------------------------------------------------------
-
     def _tend_gateway(
         self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
     ) -> Reason | None:
@@ -306,8 +301,6 @@ class Reconciler:
             self._order(order, Reason(Cause.NEW_SLOT))
         there = step.host and spec.dial_in == spec.gateway.endpoints(step.host)[2]
         return None if there or not spec.gateway.launch else step.note
-
-    # -- apply ------------------------------------------------------------------------------
 
     def _apply(
         self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan, history: History

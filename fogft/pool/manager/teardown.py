@@ -22,10 +22,7 @@ ASK_AGAIN_S = 1.0
 class Known:
     """The machines recorded in a pool's folder, in case its cloud does not answer.
 
-    Attributes:
-        running: Replicas that were launched and have not ended as far as was seen, in words.
-        clouds: Where any were ever launched.
-        unmanaged_max_hours: When replicas without a manager end by themselves; None if not known.
+    `running` have not ended as far as was seen, in words; any were ever launched in `clouds`.
     """
 
     pool: str

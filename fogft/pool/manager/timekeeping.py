@@ -21,7 +21,11 @@ from fogft.reason_words import words
 
 
 class Remembering:
-    """Adds to a pool's history. Events are on disk before a method returns, or `StateError`."""
+    """Adds to a pool's history. Events are on disk before a method returns, or `StateError`.
+
+    `clock` gives the observation's time: the plan that follows must not take a loss for something
+    of the future, and go to the same place again.
+    """
 
     def __init__(self, store: PoolStore, clock: Callable[[], float]) -> None:
         self._store = store
@@ -36,21 +40,16 @@ class Remembering:
         location: str = "",
         reason: Reason | None = None,
         on_demand: bool = False,
-        at: float | None = None,
         version: str = "",
     ) -> None:
-        """Add one event, by default with the current time."""
-        when = self._clock() if at is None else at
+        """Add one event."""
+        at = self._clock()
         self._store.append(
-            Event(when, kind, id.slot, id.generation, location, reason, on_demand, version=version)
+            Event(at, kind, id.slot, id.generation, location, reason, on_demand, version=version)
         )
 
     def losses(self, observed: Observed) -> None:
-        """Record replicas that are no longer listed. The cloud's list must be known.
-
-        The loss has the observation's time: the plan that follows must not take it for something
-        of the future, and go to the same place again.
-        """
+        """Record replicas that are no longer listed. The cloud's list must be known."""
         uid = self._store.identity().uid
         ids = [m.id for m in (*(observed.machines or ()), *observed.gateway)]
         listed = {(id.slot, id.generation) for id in ids if id.pool_uid == uid}
@@ -60,9 +59,9 @@ class Remembering:
                 kind = EventKind.ENDED if record.ending else EventKind.GONE
                 log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
                 why = None if record.ending else self._leaving.get(id, Reason(Cause.NOT_LISTED))
-                self.add(kind, id, reason=why, at=observed.now)
+                self.add(kind, id, reason=why)
 
-    def health(self, health: Health, history: History, now: float) -> None:
+    def health(self, health: Health, history: History) -> None:
         """Record replicas that became ready, became unready or failed."""
         leaving = (judged for judged in health.replicas if judged.verdict is Verdict.LEAVING)
         self._leaving = {judged.id: judged.fault for judged in leaving if judged.fault}
@@ -76,7 +75,6 @@ class Remembering:
                     id,
                     location=place.location,
                     on_demand=not place.spot,
-                    at=now,
                     version=machine.spec_hash,
                 )
                 record = history.record(id.slot, id.generation)
@@ -85,13 +83,13 @@ class Remembering:
             if judged.serving:
                 if record.first_ready_at is None or record.unready_since:
                     log.info("replica_ready replica=%s zone=%s", id.short, record.location)
-                    self.add(EventKind.READY, id, at=now)
+                    self.add(EventKind.READY, id)
             elif record.first_ready_at and not record.unready_since and judged.answers:
                 log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
-                self.add(EventKind.UNREADY, id, at=now)
+                self.add(EventKind.UNREADY, id)
             if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
                 log.warning("replica_failed replica=%s reason=%r", id.short, words(judged.why))
-                self.add(EventKind.FAILED, id, reason=judged.why, at=now)
+                self.add(EventKind.FAILED, id, reason=judged.why)
 
 
 log = logging.getLogger(__name__)
@@ -132,13 +130,6 @@ class Timekeeping:
     def doubt_s(self) -> float:
         """By how much the clock was just set; see `Observed.doubt_s`."""
         return self._watch.doubt_s
-
-    @property
-    def notes(self) -> list[Reason]:
-        """Notes about a changed clock."""
-        if not self.doubt_s:
-            return []
-        return [Reason(Cause.CLOCK_DOUBTED, seconds=self.doubt_s)]
 
 
 _QUICK_S = 0.1
