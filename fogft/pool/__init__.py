@@ -1,4 +1,1 @@
-"""Pools: the manager, the commands, the folder and the credentials.
-
-Not here: what to launch or end (`fogft.planning`), requests (`fogft.proxy`).
-"""
+"""Pools: manager, commands, folder, credentials. Not here: what to launch (`fogft.planning`)."""

@@ -1,4 +1,1 @@
-"""What `up`, `scale`, `join`, `sweep`, ... do to a pool.
-
-Not here: their text (`fogft.cli`).
-"""
+"""What `up`, `scale`, `join`, `sweep`, ... do to a pool. Not here: their text (`fogft.cli`)."""

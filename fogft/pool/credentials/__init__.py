@@ -1,4 +1,1 @@
-"""The pool's certificate authority, its ledger, and bundles that let machines join.
-
-Not here: using a certificate (`fogft.link.zenoh`).
-"""
+"""A pool's CA, its ledger, and join bundles. Not here: using a certificate (`fogft.link.zenoh`)."""

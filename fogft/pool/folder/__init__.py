@@ -1,4 +1,1 @@
-"""A pool on disk: who writes which file, see `PoolPaths`.
-
-Not here: what is written (`fogft.pool.manager`).
-"""
+"""A pool on disk: who writes which file, see `PoolPaths`."""

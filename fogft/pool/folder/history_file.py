@@ -21,21 +21,25 @@ COMPACT_AFTER = 20_000
 
 
 class HistoryFile:
-    """The events of one pool. Safe to use from several threads; one process writes it."""
+    """The events of one pool. Safe to use from several threads; one process writes it.
+
+    `heard` is called with each event, once it is written.
+    """
 
     def __init__(self, path: Path, clock: Callable[[], float]) -> None:
         self._path = path
         self._clock = clock
         self._lock = threading.Lock()
-        self._history: History | None = None
+        self._known: History | None = None
         self._appended = 0
+        self.heard: Callable[[Event], object] = lambda _: None
 
     def history(self) -> History:
         """Return the history so far."""
         with self._lock:
-            if self._history is None:
-                self._history = History(self._load())
-            return self._history
+            if self._known is None:
+                self._known = History(self._load())
+            return self._known
 
     def append(self, event: Event) -> None:
         """Append an event; it is on disk when this returns."""
@@ -51,9 +55,10 @@ class HistoryFile:
             history.add(event)
             self._appended += 1
             if self._appended >= COMPACT_AFTER:
-                self._history = History(self._load())
+                self._known = History(self._load())
+        self.heard(event)
 
-    def recent(self, count: int) -> list[Event]:
+    def recent(self, count: int = 20) -> list[Event]:
         """Return the last events, oldest first."""
         return _read_events(self._path)[-count:]
 

@@ -19,7 +19,6 @@ from fogft.model.names import POOL_NAME_PATTERN, PoolUid
 from fogft.model.plain import Count, to_plain
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
-from fogft.planning.observed.history import Event, History
 from fogft.planning.observed.services import Discovered
 from fogft.planning.rollout import Trial
 from fogft.pool.folder.history_file import HistoryFile
@@ -52,7 +51,7 @@ class GatewayPlace:
     host: str = ""
 
 
-class PoolStore:
+class PoolStore(HistoryFile):
     """A pool's folder. Safe to use from several threads; one process writes each file.
 
     What cannot be written raises `StateError`; where there is no such pool, `PoolNotFound`.
@@ -69,8 +68,7 @@ class PoolStore:
     ) -> None:
         self.paths = paths
         self._parse = parse
-        self._events = HistoryFile(paths.history, clock)
-        self.heard: Callable[[Event], object] = lambda _: None  # each event, once it is written
+        super().__init__(paths.history, clock)
         self._spec: tuple[bytes, PoolSpec] | None = None
         self._good: tuple[bytes, PoolSpec] | None = None
 
@@ -166,19 +164,6 @@ class PoolStore:
     def write_intent(self, intent: Intent) -> None:
         """Store the user's changes; the caller holds `intent_lock`."""
         disk.write_json(self.paths.intent, to_plain(intent))
-
-    def history(self) -> History:
-        """Return the history so far."""
-        return self._events.history()
-
-    def append(self, event: Event) -> None:
-        """Append an event; it is on disk when this returns."""
-        self._events.append(event)
-        self.heard(event)
-
-    def recent(self, count: int = 20) -> list[Event]:
-        """Return the last events, oldest first."""
-        return self._events.recent(count)
 
     def place_gateway(self, host: str) -> None:
         """Store where the launched gateway is: from now on `spec` is behind it."""

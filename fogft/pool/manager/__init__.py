@@ -1,4 +1,1 @@
-"""The manager of one pool: observe, plan, apply, once a second.
-
-Not here: what to launch or end (`fogft.planning`).
-"""
+"""The manager of one pool: observe, plan, apply. Not here: what to launch (`fogft.planning`)."""
