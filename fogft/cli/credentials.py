@@ -14,7 +14,7 @@ from fogft import disk
 from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolOption
-from fogft.cli.status_text import utc
+from fogft.cli.status_text import show_table, utc
 from fogft.errors import CredentialError, FogftError
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
@@ -97,7 +97,7 @@ def list_(as_json: AsJson = False, pool: PoolOption = None) -> None:
         for e in entries
     ]
     names = ("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL")
-    output.table(names, rows)
+    show_table(names, rows)
 
 
 @credentials.command(cls=Command, epilog="fogft credentials revoke robot ada")

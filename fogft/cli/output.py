@@ -11,7 +11,7 @@ import os
 import re
 import select
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import IO, TYPE_CHECKING, Any
 
 import typer
@@ -46,13 +46,6 @@ def show(*parts: RenderableType, stream: IO[str] | None = None, folds: bool = Tr
     stream = stream or sys.stdout
     stream.write(_drawn(stream, *parts, limit=width(stream) if folds else None) + "\n")
     stream.flush()
-
-
-def table(header: Iterable[str], rows: Iterable[Iterable[str | Text]], **layout: Any) -> None:
-    """Write a table to stdout, folded to its width; `layout` as in `fogft.cli.table`."""
-    from fogft.cli.table import table
-
-    show(table(header, rows, width=width(sys.stdout), **layout))
 
 
 def cell(text: str, style: str = "") -> Text:

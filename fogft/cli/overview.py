@@ -12,7 +12,7 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import AsJson, PoolArgument, PoolOption
-from fogft.cli.status_text import age, price
+from fogft.cli.status_text import age, price, show_table
 from fogft.errors import PoolNotFound, StateError
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import PoolPaths, home
@@ -64,7 +64,7 @@ def list(as_json: AsJson = False) -> None:
         output.json_data([*found.values()])
     elif rows:
         names = ("POOL", "ANSWERS", "READY", "CLOUD", "$/H", "SEEN", "FILE")
-        output.table(names, rows, right=("$/H", "SEEN"), folds=("FILE",))
+        show_table(names, rows, right=("$/H", "SEEN"), folds=("FILE",))
     else:
         output.say("no pools on this machine")
         output.hint("start one with `fogft up FILE`")
@@ -90,7 +90,7 @@ def events(
         output.json_data([to_plain(one) for one in _last_events(store, count)])
         return
     names = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
-    output.table(names, event_rows(store, count), folds=("LOCATION", "WHY"))
+    show_table(names, event_rows(store, count), folds=("LOCATION", "WHY"))
 
 
 def event_rows(store: PoolStore, count: int) -> Sequence[Sequence[str]]:
@@ -171,7 +171,7 @@ def _show_costs(found: Sequence[Costs]) -> None:
             for one in costs.spent
         )
     names = ("POOL", "DAY", "REPLICA", "LOCATION", "INSTANCE", "HOURS", "$")
-    output.table(names, rows, right=("HOURS", "$"), folds=("LOCATION",))
+    show_table(names, rows, right=("HOURS", "$"), folds=("LOCATION",))
     output.data("")
     for costs in found:
         output.data(f"{costs.pool}: {price(costs.usd)}")

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from fogft.cli import output
-from fogft.cli.status_text import age
+from fogft.cli.status_text import age, show_table
 from fogft.model.plain import to_plain
 from fogft.reason_words import words
 
@@ -33,13 +33,13 @@ def show(shown: PlanShown, *, everything: bool = False) -> None:
     listed = found if everything else _best_of_regions(found)
     rows = [_row(shown, one) for one in listed]
     folds = ("LOCATION", "PRICE", "WHY NOT")
-    output.table(_HEADER, rows, right=("$/H", "RTT", "LOST"), folds=folds)
+    show_table(_HEADER, rows, right=("$/H", "RTT", "LOST"), folds=folds)
     if len(listed) < len(found):
         output.data(f"and {len(found) - len(listed)} more offers in these regions (--all)")
     output.data("")
     if everything and shown.clouds:
         clouds = [(name, "no" if why else "yes", why) for name, why in shown.clouds.items()]
-        output.table(("CLOUD", "FITS", "WHY NOT"), clouds, folds=("WHY NOT",))
+        show_table(("CLOUD", "FITS", "WHY NOT"), clouds, folds=("WHY NOT",))
         output.data("")
     for line in _summary(shown):
         by = 4 if line.startswith(" ") else _MARGIN

@@ -11,7 +11,7 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import AsJson, Cloud, Plot
-from fogft.cli.status_text import age
+from fogft.cli.status_text import age, show_table
 
 if TYPE_CHECKING:
     from rich.text import Text
@@ -96,7 +96,7 @@ HEADER = (
 
 
 def _show(report: Report) -> None:
-    output.table(HEADER, [_cells(row, report) for row in report.rows], right=HEADER[1:])
+    show_table(HEADER, [_cells(row, report) for row in report.rows], right=HEADER[1:])
     scenario = report.scenario
     kind = "recorded" if scenario.recorded else "simulated"
     output.data(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from fogft.cli import output
 from fogft.cli.output import cell
 
 if TYPE_CHECKING:
@@ -289,6 +291,13 @@ def _gateway(gateway: Mapping[str, Any], link: Mapping[str, Any] | None) -> Text
         if link.get("detail"):
             words.append(cell(link["detail"]))
     return _joined(words)
+
+
+def show_table(header: Iterable[str], rows: Iterable[Iterable[str | Text]], **layout: Any) -> None:
+    """Write a table to stdout, folded to its width; `layout` as in `fogft.cli.table`."""
+    from fogft.cli.table import table
+
+    output.show(table(header, rows, width=output.width(sys.stdout), **layout))
 
 
 def utc(seconds: float) -> str:

@@ -9,7 +9,7 @@ import typer
 
 from fogft.cli import output
 from fogft.cli.options import Yes
-from fogft.cli.status_text import age, price
+from fogft.cli.status_text import age, price, show_table
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
@@ -78,4 +78,4 @@ def _show(found: Swept) -> None:
         rows.append((str(machine.id), machine.placement.location, costs, age(age_s), one.why))
     if rows:
         names = ("MACHINE", "LOCATION", "$/H", "AGE", "WHY")
-        output.table(names, rows, folds=("WHY", "LOCATION"), titled=False)
+        show_table(names, rows, folds=("WHY", "LOCATION"), titled=False)

@@ -1,1 +1,1 @@
-"""A pool on disk: who writes which file, see `PoolPaths`."""
+"""A pool on disk; `PoolPaths` says who writes what. Not here: why (`fogft.pool.manager`)."""

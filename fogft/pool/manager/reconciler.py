@@ -185,9 +185,7 @@ class Reconciler:
                 spec, trial, decided.health, wanted=decided.wanted, now=observed.now
             )
         trouble += [update.reason] if update is not None else []
-        decided = decided._replace(notes=tuple(map(self._with_log, decided.notes)))
-        if trouble:
-            decided = decided._replace(notes=(*decided.notes, *trouble))
+        decided = decided._replace(notes=(*map(self._with_log, decided.notes), *trouble))
         if observed.machines is not None:
             awaited = self._tend_gateway(spec, intent, observed, history)
             if awaited is not None:
