@@ -22,7 +22,7 @@ from fogft.model.replica import Membership, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
 from fogft.proxy.robot.dispatcher import Dispatcher, Wake
-from fogft.proxy.robot.links import Define, Links, TypeCheck
+from fogft.proxy.robot.links import Define, Links, TypeCheck, best_of, link_report, seen_through
 from fogft.proxy.robot.proxied_service import ProxiedService
 from fogft.proxy.robot.sending import key_of
 from fogft.proxy.robot.topics import Merge, TopicsOnRobot
@@ -267,7 +267,7 @@ class ClientProxy:
         links = list(self.links)
         self._topics.route({key_of(link): link for link in links})
         differ = {link.peer.id: self._differences(link) for link in links}
-        versions = self.links.versions()
+        versions = {id: member.version for id, member in self.links.members.items()}
         leaving = frozenset(link.peer.id for link in links if self.links.draining(link))
         hanging = self.links.hanging()
         for service in self._services.values():
@@ -298,7 +298,20 @@ class ClientProxy:
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return the links to replicas, those behind gateways included, and those to gateways."""
         dispatchers = [service.dispatcher for service in self._services.values()]
-        return self.links.reports(dispatchers, self._differences, self._topics.misreads)
+        replicas, gateways, behind = [], [], []
+        for link in sorted(self.links, key=lambda link: link.peer.id):
+            member = self.links.members[link.peer.id]
+            report = link_report(
+                *(link, dispatchers, self._differences(link)),
+                draining=self.links.draining(link),
+                misread=self._topics.misreads(key_of(link)),
+            )
+            if not member.gateway:
+                replicas.append(report)
+                continue
+            gateways.append({"name": member.gateway, "endpoint": member.endpoint, **report})
+            behind += seen_through(link.status(), member.gateway)
+        return [*replicas, *best_of(behind)], gateways
 
     def behind(self) -> tuple[GatewayView, ...]:
         """Return the state of each replica, as a gateway reports it to its robots."""

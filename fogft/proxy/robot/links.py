@@ -184,7 +184,7 @@ class Links:
         self._events = events
         self._keys = keys
         self._links: dict[ReplicaId, Link] = {}
-        self._members: dict[ReplicaId, Member] = {}
+        self.members: dict[ReplicaId, Member] = {}
 
     def __iter__(self) -> Iterator[Link]:
         """Go over all of them; safe while another thread changes them."""
@@ -192,15 +192,15 @@ class Links:
 
     def reach(self, member: Member) -> None:
         """Ensure a link to a member; redial it if it has moved."""
-        old = self._members.get(member.id)
-        self._members[member.id] = member
+        old = self.members.get(member.id)
+        self.members[member.id] = member
         if old is None or old.endpoint != member.endpoint:
             self._dial(member)
 
     def redial(self) -> None:
         """Redial all replicas; requests in flight are sent again."""
         for id in list(self._links):
-            self._dial(self._members[id])
+            self._dial(self.members[id])
 
     def _dial(self, member: Member) -> None:
         id, old = member.id, self._links.get(member.id)
@@ -213,17 +213,13 @@ class Links:
 
     def remove(self, id: ReplicaId) -> Link:
         """Remove a link; close it once no route uses it."""
-        self._members.pop(id, None)
+        self.members.pop(id, None)
         log.info("link_dropped replica=%s", id.short)
         return self._links.pop(id)
 
     def draining(self, link: Link) -> bool:
         """Whether a replica is draining, by its own report or the manager's."""
-        return link.draining or self._members[link.peer.id].draining
-
-    def versions(self) -> dict[ReplicaId, str]:
-        """Return the version of each member."""
-        return {id: member.version for id, member in self._members.items()}
+        return link.draining or self.members[link.peer.id].draining
 
     @property
     def silent_together(self) -> bool:
@@ -254,25 +250,3 @@ class Links:
     def types(self) -> dict[str, Definition]:
         """Return the type definitions reported by most replicas."""
         return {name: max(all_of, key=all_of.count) for name, all_of in self.told().items()}
-
-    def reports(
-        self,
-        dispatchers: Collection[Dispatcher],
-        differences: Callable[[Link], Mapping[str, str]],
-        misreads: Callable[[int], bool],
-    ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Return the links to replicas, those behind gateways included, and those to gateways."""
-        replicas, gateways, behind = [], [], []
-        for id, link in sorted(self._links.items()):
-            member = self._members[id]
-            report = link_report(
-                *(link, dispatchers, differences(link)),
-                draining=self.draining(link),
-                misread=misreads(key_of(link)),
-            )
-            if not member.gateway:
-                replicas.append(report)
-                continue
-            gateways.append({"name": member.gateway, "endpoint": member.endpoint, **report})
-            behind += seen_through(link.status(), member.gateway)
-        return [*replicas, *best_of(behind)], gateways
