@@ -302,8 +302,7 @@ class OrderedReplica(Generic[T]):
         out = self._give_up(Refusal.CRASHED)
         if self._work is not None:
             out += [Refuse(to, Refusal.CRASHED) for to in self._work.waiting]
-        out += [Refuse(to, Refusal.NOT_READY) for to in self._claims]
-        self._work, self._claims = None, []
+        self._work = None
         self.position, self.sound, self.joined, self.serving = START, True, False, False
         self._forget_answers()
         return out

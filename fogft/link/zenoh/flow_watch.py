@@ -11,6 +11,7 @@ from fogft.link.zenoh import sockets
 from fogft.link.zenoh.sockets import Address, OwnSocket
 
 THIN_BYTES_PER_S = 2_000_000.0  # below, what is large is kept short in the kernel
+_END_WITHIN_S = 1.0  # so long a closed connection may still flow
 _LOOK_AGAIN_S = 0.002
 _QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
 
@@ -44,15 +45,13 @@ class FlowWatch:
                 self._kept_short = True
         return moved_s
 
-    def end_when_safe(
-        self, sending: Callable[[], bool], asked: Callable[[], bool], within_s: float
-    ) -> None:
+    def end_when_safe(self, sending: Callable[[], bool], asked: Callable[[], bool]) -> None:
         """End the connection where something large may be on its way, either way; may block.
 
         Zenoh's thread and a sender may wait for each other where an end meets a flow: see
         `docs/design/links.md`. So what flows fast is let through, and what is stuck is ended.
         """
-        deadline = time.monotonic() + within_s
+        deadline = time.monotonic() + _END_WITHIN_S
         received, quiet_since = -1, 0.0
         while time.monotonic() < deadline:
             connection = self._socket.borrow()

@@ -37,10 +37,7 @@ def is_this() -> bool:
 
 
 WAIT_S = 2.0
-
 _leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
-
-
 join_at_exit = _leaving.add  # have the process wait for a thread that is about to end
 
 

@@ -55,22 +55,18 @@ class Shared:
         return Signer(self.credentials.certificate, self.credentials.key)
 
 
-_ALL = zenoh.QueryTarget.ALL
 # NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
 # last replica has answered. Kept true by tests/link/zenoh/robot/test_first_reply_is_not_held_back.
 _AT_ONCE = zenoh.ConsolidationMode.NONE
-_END_WITHIN_S = 1.0  # so long a closed connection may still flow
 _ANSWERS_TIMEOUT_S = 1e9  # for as long as the connection
-
+_PROBE_TIMEOUT_S = 60.0  # on a thin uplink a probe waits behind what is large
+_TELL_RECORDS_TIMEOUT_S = 5.0
 
 _REFUSED = {
     Refusal.REVOKED: "our certificate is revoked",
     Refusal.NOT_ADMITTED: "the replica refuses us: our certificate does not allow requests",
     Refusal.EXPIRED_CERTIFICATE: "our certificate is not valid now, by the replica's clock",
 }
-
-
-_TELL_RECORDS_TIMEOUT_S = 5.0
 
 
 class Connection:
@@ -102,7 +98,7 @@ class Connection:
         self.lost_because = ""
         self.told, self.told_at = b"", 0.0  # the records that the replica has taken, and when
         self._session = zenoh.open(config)
-        self._get = partial(self._session.get, target=_ALL, consolidation=_AT_ONCE)
+        self._get = partial(self._session.get, target=zenoh.QueryTarget.ALL, consolidation=_AT_ONCE)
         # The link's thread must not wait behind what is stuck: a lost probe is an unanswered one.
         self._ask = partial(self._get, congestion_control=zenoh.CongestionControl.DROP)
         try:
@@ -199,9 +195,7 @@ class Connection:
         except zenoh.ZError:
             return False
 
-    def probe(
-        self, key: str, payload: bytes, timeout_s: float, heard: Callable[[bytes], None]
-    ) -> None:
+    def probe(self, key: str, payload: bytes, heard: Callable[[bytes], None]) -> None:
         """Send a probe ahead of all requests; `heard` gets the answer's bytes, if any."""
 
         def on_reply(reply: zenoh.Reply) -> None:
@@ -214,7 +208,7 @@ class Connection:
         self._ask(
             key,
             handlers.Callback(on_reply, indirect=False),
-            timeout=timeout_s,
+            timeout=_PROBE_TIMEOUT_S,
             payload=payload,
             attachment=self._greeting,
             priority=zenoh.Priority.INTERACTIVE_HIGH,
@@ -259,9 +253,7 @@ class Connection:
     def _end_flow(self) -> None:
         attempts = self.attempts
         try:
-            self.flow.end_when_safe(
-                lambda: attempts.sending, lambda: attempts.awaits_answers, _END_WITHIN_S
-            )
+            self.flow.end_when_safe(lambda: attempts.sending, lambda: attempts.awaits_answers)
         finally:
             attempts.end()
 

@@ -52,9 +52,6 @@ class Silence:
         return 0.0 if self._since is None else max(0.0, now - self._since)
 
 
-_TIMEOUT_S = 60.0  # on a thin uplink a probe waits behind what is large
-
-
 # Over which connection an answer came, its bytes, when its probe was sent, and when it came.
 Heard = tuple["Connection", bytes, float, float]
 
@@ -91,7 +88,7 @@ class Probing:
             self._queue.put((connection, content, now, time.monotonic()))
             self._came()
 
-        connection.probe(self._key, probe_frames.encode_probe(probe), _TIMEOUT_S, heard)
+        connection.probe(self._key, probe_frames.encode_probe(probe), heard)
 
     def heard(self, connection: Connection) -> Iterator[Heard]:
         """Return the answers of this connection since the last call; others are dropped."""

@@ -30,9 +30,7 @@ class Wire:
     def __init__(self) -> None:
         self.heard: list[Callable[[bytes], None]] = []
 
-    def probe(
-        self, key: str, payload: bytes, timeout_s: float, heard: Callable[[bytes], None]
-    ) -> None:
+    def probe(self, key: str, payload: bytes, heard: Callable[[bytes], None]) -> None:
         assert probe_frames.decode_probe(payload).robot == "r"
         self.heard.append(heard)
 
