@@ -12,10 +12,8 @@ from typing import NamedTuple
 
 from fogft.model.choices import Spread
 from fogft.model.groups import Group, group_of, is_stand_in, replica_hash
-from fogft.model.intent import Intent
 from fogft.model.reason import MOVES, Cause, Reason, because
-from fogft.model.replica import Observed, Offer, Placement
-from fogft.model.spec import PoolSpec
+from fogft.model.replica import Offer, Placement
 from fogft.planning.classification import Classification
 from fogft.planning.listing import Listing, Scale, catalogue
 from fogft.planning.needs import Need
@@ -29,9 +27,9 @@ from fogft.planning.observed.backoff import (
 )
 from fogft.planning.observed.hazard import UNKNOWN, hazards, penalty
 from fogft.planning.observed.health import Assessment, Verdict
-from fogft.planning.observed.history import History
 from fogft.planning.observed.launches import LAUNCHES_AN_HOUR, given_up, within_an_hour
 from fogft.planning.placement import Choice, Market
+from fogft.planning.sizing import Inputs, Size
 
 
 class PlannedLaunch(NamedTuple):
@@ -47,19 +45,17 @@ class PlannedLaunch(NamedTuple):
 class Buyer:
     """Plans launches one by one."""
 
-    spec: PoolSpec
-    intent: Intent
-    observed: Observed
-    history: History
+    inputs: Inputs
     machines: Classification
-    groups: Sequence[Group]  # as they are sized
-    cap: float | None  # on the price of all machines together; None for none
+    sized: Size
     standing_in: Sequence[Assessment] = ()  # on-demand machines that serve until spot ones do
     launches: list[PlannedLaunch] = field(default_factory=list)
     notes: list[Reason] = field(default_factory=list)
     ended_for_room: list[tuple[Assessment, Reason]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        self.spec, self.intent, self.observed, self.history = self.inputs
+        self.groups, self.cap = self.sized.groups, self.sized.max_usd_per_hour
         self._catalogue = catalogue(self.observed.offers)
         self._markets: dict[tuple[object, ...], Market] = {}
         self._whole: dict[tuple[str, bool | None], Market] = {}

@@ -12,10 +12,10 @@ from dataclasses import dataclass, field, replace
 from fogft.model.groups import BLOCK, Group, group_of, is_current
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import MachinePhase, Observed
+from fogft.model.replica import MachinePhase
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.health import Assessment, Health, Verdict
-from fogft.planning.sizing import Size
+from fogft.planning.sizing import Inputs, Size
 
 _ORDER = {Cause.DRAINED: 0, Cause.EXCLUDED: 1, Cause.OUTDATED: 3}  # all others between
 _OUTDATED = Reason(Cause.OUTDATED)  # of many at once, at every tick
@@ -71,15 +71,9 @@ class Classification:
         return kept + sum(s.verdict not in exempt for s in self.ending)
 
 
-def classify(
-    spec: PoolSpec,
-    intent: Intent,
-    observed: Observed,
-    *,
-    health: Health,
-    size: Size,
-) -> Classification:
+def classify(inputs: Inputs, health: Health, size: Size) -> Classification:
     """Classify every machine of the pool."""
+    spec, intent, observed, _ = inputs
     machines = Classification()
     failed = Verdict.FAILED
     blocks = {group.block for group in size.groups}

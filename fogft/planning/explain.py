@@ -14,20 +14,17 @@ from typing import NamedTuple
 
 from fogft.model.choices import Assumption
 from fogft.model.groups import group_of, groups_of
-from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import Observed, Offer, Placement
-from fogft.model.spec import PoolSpec
+from fogft.model.replica import Offer, Placement
 from fogft.planning.availability import Expected, expected, full_together, unavailability_of
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
 from fogft.planning.listing import Scale, is_possible
 from fogft.planning.observed.backoff import EVERYWHERE, backing_off
 from fogft.planning.observed.hazard import UNKNOWN, hazards
-from fogft.planning.observed.history import History
 from fogft.planning.placement import crowding
 from fogft.planning.planner import plan
-from fogft.planning.sizing import size, spot_sold
+from fogft.planning.sizing import Inputs, size, spot_sold
 
 NO_POOL = "0" * 16
 LATELY_S = 4 * 3600.0
@@ -93,32 +90,28 @@ class Explanation:
 
 
 def explain(
-    spec: PoolSpec,
-    intent: Intent,
-    observed: Observed,
-    history: History,
-    on_demand: Sequence[Offer] = (),
-    *,
-    recovery_s: float | None = None,
+    inputs: Inputs, on_demand: Sequence[Offer] = (), *, recovery_s: float | None = None
 ) -> Explanation:
     """Plan a pool from scratch, whatever runs, and explain the plan.
 
     Args:
-        history: Losses and failures of places count.
+        inputs: Of the history the losses and failures of places count.
         on_demand: What one on-demand machine of this kind costs, for comparison.
         recovery_s: How long launches have taken, in place of what is assumed where nobody said.
     """
-    world = replace(observed, machines=(), links=None, ending=frozenset())
-    intent = replace(intent, stopping=False)
-    planned = plan(NO_POOL, spec, intent, world, history.places_alone())
-    sized = size(spec, intent, world)
-    cap = sized.max_usd_per_hour
-    reasons = _Reasons(spec, intent, world, history, launches=planned.launches, cap=cap)
+    spec, intent, observed, history = inputs
+    inputs = inputs._replace(
+        intent=replace(intent, stopping=False),
+        observed=replace(observed, machines=(), links=None, ending=frozenset()),
+    )
+    planned = plan(NO_POOL, inputs._replace(history=history.places_alone()))
+    cap = size(inputs).max_usd_per_hour
+    reasons = _Reasons(inputs, planned.launches, cap)
     assumed: Assumption = spec.availability or Assumption()
     if recovery_s is not None and assumed.recovery_s == Assumption().recovery_s:
         assumed = replace(assumed, recovery_s=recovery_s)
     places = [launch.offer.placement for launch in planned.launches]
-    sold = spot_sold(spec, intent, world)
+    sold = spot_sold(inputs)
     full = full_together(sold, assumed)
     cheapest = min(
         (o for o in on_demand if is_possible(o)),
@@ -168,15 +161,9 @@ class _Reasons:
     """Says of each offer why it was not chosen."""
 
     def __init__(
-        self,
-        spec: PoolSpec,
-        intent: Intent,
-        observed: Observed,
-        history: History,
-        *,
-        launches: Sequence[PlannedLaunch],
-        cap: float | None,
+        self, inputs: Inputs, launches: Sequence[PlannedLaunch], cap: float | None
     ) -> None:
+        spec, intent, observed, history = inputs
         self._now = observed.now
         self._intent = intent
         self._losses: Mapping[str, list[float]] = history.losses

@@ -10,10 +10,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from fogft.model.groups import group_of, is_stand_in, replica_hash
-from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import Machine, MachinePhase, Observed, ReplicaId
-from fogft.model.spec import PoolSpec
+from fogft.model.replica import Machine, MachinePhase, ReplicaId
 from fogft.planning import fallback, migration, rollout
 from fogft.planning.buying import Buyer, PlannedLaunch
 from fogft.planning.classification import classify
@@ -22,7 +20,7 @@ from fogft.planning.needs import Need, needed_launches, stand_in
 from fogft.planning.observed.health import Assessment, Health, Verdict, judge
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.placement import EPSILON_USD
-from fogft.planning.sizing import Size, size
+from fogft.planning.sizing import Inputs, size
 
 __all__ = ["Plan", "PlannedEnd", "PlannedLaunch", "plan"]
 
@@ -55,32 +53,24 @@ class Plan(NamedTuple):
     restless: frozenset[ReplicaId] = frozenset()
 
 
-def plan(
-    pool_uid: str,
-    spec: PoolSpec,
-    intent: Intent,
-    observed: Observed,
-    history: History,
-    *,
-    health: Health | None = None,
-) -> Plan:
+def plan(pool_uid: str, inputs: Inputs, *, health: Health | None = None) -> Plan:
     """Plan changes that bring the pool closer to its spec, within the safety rules.
 
     It is planned again on the world as it is once a plan is under way, until nothing is added.
 
-    `health` is what `judge` makes of these very arguments, where that is known already.
+    `health` is what `judge` makes of these very inputs, where that is known already.
     """
-    health = health or judge(pool_uid, spec, observed, history)
-    decided = latest = plan_once(spec, intent, observed, history, health=health)
-    if observed.machines is None:
+    health = health or judge(pool_uid, inputs.spec, inputs.observed, inputs.history)
+    decided = latest = plan_once(inputs, health)
+    if inputs.observed.machines is None:
         return decided
     for _ in range(MOST_PASSES):
-        changes = latest.launches or latest.terminations or _newly_marked(latest, history)
+        changes = latest.launches or latest.terminations or _newly_marked(latest, inputs.history)
         if latest.closed or not changes:
             break
-        world, memory = _under_way(pool_uid, spec, observed, history, decided)
-        health = judge(pool_uid, spec, world, memory)
-        latest = plan_once(spec, intent, world, memory, health=health)
+        later = _under_way(pool_uid, inputs, decided)
+        health = judge(pool_uid, later.spec, later.observed, later.history)
+        latest = plan_once(later, health)
         is_done = not latest.launches and not latest.terminations
         is_done = is_done and set(latest.draining) == set(decided.draining)
         decided = decided._replace(
@@ -103,10 +93,9 @@ def _newly_marked(decided: Plan, history: History) -> list[ReplicaId]:
     return [id for id in decided.draining if (id.slot, id.generation) not in marked]
 
 
-def _under_way(
-    pool_uid: str, spec: PoolSpec, observed: Observed, history: History, decided: Plan
-) -> tuple[Observed, History]:
+def _under_way(pool_uid: str, inputs: Inputs, decided: Plan) -> Inputs:
     """Return the observation and history that follow if nothing but the plan happens."""
+    spec, _, observed, history = inputs
     now = observed.now
     ordered, events = [], []
     for slot, generation, offer, _ in decided.launches:
@@ -129,41 +118,26 @@ def _under_way(
         machines=(*(observed.machines or ()), *ordered),
         ending=observed.ending.union(end.id for end in decided.terminations),
     )
-    return later, history.followed_by(events) if events else history
+    history = history.followed_by(events) if events else history
+    return inputs._replace(observed=later, history=history)
 
 
-def plan_once(
-    spec: PoolSpec,
-    intent: Intent,
-    observed: Observed,
-    history: History,
-    *,
-    health: Health,
-) -> Plan:
+def plan_once(inputs: Inputs, health: Health) -> Plan:
+    spec, intent, observed, history = inputs
     if observed.machines is None:
-        known = size(spec, intent, observed).total if observed.offers else intent.wanted(spec)
+        known = size(inputs).total if observed.offers else intent.wanted(spec)
         return Plan(known, notes=(Reason(Cause.CLOUD_UNREACHABLE),))
     if intent.stopping:
         left = [judged.id for judged in health.replicas if judged.id not in observed.ending]
         ends = [PlannedEnd(id, Reason(Cause.DOWN)) for id in left]
         return Plan(0, terminations=tuple(ends), notes=(Reason(Cause.STOPPING),), health=health)
 
-    running = sum(judged.verdict is not Verdict.FAILED for judged in health.replicas)
-    sized = size(spec, intent, observed, running)
-    machines = classify(spec, intent, observed, health=health, size=sized)
+    sized = size(inputs, sum(s.verdict is not Verdict.FAILED for s in health.replicas))
+    machines = classify(inputs, health, sized)
     standing_in = [s for s in (*machines.good, *machines.replaced) if is_stand_in(s.slot)]
     others = machines.without(standing_in) if standing_in else machines
-    buyer = Buyer(
-        spec,
-        intent,
-        observed,
-        history,
-        machines,
-        sized.groups,
-        sized.max_usd_per_hour,
-        standing_in=standing_in,
-    )
-    counts, excess = _within_cap(sized, buyer)
+    buyer = Buyer(inputs, machines, sized, standing_in)
+    counts, excess = _within_cap(buyer)
     wanted = sum(counts)
     settling = bool(others.replaced) and rollout.is_settling(others, observed.now)
     of_groups = [
@@ -320,7 +294,7 @@ def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessm
     return None
 
 
-def _within_cap(sized: Size, buyer: Buyer) -> tuple[Sequence[int], list[Reason]]:
+def _within_cap(buyer: Buyer) -> tuple[Sequence[int], list[Reason]]:
     """Return how many are wanted of each group: one fewer while those at hand exceed the cap.
 
     No launch exceeds the cap: this is for one that was lowered, by a schedule or in the file.
@@ -329,7 +303,7 @@ def _within_cap(sized: Size, buyer: Buyer) -> tuple[Sequence[int], list[Reason]]
     always stays.
     """
     machines = buyer.machines
-    cap, counts, groups = sized.max_usd_per_hour, list(sized.counts), sized.groups
+    cap, counts, groups = buyer.cap, list(buyer.sized.counts), buyer.groups
     if cap is None or len(machines.good) < 2:
         return counts, []
     cost = sum(min(s.machine.usd_per_hour, buyer.price(s)) for s in machines.good)

@@ -8,7 +8,7 @@ Not here: what is missing (`planner`), the arithmetic (`availability`).
 
 from typing import NamedTuple
 
-from fogft.model.choices import MAX_REPLICAS
+from fogft.model.choices import MAX_REPLICAS, AvailabilitySpec
 from fogft.model.groups import Group, groups_of, shares
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
@@ -17,10 +17,20 @@ from fogft.model.schedule import Wish, wish
 from fogft.model.spec import PoolSpec
 from fogft.planning.availability import expected, full_together, replicas_needed, unavailability_of
 from fogft.planning.listing import Listing, Scale, catalogue
+from fogft.planning.observed.history import History
 from fogft.planning.placement import Market
 
 # Where a target is out of reach, no replica is had that would take away less of the outages.
 MUCH_THE_SAME = 1.1
+
+
+class Inputs(NamedTuple):
+    """All that a plan follows from."""
+
+    spec: PoolSpec
+    intent: Intent
+    observed: Observed
+    history: History
 
 
 class Size(NamedTuple):
@@ -37,12 +47,13 @@ class Size(NamedTuple):
         return sum(self.counts)
 
 
-def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -> Size:
+def size(inputs: Inputs, running: int = 0) -> Size:
     """Return the wanted number of replicas of each group, and the cap.
 
     `running` is how many there are: near the cap, or while nothing is offered, a target's number
     does not fall below it.
     """
+    spec, intent, observed, _ = inputs
     groups = groups_of(spec)
     usual = Wish(spec.replicas, spec.max_usd_per_hour)
     notes: list[Reason] = []
@@ -57,39 +68,34 @@ def size(spec: PoolSpec, intent: Intent, observed: Observed, running: int = 0) -
     elif intent.is_scaled(spec):
         total = intent.wanted(spec)
     elif spec.availability and now.replicas == spec.replicas:
-        total, unmet = _for_target(spec, intent, observed, cap, running)
+        total, unmet = _for_target(inputs, spec.availability, cap, running)
         notes += because(unmet)
     return Size(groups, shares(groups, total), cap, tuple(notes))
 
 
-def spot_sold(spec: PoolSpec, intent: Intent, observed: Observed) -> list[Placement]:
+def spot_sold(inputs: Inputs) -> list[Placement]:
     """Return a placement in each location with spot offers, if nothing fills in."""
-    groups = groups_of(spec)
+    groups = groups_of(inputs.spec)
     if any(group.on_demand.fallback for group in groups):
         return []
-    rows = (row for group in groups for row in _listing(spec, intent, observed, group, True).rows)
+    rows = (row for group in groups for row in _listing(inputs, group, True).rows)
     return list({row.location: row.offer.placement for row in rows}.values())
 
 
-def _listing(
-    spec: PoolSpec, intent: Intent, observed: Observed, group: Group, spot: bool | None
-) -> Listing:
+def _listing(inputs: Inputs, group: Group, spot: bool | None) -> Listing:
+    spec, intent, observed, _ = inputs
     scale = Scale(spec.placement.latency_weight, observed.rtt_s, spec.name)
     return catalogue(observed.offers).listing(group.name, spot, intent.excluded, scale)
 
 
-def _layout(
-    spec: PoolSpec, intent: Intent, observed: Observed, cap: float | None
-) -> list[Placement]:
+def _layout(inputs: Inputs, cap: float | None) -> list[Placement]:
     """Return the placements of the largest pool started from scratch, as far as offers allow."""
     chosen: list[Offer] = []
-    groups = groups_of(spec)
+    groups = groups_of(inputs.spec)
     for group, count in zip(groups, shares(groups, MAX_REPLICAS), strict=True):
         base, fallback = group.on_demand.base, group.on_demand.fallback
         kinds = (True, False) if fallback else (True,) if base else (None,)
-        markets = {
-            spot: Market(_listing(spec, intent, observed, group, spot)) for spot in (False, *kinds)
-        }
+        markets = {spot: Market(_listing(inputs, group, spot)) for spot in (False, *kinds)}
         for mine in range(count):
             budget = None if cap is None else cap - sum(o.usd_per_hour for o in chosen)
             places = [offer.placement for offer in chosen]
@@ -104,29 +110,27 @@ def _layout(
 
 
 def _for_target(
-    spec: PoolSpec, intent: Intent, observed: Observed, cap: float | None, running: int
+    inputs: Inputs, asked: AvailabilitySpec, cap: float | None, running: int
 ) -> tuple[int, Reason | None]:
     """Return the fewest replicas that reach the target, or all but reach what can be reached.
 
     The reason says why the target cannot be reached; None where it can.
     """
-    asked = spec.availability
-    if asked is None:
-        return spec.replicas, None
-    if not observed.offers:
+    least = inputs.spec.replicas
+    if not inputs.observed.offers:
         one = 1.0 - unavailability_of(asked, spot=True)
         needed = replicas_needed(one, asked.target, limit=10_000)
-        return min(MAX_REPLICAS, max(spec.replicas, running, needed)), None
-    laid = _layout(spec, intent, observed, cap)
+        return min(MAX_REPLICAS, max(least, running, needed)), None
+    laid = _layout(inputs, cap)
     down: list[float] = []
-    sold = spot_sold(spec, intent, observed)
+    sold = spot_sold(inputs)
     for count in range(1, len(laid) + 1):
         down.append(1.0 - expected(laid[:count], asked, sold).correlated)
-        if down[-1] <= 1.0 - asked.target + 1e-12 and count >= spec.replicas:
+        if down[-1] <= 1.0 - asked.target + 1e-12 and count >= least:
             return count, None
     enough = next((n for n, share in enumerate(down, 1) if share <= MUCH_THE_SAME * down[-1]), 0)
     # Not below what runs: near the cap, prices that waver would make the number waver.
-    count = max(1, spec.replicas, enough, min(running, len(laid)))
+    count = max(1, least, enough, min(running, len(laid)))
     most = Reason(Cause.MOST_REPLICAS, count=MAX_REPLICAS)
     why = Reason(Cause.OVER_CAP) if len(laid) < MAX_REPLICAS else most
     full = full_together(sold, asked)

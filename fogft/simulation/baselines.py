@@ -61,10 +61,6 @@ class Fleet:
         vm = self.world.vms.get(id)
         return vm is not None and vm.ready and not vm.noticed
 
-    def leaving(self, id: ReplicaId) -> bool:
-        """Whether a machine has a notice."""
-        return id in self.world.vms and self.world.vms[id].noticed
-
 
 class Static:
     """One machine for each given offer, ordered again whenever it is lost or refused."""
@@ -128,7 +124,8 @@ class Search:
         for id, offer in fleet.ordered.items():
             if not offer.placement.spot:
                 continue
-            if fleet.leaving(id):
+            vm = fleet.world.vms.get(id)
+            if vm is not None and vm.noticed:
                 if id not in self._left:
                     self._left.add(id)
                     rule.lost(offer)

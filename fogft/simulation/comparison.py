@@ -14,11 +14,12 @@ from typing import Any
 
 from fogft.model.groups import groups_of, with_spot
 from fogft.model.intent import Intent
-from fogft.model.replica import Observed, Offer, Placement
+from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.listing import Scale, catalogue
+from fogft.planning.observed.history import History
 from fogft.planning.placement import Market as Offered
-from fogft.planning.sizing import size
+from fogft.planning.sizing import Inputs, size
 from fogft.pool.manager.offers import ask
 from fogft.simulation.baselines import ActiveZones, InTurn, Naive, Search, Static
 from fogft.simulation.bound import least_usd_per_hour
@@ -82,14 +83,15 @@ class Scenario:
     def replicas(self) -> int:
         """How many replicas the planner wants outside the schedule's windows."""
         bare = replace(self.spec, schedule=None)
-        return size(bare, Intent(), self._seen(EPOCH)).total
+        return self._wanted(bare, EPOCH)
 
     @cached_property
     def _offers(self) -> tuple[Offer, ...]:
         return ask(self.market(self.seeds[0]), self.spec)
 
-    def _seen(self, now: float) -> Observed:
-        return Observed(now, (), None, self._offers)
+    def _wanted(self, spec: PoolSpec, now: float) -> int:
+        seen = Observed(now, (), None, self._offers)
+        return size(Inputs(spec, Intent(), seen, History())).total
 
     @cached_property
     def sold(self) -> tuple[list[Offer], list[Offer]]:
@@ -109,7 +111,7 @@ class Scenario:
 
         @cache
         def wanted(minute: int) -> int:
-            return size(punctual, Intent(), self._seen(60.0 * minute)).total
+            return self._wanted(punctual, 60.0 * minute)
 
         return lambda now: wanted(int(now // 60))
 
@@ -242,13 +244,11 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
 def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
     """Return a careful fixed placement of this many replicas."""
     chosen: list[Offer] = []
-    taken: list[Placement] = []
     market = Offered(catalogue(offers).listing(None, None, (), Scale()))
     for _ in range(count):
-        offer = market.choose(taken).offer
+        offer = market.choose([one.placement for one in chosen]).offer
         if offer is not None:
             chosen.append(offer)
-            taken.append(offer.placement)
     return chosen
 
 

@@ -53,14 +53,8 @@ class _Memory(PoolStore):
     def good(self) -> PoolSpec | None:
         return self.the_spec
 
-    def keep_good(self, spec: PoolSpec) -> bool:
-        return False
-
     def trial(self) -> Trial:
         return _TRIAL
-
-    def write_trial(self, trial: Trial) -> None:
-        pass
 
     def intent(self) -> Intent:
         return _NO_WISHES

@@ -100,23 +100,17 @@ class World:
         """Schedule an event after a delay, rounded up to whole ticks."""
         self.at(self.now + rounded_up(seconds, TICK_S), happen)
 
-    def run(self, policy: Policy, *, every_tick: bool = False) -> Meter:
-        """Run a policy until the end.
-
-        `every_tick` asks it as often as the manager's loop, not only when something can have
-        changed: slow, and to check that it makes no difference.
-        """
+    def run(self, policy: Policy) -> Meter:
+        """Run a policy until the end."""
         wake = self.now
         while True:
             due = self._queue[0][0] if self._queue else NEVER
             moment = min(wake, due)
-            if every_tick:
-                moment = min(moment, self.now + TICK_S) if self.asked else self.now
             if moment >= self._until:
                 self._pass_until(self._until, policy)
                 return self.meter
             self._pass_until(moment, policy)
-            seen = every_tick or self.now >= wake
+            seen = self.now >= wake
             while self._queue and self._queue[0][0] <= self.now:
                 seen |= heapq.heappop(self._queue)[2]() is not UNSEEN
             if not seen:

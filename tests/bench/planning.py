@@ -15,6 +15,7 @@ from fogft.model.replica import Observed, Offer, Placement
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.planning.observed.history import History
 from fogft.planning.planner import plan
+from fogft.planning.sizing import Inputs
 from tests.bench.caller import milliseconds
 from tests.estimates import median
 
@@ -52,7 +53,7 @@ def planning(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
             observed = replace(observed, offers=observed.offers[:-1] + observed.offers[-1:])
             for offers in ("new", "known"):
                 began = time.process_time()
-                planned = plan(UID, spec, Intent(), observed, History())
+                planned = plan(UID, Inputs(spec, Intent(), observed, History()))
                 if number:
                     took[name, offers].append(time.process_time() - began)
                 assert len(planned.launches) == REPLICAS

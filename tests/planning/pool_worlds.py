@@ -24,6 +24,7 @@ from fogft.model.replica import (
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.planner import Plan, plan
+from fogft.planning.sizing import Inputs
 
 UID = "0123456789abcdef"
 STRANGER = "fedcba9876543210"
@@ -72,7 +73,7 @@ class World:
         return Observed(self.now, self.machines, self.links, self.offers, self.ending, self.rtt_s)
 
     def plan(self) -> Plan:
-        return plan(UID, self.spec, self.intent, self.observed, self.history)
+        return plan(UID, Inputs(self.spec, self.intent, self.observed, self.history))
 
     def having(self, *parts: Part) -> World:
         """Add replicas."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from fogft.model.choices import OnDemandSpec
 from fogft.planning.explain import explain
 from fogft.planning.observed.history import Event, EventKind
+from fogft.planning.sizing import Inputs
 from tests.planning.pool_worlds import NOW, OFFERS, ON_DEMAND, PLACES, World, spec
 
 MIXED = spec(2, on_demand=OnDemandSpec(0, fallback=True))
@@ -12,7 +13,7 @@ MIXED = spec(2, on_demand=OnDemandSpec(0, fallback=True))
 
 def explained(*events: Event):
     world = World(MIXED, events=events, offers=OFFERS + ON_DEMAND)
-    return explain(world.spec, world.intent, world.observed, world.history)
+    return explain(Inputs(world.spec, world.intent, world.observed, world.history))
 
 
 def test_a_pool_that_just_lost_a_replica_is_planned_from_nothing():

@@ -15,7 +15,7 @@ from fogft.planning.buying import Buyer
 from fogft.planning.classification import classify
 from fogft.planning.observed.health import judge
 from fogft.planning.observed.history import Event, EventKind
-from fogft.planning.sizing import size
+from fogft.planning.sizing import Inputs, size
 from tests.planning.pool_worlds import NOW, PLACES, UID, World, applied, replica, spec
 
 PRICES = st.sampled_from([0.02, 0.1, 0.2, 0.5])
@@ -65,11 +65,9 @@ def quiet(draw: st.DrawFn) -> World:
 def buyer(world: World) -> Buyer:
     """What the planner asks who is to move."""
     health = judge(UID, world.spec, world.observed, world.history)
-    sized = size(world.spec, world.intent, world.observed)
-    machines = classify(world.spec, world.intent, world.observed, health=health, size=sized)
-    cap = sized.max_usd_per_hour
-    seen = world.observed, world.history
-    return Buyer(world.spec, world.intent, *seen, machines, sized.groups, cap)
+    inputs = Inputs(world.spec, world.intent, world.observed, world.history)
+    sized = size(inputs)
+    return Buyer(inputs, classify(inputs, health, sized), sized)
 
 
 @given(quiet())

@@ -14,7 +14,7 @@ from fogft.planning.observed.history import Event
 from fogft.simulation.comparison import policies, unlogged
 from fogft.simulation.managed import Managed
 from fogft.simulation.world import World
-from tests.simulation.markets import any_scenario
+from tests.simulation.markets import EveryTick, any_scenario
 
 
 def events(seed: int, days: float, *, every_tick: bool) -> tuple[list[Event], int]:
@@ -24,7 +24,7 @@ def events(seed: int, days: float, *, every_tick: bool) -> tuple[list[Event], in
     pool = policies(wanted)["fogft"](world)
     assert isinstance(pool, Managed)
     with unlogged():
-        world.run(pool, every_tick=every_tick)
+        world.run(EveryTick(pool) if every_tick else pool)
     return pool.store.events, world.asked
 
 

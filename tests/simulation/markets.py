@@ -12,6 +12,7 @@ from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.simulation.comparison import Scenario
 from fogft.simulation.market import remembered
 from fogft.simulation.model import MarketModel, Timing
+from fogft.simulation.world import Policy
 
 EVERY_DAY = frozenset(range(7))
 # Nothing between two zones, changes often: much happens in a short time.
@@ -32,6 +33,19 @@ def scenario(pool: PoolSpec | None = None, **changes: Any) -> Scenario:
     find = remembered(lambda resources: offers_for(BUILT_IN, resources))
     chosen: dict[str, Any] = {"timing": Timing(), "model": MarketModel(), "days": 1.0}
     return Scenario(pool or spec(), find, **{**chosen, "seeds": (0,), **changes})
+
+
+class EveryTick:
+    """A policy that is asked as often as the manager's loop, not only when something can change."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.wanted = policy.wanted
+        self._policy = policy
+
+    def tick(self, now: float) -> float:
+        """Act, and ask to be called again at once."""
+        self._policy.tick(now)
+        return now
 
 
 def any_scenario(seed: int, days: float = 0.02) -> Scenario:

@@ -26,7 +26,7 @@ from fogft.simulation.world import World
 from tests.needs import needs
 from tests.nightly import by_day
 from tests.simulation.arithmetic import moving, staying
-from tests.simulation.markets import INDEPENDENT, any_scenario, scenario, spec
+from tests.simulation.markets import INDEPENDENT, EveryTick, any_scenario, scenario, spec
 
 HOUR_S = 3600.0
 EVERY_DAY = frozenset(range(7))
@@ -37,12 +37,12 @@ def managed(world, wanted):
     return policies(wanted)["fogft"](world)
 
 
-def run(wanted, policy="fogft", seed=0, **options):
+def run(wanted, policy="fogft", seed=0, asked=lambda policy: policy):
     """Run one policy in one market; return the policy and its meter."""
     world = World(wanted.market(seed), seed=seed, length_s=wanted.length_s, settle_s=SETTLE_S)
     chosen = policies(wanted)[policy](world)
     with unlogged():
-        meter = world.run(chosen, **options)
+        meter = world.run(asked(chosen))
     return chosen, meter
 
 
@@ -93,7 +93,7 @@ def test_asking_only_when_something_can_change_changes_nothing(seed):
     """
     wanted = any_scenario(seed)
     jumping, lazily = run(wanted, seed=seed)
-    ticking, eagerly = run(wanted, seed=seed, every_tick=True)
+    ticking, eagerly = run(wanted, seed=seed, asked=EveryTick)
     assert jumping.world.asked < ticking.world.asked / 4
     assert jumping.store.events == ticking.store.events
     assert lazily.outcome().available == pytest.approx(eagerly.outcome().available)

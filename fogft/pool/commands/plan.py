@@ -16,6 +16,7 @@ from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.explain import Explanation, explain
 from fogft.planning.observed.history import Event, EventKind, History
+from fogft.planning.sizing import Inputs
 from fogft.pool.commands.composition import LOCAL, make_cloud, make_store
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.manager import launched_gateway, offers, proxy_report
@@ -109,7 +110,8 @@ def plan_file(
     now = time.time()
     observed = Observed(now, (), None, sold, rtt_s={r: d.rtt_s for r, d in distances.items()})
     ready_p90_s = took_s[int(0.9 * len(took_s))] if len(took_s) >= LEAST_LAUNCHES else None
-    explained = explain(spec, intent, observed, history, on_demand, recovery_s=ready_p90_s)
+    inputs = Inputs(spec, intent, observed, history)
+    explained = explain(inputs, on_demand, recovery_s=ready_p90_s)
     clouds = (
         seller.lacking(spec.task.get("resources") or {}) if isinstance(seller, RealCloud) else {}
     )

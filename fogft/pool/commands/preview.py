@@ -21,6 +21,7 @@ from fogft.planning.lifetime import HOUR_S
 from fogft.planning.observed.history import History
 from fogft.planning.planner import plan
 from fogft.planning.rollout import has_room
+from fogft.planning.sizing import Inputs
 from fogft.pool.commands.composition import LOCAL, make_cloud, make_store
 from fogft.pool.commands.plan import far
 from fogft.pool.commands.sweep import left_of
@@ -127,7 +128,7 @@ def order(
     rtt_s = {region: distance.rtt_s for region, distance in known.items()}
     now = time.time()
     observed = Observed(now, (), None, sold, rtt_s=rtt_s)
-    planned = plan("0" * 16, spec, Intent(), observed, History())
+    planned = plan("0" * 16, Inputs(spec, Intent(), observed, History()))
     after = spec
     if before is not None and before.gateway.launch and before.dial_in and spec.gateway.launch:
         after = spec.behind(before.dial_in.rpartition(":")[0])

@@ -41,6 +41,7 @@ from fogft.planning.observed.history import EventKind, History, fault_of
 from fogft.planning.observed.refresh import Silent
 from fogft.planning.planner import Plan, PlannedLaunch, plan
 from fogft.planning.rollout import Update
+from fogft.planning.sizing import Inputs
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import offers
 from fogft.pool.manager.launched_gateway import LaunchedGateway
@@ -174,7 +175,7 @@ class Reconciler:
         over = lifetime.is_over(spec, begun_at, observed.now)
         if over:
             intent = replace(intent, stopping=True)
-        decided = plan(identity.uid, spec, intent, observed, history, health=health)
+        decided = plan(identity.uid, Inputs(spec, intent, observed, history), health=health)
         if over:
             reason = Reason(Cause.MAX_HOURS)
             ends = tuple(end._replace(reason=reason) for end in decided.terminations)

@@ -12,7 +12,7 @@ from fogft.model.replica import Observed
 from fogft.planning.observed.backoff import backing_off, recently_failed
 from fogft.planning.observed.clock_jumps import DOUBT_S, LEAST_S, Jump, Reading, Watch
 from fogft.planning.observed.history import Event, EventKind, History, compacted
-from fogft.planning.sizing import size
+from fogft.planning.sizing import Inputs, size
 from tests.planning.pool_worlds import spec
 
 PLACE = "c/r/a"
@@ -109,7 +109,7 @@ def test_a_schedule_waits_for_a_clock_that_was_just_set():
     pool = spec(1, schedule=ScheduleSpec("UTC", (night,), prelaunch_s=0.0))
     noon, evening = 12 * 3600.0, 21 * 3600.0
     wanted = [
-        size(pool, Intent(), Observed(now, (), doubt_s=doubt_s)).total
+        size(Inputs(pool, Intent(), Observed(now, (), doubt_s=doubt_s), History())).total
         for now, doubt_s in ((noon, 0.0), (evening, evening - noon), (evening, 0.0))
     ]
     assert wanted == [1, 1, 4]

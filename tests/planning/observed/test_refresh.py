@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.model.replica import LinkState, MachinePhase, Observed
 from fogft.planning.observed.refresh import LONGEST_PAUSE_S, Silent
-from fogft.planning.planner import plan
-from tests.planning.pool_worlds import UID, World, replica, spec, worlds
+from tests.planning.pool_worlds import World, replica, spec, worlds
 
 
 def times_asked(world: World, seconds: int) -> list[int]:
@@ -83,7 +82,7 @@ def test_a_late_answer_changes_nothing_but_the_question() -> None:
     """Whoever is merely late is planned for as if nothing were."""
     well = World(spec()).having(replica(0), replica(1))
     late = with_silence(well, 1.9)
-    plans = [plan(UID, w.spec, w.intent, w.observed, w.history) for w in (well, late)]
+    plans = [w.plan() for w in (well, late)]
     assert plans[0].launches == plans[1].launches
     assert plans[0].terminations == plans[1].terminations == ()
     assert plans[0].draining == plans[1].draining

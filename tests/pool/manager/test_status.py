@@ -18,6 +18,7 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkState, Observed, ReplicaId
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.planner import plan
+from fogft.planning.sizing import Inputs
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager import proxy_report, status
 from fogft.pool.manager.reconciler import Tick
@@ -59,7 +60,7 @@ def test_the_phases_of_a_launch_are_told_as_far_as_they_are_known() -> None:
             history.add(Event(ready_at, EventKind.READY, 0, 1))
         machine = replace(base, running_at=running_at, set_up_at=set_up_at)
         observed = Observed(NOW, (machine,))
-        decided = plan(UID, spec(), Intent(), observed, history)
+        decided = plan(UID, Inputs(spec(), Intent(), observed, history))
         identity = Identity("pool", UID, "sky", "/pool.yaml", NOW)
         tick = Tick(identity, spec(), Intent(), observed, decided, None)
         seen = status.of_tick(tick, history=history, recent=[])
