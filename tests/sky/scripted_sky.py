@@ -71,11 +71,10 @@ class ScriptedProvider:
             and (self.asked_regions[-1] is None or i.placement.region in self.asked_regions[-1])
         ]
 
-    def terminate(self, instances: Iterable[Instance]) -> None:
+    def terminate(self, instance: Instance) -> None:
         self._meet()
-        for instance in instances:
-            self.terminated.append(instance.key)
-            self.found.pop(instance.key, None)
+        self.terminated.append(instance.key)
+        self.found.pop(instance.key, None)
 
     def end_when_shut_down(self, instance: Instance) -> None:
         self._meet()

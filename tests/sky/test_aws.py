@@ -72,8 +72,8 @@ def test_a_machine_that_shut_itself_down_is_found_as_long_as_its_disk_costs(acco
     mine = launch("us-east-1", labels(replica(0)))
     boto3.client("ec2", region_name="us-east-1").stop_instances(InstanceIds=[mine])
     aws = Aws()
-    found = aws.instances(None, replica().pool_uid)
-    assert [i.key for i in found] == [mine]
+    (found,) = aws.instances(None, replica().pool_uid)
+    assert found.key == mine
     aws.terminate(found)
     assert not aws.instances(None, replica().pool_uid)
 
@@ -98,8 +98,8 @@ def test_terminate_ends_these_and_is_repeatable(account: None):
     launch("us-east-1", labels(replica(1)))
     aws = Aws()
     first, second = aws.instances(["us-east-1"])
-    aws.terminate([first])
-    aws.terminate([first])
+    aws.terminate(first)
+    aws.terminate(first)
     assert [i.key for i in aws.instances(["us-east-1"])] == [second.key]
 
 

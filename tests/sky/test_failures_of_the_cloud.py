@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cloud.sky import prices, task
+from fogft.cloud.sky import prices
 from fogft.cloud.sky.naming import cluster_name, infra
 from fogft.cloud.sky.presence import PROVIDER_SURE_AFTER_S
 from fogft.cloud.sky.sdk import JobState
@@ -283,7 +283,7 @@ def test_a_notice_is_answered_while_the_machine_still_runs(pool: PoolOnSky):
 
 def test_the_budget_counts_what_is_being_launched_and_is_never_exceeded(tmp_path: Path):
     """Two fit; a replacement waits for headroom, and says so."""
-    cap = 0.055 + 2 * prices.extras_usd_per_hour(EAST, task.DISK_GB)
+    cap = 0.055 + 2 * prices.extras_usd_per_hour(EAST, {})
     pool = PoolOnSky(tmp_path, replicas=2, max_usd_per_hour=cap)
     pool.sky.boots = False
     pool.tick(5)
@@ -307,7 +307,7 @@ def test_another_type_takes_the_place_of_one_without_capacity_where_the_cap_allo
 ):
     """The place does not rest, and what the machine costs is what its own type costs."""
     other = replace(EAST, instance="m5.large")
-    more = prices.extras_usd_per_hour(EAST, task.DISK_GB)
+    more = prices.extras_usd_per_hour(EAST, {})
     for cap, came in ((None, "m5.large"), (0.06, "m5.large"), (0.04, "")):
         pool = PoolOnSky(tmp_path / str(cap), max_usd_per_hour=cap)
         pool.sky.sold = [Offer(EAST, 0.02, "catalogue"), Offer(other, 0.03, "catalogue")]

@@ -141,8 +141,8 @@ def test_terminate_ends_these_and_is_repeatable(compute: tuple[Compute, Gcp]):
     kept = project.make(replica(1), "us-east1-b")
     project.make(replica(0), "us-central1-a")
     (found,) = cloud.instances(["us-central1"])
-    cloud.terminate([found])
-    cloud.terminate([found])
+    cloud.terminate(found)
+    cloud.terminate(found)
     assert list(project.machines) == [kept]
 
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pytest
 
-from fogft.cloud.sky import prices, task
+from fogft.cloud.sky import prices
 from fogft.cloud.sky.prices import FRESH_S, USABLE_S, Prices
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudUnreachable, SpecError
 from fogft.model.replica import Offer, Placement
 from tests.sky.scripted_sky import EAST, WEST, ScriptedProvider, ScriptedSky
 
-MORE = prices.extras_usd_per_hour(EAST, task.DISK_GB)
+MORE = prices.extras_usd_per_hour(EAST, {})
 
 
 class Market:

@@ -171,9 +171,7 @@ class SkyCloud:
     def stop(self, order: Launch) -> None:
         """See `RealCloud`."""
         self.sky.stop(cluster_name(order.id))
-        resources = task.alternative(order.task.get("resources") or {}, order.placement)
-        disk_size = resources.get("disk_size", task.DISK_GB)
-        usd_per_hour = disk_usd_per_hour(order.placement.cloud, disk_size)
+        usd_per_hour = disk_usd_per_hour(order.placement, order.task.get("resources") or {})
         self.journal.update(order.id, stage=Stage.STANDBY, usd_per_hour=usd_per_hour)
         self._presence.clusters.forget()
 

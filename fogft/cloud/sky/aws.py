@@ -62,11 +62,10 @@ class Aws:
             raise refused[0]
         return sorted(found, key=lambda i: (i.id, i.key))
 
-    def terminate(self, instances: Iterable[Instance]) -> None:
+    def terminate(self, instance: Instance) -> None:
         """See `Provider`."""
-        for one in instances:  # one by one: a single unknown key fails a whole call
-            with self._asked(one.placement.region) as ec2, _unless("InvalidInstanceID.NotFound"):
-                ec2.terminate_instances(InstanceIds=[one.key])
+        with self._asked(instance.placement.region) as ec2, _unless("InvalidInstanceID.NotFound"):
+            ec2.terminate_instances(InstanceIds=[instance.key])
 
     def end_when_shut_down(self, instance: Instance) -> None:
         """See `Provider`."""

@@ -47,9 +47,10 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
                 for place, price in _sold(name, machine):
                     prices[place] = min(prices.get(place, price), price)
                     key = place.instance, place.spot
-                    if key not in quotas:
+                    if name == "aws" and key not in quotas:
+                        codes = importlib.import_module("sky.catalog.aws_catalog")
                         has = cloud.get_vcpus_mem_from_instance_type(machine.instance_type)
-                        quotas[key] = _quota_code(name, *key), float(has[0] or 0.0)
+                        quotas[key] = str(codes.get_quota_code(*key) or ""), float(has[0] or 0.0)
     fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in prices}}
     offers = [Offer(p, price, "catalogue", fetched[p.cloud]) for p, price in prices.items()]
     offers.sort(key=lambda o: (o.usd_per_hour, o.placement))
@@ -131,13 +132,6 @@ def _price(cloud: str, machine: Any) -> Callable[[str, str | None], float]:
     return lambda *place: search(own, machine.instance_type, machine.use_spot, *place)
 
 
-def _quota_code(cloud: str, instance: str, spot: bool) -> str:
-    if cloud != "aws":
-        return ""
-    codes = importlib.import_module("sky.catalog.aws_catalog")
-    return str(codes.get_quota_code(instance, spot) or "")
-
-
 def _fetched_at(cloud: str) -> float:
     """Return when SkyPilot last fetched a cloud's catalogue: seconds since the epoch, 0 unknown."""
     try:
@@ -159,5 +153,4 @@ def best(offers: Sequence[Offer]) -> tuple[list[Offer], Mapping[Placement, Seque
         first.placement: [o for o in rest if o.usd_per_hour <= 2 * first.usd_per_hour]
         for first, *rest in (found[:CHOICES] for found in by_supply.values())
     }
-    firsts = [found[0] for found in by_supply.values()]
-    return sorted(firsts, key=lambda o: (o.usd_per_hour, o.placement)), instead
+    return [found[0] for found in by_supply.values()], instead

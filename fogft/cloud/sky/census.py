@@ -53,7 +53,7 @@ class Census:
     def terminate(self, instance: Instance) -> None:
         """Ask for the end of an instance. Raises CloudUnreachable: it may run on."""
         try:
-            self.providers[instance.placement.cloud].terminate([instance])
+            self.providers[instance.placement.cloud].terminate(instance)
         except NotAllowedError as error:
             raise CloudUnreachable(f"no permission to end {instance.key}: {error}") from error
 

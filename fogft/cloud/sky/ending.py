@@ -41,7 +41,11 @@ class Ending:
         name = cluster_name(id)
         trouble: Exception | None = None
         begun_at = self.clock()
-        quiet, enough = 0, self._looks_needed(id)
+        entry = self.journal.get(id)
+        # Nothing must be found twice where SkyPilot may yet hear of the order.
+        heard = entry is None or entry.request or begun_at - entry.launched_at >= _HEARD_WITHIN_S
+        enough = 1 if heard else 2
+        quiet = 0
         for attempt in range(_TRIES + enough - 1):
             if attempt:
                 if self.clock() - begun_at > _LIMIT_S:
@@ -68,13 +72,6 @@ class Ending:
             f"check with `sky status --refresh {name}`, end it with `sky down {name}`, and search "
             f"the cloud's console for machines with the label `fogft-pool={id.pool_uid}`",
         ) from trouble
-
-    def _looks_needed(self, id: ReplicaId) -> int:
-        """Return how often nothing must be found: twice if SkyPilot may yet hear of the order."""
-        entry = self.journal.get(id)
-        on_its_way = entry is not None and not entry.request
-        young = entry is not None and self.clock() - entry.launched_at < _HEARD_WITHIN_S
-        return 2 if on_its_way and young else 1
 
     def _left(self, id: ReplicaId, name: str) -> list[str]:
         """Return what still exists; ask the provider to end what SkyPilot did not."""

@@ -24,10 +24,8 @@ from fogft.reason_words import words as in_words
 log = logging.getLogger(__name__)
 
 JOB_PAUSE_S = 20.0
-"""Shortest pause before and between questions about a job. For each SkyPilot runs three programs
-on the machine over ssh, in one of its few workers, and holds up whoever wants something of the
-same machine: it takes some ten seconds of processor time. So nobody asks before `setup` can have
-ended, and the pause grows with the time that an answer takes."""
+"""Shortest pause before and between questions about a job. For each SkyPilot takes some ten seconds
+of processor time, in one of its few workers; the pause grows with the time that an answer takes."""
 
 _TRIES_LINES = 400  # of a launch's log: what its last tries have come to
 ASK_LIMIT_S = 180.0

@@ -51,15 +51,11 @@ class Gcp(Provider):
         ours = [i for i in found if i and (where is None or i.placement.region in where)]
         return sorted(ours, key=lambda i: (i.id, i.key))
 
-    def terminate(self, instances: Iterable[Instance]) -> None:
+    def terminate(self, instance: Instance) -> None:
         """See `Provider`."""
-        for instance in instances:
-            self._ask("DELETE", instance.key, gone_is_done=True)
+        self._ask("DELETE", instance.key)
 
-    def _ask(
-        self, method: str, path: str, asked: Mapping[str, Any] | None = None, *,
-        gone_is_done: bool = False,
-    ) -> Mapping[str, Any]:  # fmt: skip
+    def _ask(self, method: str, path: str, asked: Any = None) -> Mapping[str, Any]:
         try:
             session, project = self._session()
             url = f"{self._api}/{project}/{path}"
@@ -73,7 +69,7 @@ class Gcp(Provider):
             hint = "renew the GCP credentials; `sky check gcp` tests them"
             raise CloudUnreachable(f"GCP did not answer: {error}", hint) from error
         status = answer.status_code
-        if status < 400 or (status == 404 and gone_is_done):
+        if status < 400 or (method == "DELETE" and status == 404):
             return dict(told)
         words = f"{status}: {(told.get('error') or {}).get('message', '')}"
         if status in (403, 404):

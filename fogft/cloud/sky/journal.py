@@ -79,7 +79,7 @@ class Journal:
             make_folder(folder)
             for name, content in files.items():
                 write_whole(folder / name, content)
-            self._write(entry)
+            write_json(self._path(entry.id), to_plain(entry))
             return True
 
     def update(self, id: ReplicaId, **changes: Any) -> Entry | None:
@@ -93,7 +93,7 @@ class Journal:
                 changes = {k: v for k, v in changes.items() if k not in ("stage", "failure")}
             changed = replace(entry, **changes)
             if changed != entry:
-                self._write(changed)
+                write_json(self._path(id), to_plain(changed))
             return changed
 
     def close(self, id: ReplicaId) -> None:
@@ -124,6 +124,3 @@ class Journal:
 
     def _path(self, id: ReplicaId) -> Path:
         return self._folder / f"{cluster_name(id)}.json"
-
-    def _write(self, entry: Entry) -> None:
-        write_json(self._path(entry.id), to_plain(entry))

@@ -36,11 +36,6 @@ def cluster_name(id: ReplicaId) -> str:
     return name
 
 
-def clusters_of(pool_uid: str) -> str:
-    """Return the pattern of the names of a pool's clusters."""
-    return f"{PREFIX}{pool_uid}-*"
-
-
 def replica_of(name: str) -> ReplicaId | None:
     """Return whose cluster a name belongs to, or None when it is not one of ours."""
     match = _NAME.fullmatch(name)

@@ -115,29 +115,26 @@ class Prices:
 
     def _within_quotas(self, sale: Sale, left_out: list[str]) -> Sequence[Offer]:
         """Return the offers that the account's quotas have room for, were nothing else running."""
-
-        def asked(place: Placement) -> tuple[str, str, str]:
-            code, _ = sale.quotas.get((place.instance, place.spot), ("", 0.0))
-            return place.cloud, place.region, code
-
-        places = (o.placement for o in sale.offers if o.placement.cloud in self.providers)
-        wanted = {quota for quota in map(asked, places) if quota[2]}
-        if not wanted:
+        needed: dict[Placement, tuple[tuple[str, str, str], float]] = {}  # which quota, how much
+        for place in (offer.placement for offer in sale.offers):
+            code, vcpus = sale.quotas.get((place.instance, place.spot), ("", 0.0))
+            if code and place.cloud in self.providers:
+                needed[place] = (place.cloud, place.region, code), vcpus
+        if not needed:
             return sale.offers
-        limits = _side_by_side(wanted, self._quota)
+        limits = _side_by_side({quota for quota, _ in needed.values()}, self._quota)
         left_out += self._unread.values()
         kept = []
         for offer in sale.offers:
-            place, limit = offer.placement, limits.get(asked(offer.placement))
-            code, needs = sale.quotas.get((place.instance, place.spot), ("", 0.0))
-            if limit is None or limit >= needs:
+            (cloud, region, code), vcpus = needed.get(offer.placement, (("", "", ""), 0.0))
+            limit = limits.get((cloud, region, code))
+            if limit is None or limit >= vcpus:
                 kept.append(offer)
                 continue
-            kind = "spot" if place.spot else "on demand"
-            where = f"{place.cloud}/{place.region}"
+            kind = "spot" if offer.placement.spot else "on demand"
             said = (
-                f"`{place.instance}` {kind} in `{where}` is left out: the quota {code} "
-                f"allows {limit:g} vCPUs, but it needs {needs:g}; request an increase"
+                f"`{offer.placement.instance}` {kind} in `{cloud}/{region}` is left out: the quota "
+                f"{code} allows {limit:g} vCPUs, but it needs {vcpus:g}; request an increase"
             )
             if said not in left_out:  # once for all its zones
                 left_out.append(said)
@@ -203,23 +200,22 @@ def _side_by_side(wanted: Collection[K], ask: Callable[[K], V]) -> dict[K, V]:
 
 
 def _with_extras(offer: Offer, resources: Mapping[str, Any]) -> Offer:
-    disk_size = alternative(resources, offer.placement).get("disk_size", DISK_GB)
-    more = extras_usd_per_hour(offer.placement, disk_size)
+    more = extras_usd_per_hour(offer.placement, resources)
     return replace(offer, usd_per_hour=offer.usd_per_hour + more, extras_usd_per_hour=more)
 
 
-def extras_usd_per_hour(placement: Placement, disk_size: Any) -> float:
-    """Return what an address and a disk of a `disk_size` cost."""
-    cloud = placement.cloud
-    address = ADDRESS_USD_PER_HOUR.get(cloud, 0.0)
+def extras_usd_per_hour(placement: Placement, resources: Mapping[str, Any]) -> float:
+    """Return what the address and the disk of a machine of a `resources` section cost."""
+    address = ADDRESS_USD_PER_HOUR.get(placement.cloud, 0.0)
     if placement.spot:
-        address = SPOT_ADDRESS_USD_PER_HOUR.get(cloud, address)
-    return address + disk_usd_per_hour(cloud, disk_size)
+        address = SPOT_ADDRESS_USD_PER_HOUR.get(placement.cloud, address)
+    return address + disk_usd_per_hour(placement, resources)
 
 
-def disk_usd_per_hour(cloud: str, disk_size: Any) -> float:
-    """Return what a disk of a `disk_size` costs."""
-    return disk_gb(disk_size) * DISK_USD_PER_GB_MONTH.get(cloud, 0.0) / HOURS_A_MONTH
+def disk_usd_per_hour(placement: Placement, resources: Mapping[str, Any]) -> float:
+    """Return what the disk of a machine of a `resources` section costs."""
+    size_gb = disk_gb(alternative(resources, placement).get("disk_size", DISK_GB))
+    return size_gb * DISK_USD_PER_GB_MONTH.get(placement.cloud, 0.0) / HOURS_A_MONTH
 
 
 def disk_gb(asked: Any) -> float:

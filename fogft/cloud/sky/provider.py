@@ -35,15 +35,13 @@ class Provider(Protocol):
     and `NotAllowedError` where the account may not.
     """
 
-    @property
-    def cloud(self) -> str:
-        """Its name, as in `Placement.cloud`."""
+    cloud: str  # as in `Placement.cloud`
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
         """List what has our labels, of one pool or (empty) all, in some regions or (None) all."""
 
-    def terminate(self, instances: Iterable[Instance]) -> None:
-        """Ask for the end of instances. Those that are gone are no error."""
+    def terminate(self, instance: Instance) -> None:
+        """Ask for the end of an instance. One that is gone is no error."""
 
     def end_when_shut_down(self, instance: Instance) -> None:
         """Have a machine on demand end, and not merely stop, when it shuts itself down."""

@@ -53,7 +53,7 @@ class Settings:
             self._launched |= ENDED_BY_FILES.intersection(clouds)
             changes: list[str] = []
             if id is not None:
-                changes += _with_group(config, naming.clusters_of(id.pool_uid), group)
+                changes += _with_group(config, f"{naming.PREFIX}{id.pool_uid}-*", group)
             given = list(config.get_nested(GUARD, []) or [])
             if guard() not in given:
                 value = json.dumps([*given, guard()])
