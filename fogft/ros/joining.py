@@ -11,7 +11,7 @@ from typing import Any
 
 from fogft.errors import RosError
 from fogft.ros import spdp
-from fogft.ros.shared_memory import dead_ports_held, make_private
+from fogft.ros.shared_memory import break_dead_ports, make_private
 
 log = logging.getLogger(__name__)
 
@@ -43,15 +43,15 @@ def bare_node(name: str, context: Any) -> Any:
     import rclpy
     from rclpy.parameter import Parameter
 
-    with dead_ports_held(context.get_domain_id()):
-        node = rclpy.create_node(
-            name,
-            context=context,
-            use_global_arguments=False,
-            enable_rosout=False,
-            start_parameter_services=False,
-            parameter_overrides=[Parameter("start_type_description_service", value=False)],
-        )
+    break_dead_ports()
+    node = rclpy.create_node(
+        name,
+        context=context,
+        use_global_arguments=False,
+        enable_rosout=False,
+        start_parameter_services=False,
+        parameter_overrides=[Parameter("start_type_description_service", value=False)],
+    )
     make_private()
     return node
 
@@ -105,7 +105,8 @@ class EarlyJoin:
     """A participant that others discover before it offers anything.
 
     The participant comes with a context's first node. Its node offers nothing, and ROS's tools hide
-    it if its name begins with an underscore; it ends once there is another one.
+    it if its name begins with an underscore. `introduction` is what introduces it: to end that soon
+    would cost whole seconds.
 
     Raises RosError: ROS 2 is not usable here.
     """
@@ -116,22 +117,23 @@ class EarlyJoin:
             self._node = bare_node(name, self.context)
         except Exception as error:  # ImportError, or rclpy's
             raise RosError(f"ROS 2 cannot be used here: {error}") from error
-        self._introduction = spdp.Introduction(self.context.get_domain_id())
+        self.introduction = spdp.Introduction(self.context.get_domain_id())
         self._timers = Timers()
 
     def look(self) -> None:
         """Keep the participant known to others. Call it every second or more often."""
         self._timers.look(self._node)
 
-    def done(self) -> spdp.Introduction:
-        """End the hidden node, because another node uses the participant now.
+    def end_node(self) -> None:
+        """End the hidden node: another node uses the participant, and is known to those that run.
 
-        Returns what may still be introducing it: to end that early would cost whole seconds.
+        Not earlier: where an endpoint ends while others are still told of it, Fast DDS tells them
+        nothing more for a second.
         """
         self._node.destroy_node()
-        return self._introduction
 
     def close(self) -> None:
         """Leave the domain, if no node has taken over the context."""
-        self.done().close()
+        self.end_node()
+        self.introduction.close()
         self.context.try_shutdown()

@@ -38,6 +38,9 @@ E = TypeVar("E", Server, Client, Publisher, Subscription)
 
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
 _KEPT = 5000  # Fast DDS keeps no more of any kind
+_KNOWN_AFTER_S = (
+    2.0  # until those that run have been told of a new node, many or busy as they may be
+)
 _NO_LIMIT = -1  # of rcl_wait: until something happens
 _REST = 9  # times what a new wait set takes, until the next one: many entities may be made in a row
 
@@ -103,7 +106,8 @@ class SerialisedNode:
             raise
         self._ports = PortWatch()
         domain_id = self._context.get_domain_id()
-        self._introduction = early.done() if early is not None else spdp.Introduction(domain_id)
+        self._early, self._known_at = early, time.monotonic() + _KNOWN_AFTER_S
+        self._introduction = early.introduction if early else spdp.Introduction(domain_id)
 
     @property
     def alive(self) -> bool:
@@ -304,6 +308,9 @@ class SerialisedNode:
         with self._create_lock:
             if not self._stopping and not self._ended.is_set():
                 self._timers.look(self._node)
+                if self._early is not None and time.monotonic() > self._known_at:
+                    self._early.end_node()
+                    self._early = None
 
     def _add(self, name: str, create: Callable[[], E]) -> E:
         """Create an entity, and have the take loop attend to it."""

@@ -25,20 +25,16 @@ import ctypes
 import fcntl
 import os
 import re
-import socket
 import struct
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from fogft.ros import spdp
-
 SETTLED_S = 2.0
 FOLDER = Path("/dev/shm")
 
 _TURN_LIMIT_S = 5.0
-_HELD_IDS = 24  # of a machine's participants: on `LOCALHOST` ROS finds those below 32
 _IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
 _PORT_EVENT = re.compile(rb"\0fast(?:dds|rtps)_port\d+\0")
 _REMOVED = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+) \(deleted\)")
@@ -135,23 +131,24 @@ def make_private() -> None:
                 (FOLDER / name).chmod(0o600)
 
 
-@contextlib.contextmanager
-def dead_ports_held(domain_id: int) -> Iterator[None]:
-    """Have a participant that is made meanwhile take no port of a process that has died.
+def break_dead_ports() -> set[str]:
+    """Mark the ports of killed processes as broken, so that who has one opens it anew; return them.
 
-    A client that wrote to the dead one would write to its memory for seconds more. A participant
-    takes the first number of which it can bind both UDP ports; its shared memory has the second's.
+    A process that wrote to one would do so for a second more, though nobody reads it, once a new
+    participant has its number.
     """
-    first = spdp.first_port(domain_id)
-    left = {path.name.rpartition("port")[2] for path in FOLDER.glob("fast*_port*")}
-    with contextlib.ExitStack() as held:
-        for port in range(first, first + 2 * _HELD_IDS, 2):
-            if str(port + 1) in left:
-                for number in (port, port + 1):
-                    sock = held.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
-                    with contextlib.suppress(OSError):  # it is alive
-                        sock.bind(("", number))
-        yield
+    broken = set[str]()
+    for path in FOLDER.glob("fast*_port*"):
+        number = path.name.rpartition("port")[2]
+        if number.isdigit() and semaphore(path.name, "sem_trywait"):
+            try:
+                if not any(_locked(path.name + beside) for beside in ("_el", "_sl")):
+                    with contextlib.suppress(OSError), path.open("r+b", buffering=0) as port:
+                        if _mark_broken(port.fileno(), 0, int(number)):
+                            broken.add(path.name)
+            finally:
+                semaphore(path.name, "sem_post")
+    return broken
 
 
 class PortWatch:

@@ -49,6 +49,21 @@ def test_no_other_user_can_read_what_a_node_sends(
     assert {Path(one).stat().st_mode & 0o777 for one in segments} == {0o600}
 
 
+def test_a_first_node_ends_once_the_next_one_is_known(ros_domain: int) -> None:
+    """If it ended at once, Fast DDS could tell those that run of the next one a second later."""
+    from fogft.ros.joining import EarlyJoin, bare_node, new_context
+    from fogft.ros.node import SerialisedNode
+
+    watcher = bare_node("watcher", new_context(ros_domain))
+    early = EarlyJoin("_first", ros_domain)
+    with closing(SerialisedNode("next", ros_domain, early=early)) as node:
+        node.look()
+        wait_for(lambda: {"_first", "next"} <= set(watcher.get_node_names()), "discovery")
+        wait_for(lambda: (node.look(), "_first" not in watcher.get_node_names())[1], "its end")
+        assert "next" in watcher.get_node_names()
+    watcher.context.try_shutdown()
+
+
 def test_a_requests_handle_tells_whose_client_asked(ros_domain: int) -> None:
     """Whatever the middleware's handles are made of; of two clients, each has its own node."""
     from fogft.ros.node import SerialisedNode

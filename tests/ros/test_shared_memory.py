@@ -273,9 +273,9 @@ def test_ports_are_looked_at_when_one_goes_and_not_for_the_files_beside_it(
     assert looks.empty()
 
 
-def _other_node(domain: int) -> subprocess.Popen[str]:
+def _other_node(domain: int, program: str = NODE) -> subprocess.Popen[str]:
     process = subprocess.Popen(
-        [sys.executable, "-c", NODE, str(domain)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", program, str(domain)], stdout=subprocess.PIPE, text=True
     )
     expect_line(process, "up")
     return process
@@ -283,22 +283,18 @@ def _other_node(domain: int) -> subprocess.Popen[str]:
 
 @pytest.mark.ros
 @needs("fastdds")
-def test_a_new_participant_takes_no_port_of_one_that_was_killed(
-    make_node: Callable[[int], Any], ros_domain: int
-) -> None:
-    """A client of the killed one would write to its memory for seconds more."""
+def test_the_ports_of_killed_processes_are_broken_and_others_not(ros_domain: int) -> None:
+    """A client of the killed one would write to its memory when a new one has its number."""
     first = spdp.first_port(ros_domain)
-    killed = _other_node(ros_domain)
-    left = _ports_of(killed.pid, first)
-    killed.kill()
-    killed.wait()
-    assert left
-    assert left <= set(os.listdir(shared_memory.FOLDER))
-    node = make_node(ros_domain)
-    assert node.alive
-    own = _ports_of(os.getpid(), first)
-    assert own
-    assert not left & own
+    process = _other_node(ros_domain)
+    ports = _ports_of(process.pid, first)
+    alive = shared_memory.break_dead_ports()
+    process.kill()
+    process.wait()
+    assert ports
+    assert not ports & alive
+    assert ports <= shared_memory.break_dead_ports()
+    assert not ports & shared_memory.break_dead_ports()
 
 
 @pytest.mark.ros
@@ -310,9 +306,11 @@ def test_what_fast_dds_complains_of_is_no_part_of_the_output(ros_domain: int) ->
     """
     first = spdp.first_port(ros_domain) + 1
     with contextlib.ExitStack() as held:
-        for number in range(first, first + 20, 2):  # some may be left by another test
+        for number in range(first, first + 20, 2):
             for begin in ("fastdds", "fastrtps"):
-                lock = shared_memory.FOLDER / f"{begin}_port{number}_el"
+                port = shared_memory.FOLDER / f"{begin}_port{number}"
+                port.unlink(missing_ok=True)  # it may be left by another test
+                lock = port.with_name(f"{port.name}_el")
                 held.callback(lock.unlink, missing_ok=True)
                 fcntl.flock(held.enter_context(lock.open("w")), fcntl.LOCK_EX)
         process = subprocess.run(
@@ -331,6 +329,16 @@ def _ports_of(pid: int, first: int) -> set[str]:
     }
     return _names_of(pid) & names
 
+
+ORDINARY = """
+import sys, rclpy
+from std_srvs.srv import SetBool
+rclpy.init(domain_id=int(sys.argv[1]))
+node = rclpy.create_node("left")
+node.create_service(SetBool, "/left", lambda _, response: response)
+print("up", flush=True)
+rclpy.spin(node)
+"""
 
 CALLER = """
 import sys, rclpy
@@ -355,7 +363,7 @@ def test_a_port_that_a_successor_removed_is_known_by_its_bytes(ros_domain: int) 
     """
     environ = {**os.environ, "ROS_DOMAIN_ID": str(ros_domain)}
     command, pipe = [sys.executable, "-c", CALLER], subprocess.PIPE
-    killed = _other_node(ros_domain)
+    killed = _other_node(ros_domain, ORDINARY)
     caller = subprocess.Popen(command, env=environ, stdin=pipe, stdout=pipe, text=True)
     try:
         assert _broken(caller) == 0
@@ -363,7 +371,7 @@ def test_a_port_that_a_successor_removed_is_known_by_its_bytes(ros_domain: int) 
         for _ in range(3):
             killed.kill()
             killed.wait()
-            killed = _other_node(ros_domain)
+            killed = _other_node(ros_domain, ORDINARY)
             found = found or _broken(caller)
         assert found > 0
     finally:
