@@ -1,11 +1,8 @@
 """How often a replica, and a whole pool of them, is down. Pure arithmetic.
 
-A pool is down while all its replicas are: for replicas that fail independently, for the product
-of their unavailabilities, which is the best case. Real preemptions are correlated, and the model
-is exact for any replicas. docs/design/availability.md describes it.
+docs/design/availability.md describes the model, which is exact for any replicas.
 
-Source: FogROS2-FT, section III.C. The paper prints the fraction for N upside down; its
-own figures (15 h up, 20 min recovery: 2.17 % for one, 0.047 % for two) agree with this.
+Source: FogROS2-FT, section III.C, which prints the fraction for N upside down.
 Not here: how many are launched (`sizing`).
 """
 
@@ -36,10 +33,7 @@ def unavailability(uptime_s: float, recovery_s: float) -> float:
 
 
 def system_unavailability(replicas: Iterable[float]) -> float:
-    """Return the fraction of time that no replica answers, by each one's unavailability.
-
-    Raises ValueError: one is not in [0, 1].
-    """
+    """Return the product of unavailabilities. Raises ValueError: one is not in [0, 1]."""
     product = 1.0
     for value in replicas:
         if not 0 <= value <= 1:
@@ -102,9 +96,8 @@ def full_together(sold: Collection[Placement], assumed: Assumption) -> float:
     """Return the fraction of time without capacity anywhere, now or one recovery ago.
 
     Locations that are full together for a share f of the time are like log(f) / log(`no_room`)
-    that are full independently: so often does one of them end it.
-
-    Spot machines are up while their location has room.
+    that are full independently: so often does one of them end it. Spot machines are up while their
+    location has room.
     """
     share = assumed.no_room
     full = joint_unavailability([(place, share) for place in sold], assumed.correlation)
@@ -158,11 +151,10 @@ class _Grid:
 
     def down(self, members: Sequence[float], follow: float) -> list[float]:
         """Return how likely all members are down, given their zone's value."""
-
-        def given(start: float) -> float:
-            return math.prod(follow * (start < q) + (1 - follow) * q for q in members)
-
-        return [given(start) for start in self._starts]
+        return [
+            math.prod(follow * (start < q) + (1 - follow) * q for q in members)
+            for start in self._starts
+        ]
 
     def followed(self, inner: list[float], follow: float) -> list[float]:
         """Return a domain's function, given the value of the domain that it lies in."""

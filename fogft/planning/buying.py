@@ -58,7 +58,6 @@ class Buyer:
         self.groups, self.cap = self.sized.groups, self.sized.max_usd_per_hour
         self._catalogue = catalogue(self.observed.offers)
         self._markets: dict[tuple[object, ...], Market] = {}
-        self._whole: dict[tuple[str, bool | None], Market] = {}
         self.scale = Scale(self.spec.placement.latency_weight, self.observed.rtt_s, self.spec.name)
         wrong = self._catalogue.impossible
         if wrong:
@@ -187,9 +186,9 @@ class Buyer:
     def whole_market(self, group: Group, spot: bool | None) -> Market:
         """Return the offers for a group as if no location were backing off."""
         key = (group.name, spot)
-        if key not in self._whole:
-            self._whole[key] = Market(self._listing(group, spot), hazards=self.hazards)
-        return self._whole[key]
+        if key not in self._markets:
+            self._markets[key] = Market(self._listing(group, spot), hazards=self.hazards)
+        return self._markets[key]
 
     def _listing(self, group: Group, spot: bool | None) -> Listing:
         return self._catalogue.listing(group.name, spot, self.intent.excluded, self.scale)

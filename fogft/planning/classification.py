@@ -62,10 +62,7 @@ class Classification:
 
     @property
     def live(self) -> int:
-        """Machines that count against `replicas + max_surge`.
-
-        Not those that are lost or have failed, whether or not they were asked to end.
-        """
+        """Machines that count against `replicas + max_surge`: neither lost nor failed ones."""
         exempt = (Verdict.FAILED, Verdict.LEAVING, Verdict.UNRESPONSIVE)
         kept = len(self.good) + len(self.replaced) + len(self.aborted)
         return kept + sum(s.verdict not in exempt for s in self.ending)

@@ -93,9 +93,8 @@ def choose_endings(
         chooser.end_some(kept, spare, Cause.ENOUGH_SPOT)
 
 
-def _by_expendability(replicas: Iterable[Assessment], *, dear_first: bool) -> list[Assessment]:
+def _by_expendability(replicas: list[Assessment], *, dear_first: bool) -> list[Assessment]:
     """Sort: not serving, then longest draining, then most crowded domain, then highest slot."""
-    replicas = list(replicas)
     count = crowding(s.placement for s in replicas)
 
     def rank(s: Assessment) -> tuple[bool, bool, float, float, int, int, int, int, int]:

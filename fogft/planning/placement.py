@@ -45,9 +45,6 @@ class Market:
         avoid: Locations to use only when no other is left: one was lost there lately.
         full: Locations that hold as many replicas as may be lost at once.
         hazards: Location -> losses per hour, as far as known.
-
-    Attributes:
-        backing_off: The supplies that it would have, where all that it sells backs off; else empty.
     """
 
     def __init__(
@@ -62,7 +59,7 @@ class Market:
         pauses = backing_off or {}
         self._avoid = frozenset(avoid)
         self._nothing = listing.trouble
-        self.backing_off: Mapping[str, Backoff] = {}
+        self.backing_off: Mapping[str, Backoff] = {}  # of all that it sells, where all of it does
         self.rows, self._clouds = listing.rows, listing.clouds
         if hazards:
             self.rows = _weighed(self.rows, hazards)

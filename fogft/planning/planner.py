@@ -57,7 +57,6 @@ def plan(pool_uid: str, inputs: Inputs, *, health: Health | None = None) -> Plan
     """Plan changes that bring the pool closer to its spec, within the safety rules.
 
     It is planned again on the world as it is once a plan is under way, until nothing is added.
-
     `health` is what `judge` makes of these very inputs, where that is known already.
     """
     health = health or judge(pool_uid, inputs.spec, inputs.observed, inputs.history)
@@ -297,10 +296,8 @@ def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessm
 def _within_cap(buyer: Buyer) -> tuple[Sequence[int], list[Reason]]:
     """Return how many are wanted of each group: one fewer while those at hand exceed the cap.
 
-    No launch exceeds the cap: this is for one that was lowered, by a schedule or in the file.
-    So a price that has risen since the order counts for nothing here, and one that has fallen
-    does: with it more were launched. The last group gives first, one at a time, and one replica
-    always stays.
+    For a cap that was lowered: no launch exceeds it. A price that has risen since the order counts
+    for nothing, and one that has fallen does: with it more were launched. One replica always stays.
     """
     machines = buyer.machines
     cap, counts, groups = buyer.cap, list(buyer.sized.counts), buyer.groups

@@ -178,9 +178,7 @@ def describe(
 ) -> Update | None:
     """Return the update in progress, or the one given up; None without one.
 
-    Args:
-        spec: The file in force, by which `health` was judged: after a rollback the good one.
-        good: The last good one; None before a pool was first ready.
+    `spec` is the file in force, by which `health` was judged: after a rollback the good one.
     """
     if good is None:
         return None

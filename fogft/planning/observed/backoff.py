@@ -51,10 +51,7 @@ def backing_off(history: History, now: float) -> Mapping[str, Backoff]:
 
 
 def recently_failed(history: History, now: float) -> Mapping[str, Backoff]:
-    """Return the supplies that failed within FORGIVE_S and have not proved themselves since.
-
-    Only the last failure counts.
-    """
+    """Return the supplies that failed within FORGIVE_S and have not proved themselves since."""
     found = _supplies(history, now).items()
     last = {supply: one.bad[-1] for supply, one in found if one.bad}
     return {

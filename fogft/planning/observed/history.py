@@ -12,7 +12,7 @@ from __future__ import annotations
 import copy
 from bisect import insort
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
 from operator import itemgetter
@@ -146,8 +146,8 @@ class History:
         self.rates: dict[str, tuple[float, float]] = {}
         self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
         self.version = 0  # of all facts: counts events
-        self._fruitless: dict[str, list[Record]] = {}  # by version: failed for a reason of its own
-        self._ready_versions: set[str] = set()
+        self.fruitless: dict[str, list[Record]] = {}  # by version: failed for a reason of its own
+        self.ready_versions: set[str] = set()
         # Whether on demand -> those of the last hour before the latest one.
         self.launches: dict[bool, list[Record]] = {False: [], True: []}
         for event in events:
@@ -228,7 +228,7 @@ class History:
                 record.first_ready_at = event.at
             record.unready_since = None
             if record.version:
-                self._ready_versions.add(record.version)
+                self.ready_versions.add(record.version)
             self.served[record.slot] = max(self.served[record.slot], record.generation)
             self._proven_at[record.supply] = event.at
         elif kind is EventKind.UNREADY:
@@ -243,7 +243,7 @@ class History:
             record.failed = True
             record.fault = event.reason or _NO_FAULT
             if fault_of(event.reason) in OWN_FAULTS:
-                self._fruitless.setdefault(record.version, []).append(record)
+                self.fruitless.setdefault(record.version, []).append(record)
             self._fail(record, event)
 
     def _close(self, record: Record, event: Event) -> None:
@@ -287,18 +287,10 @@ class History:
         """Every location with a launch."""
         return frozenset(record.location for record in self._records.values())
 
-    def fruitless(self, version: str) -> Sequence[Record]:
-        """Return the launches of a version that failed by its own fault, oldest first."""
-        return self._fruitless.get(version, ()) if version else ()
-
-    def was_ready(self, version: str) -> bool:
-        """Whether a launch of a version was ever ready."""
-        return version in self._ready_versions
-
     def proofs(self) -> set[tuple[int, int]]:
         """Return the launches that prove whether a version ever served: slot and generation."""
-        failed = [record for records in self._fruitless.values() for record in records[-_PROOFS:]]
-        ready = {r.version: r for r in self._records.values() if r.version in self._ready_versions
+        failed = [record for records in self.fruitless.values() for record in records[-_PROOFS:]]
+        ready = {r.version: r for r in self._records.values() if r.version in self.ready_versions
                  and r.first_ready_at is not None}  # fmt: skip
         return {(record.slot, record.generation) for record in (*failed, *ready.values())}
 

@@ -22,9 +22,10 @@ def given_up(history: History, version: str, since: float) -> Reason | None:
 
     What was launched before `since` does not count: the user asked for it again.
     """
-    if history.was_ready(version):
+    if version in history.ready_versions:
         return None
-    failed = [record for record in history.fruitless(version) if record.launched_at >= since]
+    fruitless = history.fruitless.get(version, ())
+    failed = [record for record in fruitless if record.launched_at >= since]
     if max(Counter(record.slot for record in failed).values(), default=0) < GIVE_UP_AFTER:
         return None
     return Reason(Cause.NEVER_READY, count=len(failed), because=(failed[-1].fault,))
