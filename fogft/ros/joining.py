@@ -43,7 +43,7 @@ def bare_node(name: str, context: Any) -> Any:
     import rclpy
     from rclpy.parameter import Parameter
 
-    break_dead_ports()
+    break_dead_ports(context.get_domain_id())
     node = rclpy.create_node(
         name,
         context=context,

@@ -31,6 +31,8 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from fogft.ros import spdp
+
 SETTLED_S = 2.0
 FOLDER = Path("/dev/shm")
 
@@ -131,20 +133,21 @@ def make_private() -> None:
                 (FOLDER / name).chmod(0o600)
 
 
-def break_dead_ports() -> set[str]:
-    """Mark the ports of killed processes as broken, so that who has one opens it anew; return them.
+def break_dead_ports(domain_id: int) -> set[str]:
+    """Mark a domain's ports of killed processes as broken, so that who has one opens it anew.
 
     A process that wrote to one would do so for a second more, though nobody reads it, once a new
-    participant has its number.
+    participant has its number. Returns their names.
     """
-    broken = set[str]()
+    broken, first = set[str](), spdp.first_port(domain_id)
+    ports = {str(number) for number in range(first, first + spdp.DOMAIN_GAIN)}
     for path in FOLDER.glob("fast*_port*"):
         number = path.name.rpartition("port")[2]
-        if number.isdigit() and semaphore(path.name, "sem_trywait"):
+        if number in ports and semaphore(path.name, "sem_trywait"):
             try:
                 if not any(_locked(path.name + beside) for beside in ("_el", "_sl")):
-                    with contextlib.suppress(OSError), path.open("r+b", buffering=0) as port:
-                        if _mark_broken(port.fileno(), 0, int(number)):
+                    with contextlib.suppress(OSError), path.open("r+b", buffering=0) as memory:
+                        if _mark_broken(memory.fileno(), 0, int(number)):
                             broken.add(path.name)
             finally:
                 semaphore(path.name, "sem_post")
