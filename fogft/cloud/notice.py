@@ -33,12 +33,10 @@ _ELSEWHERE = {"aws": "AWS_EC2_METADATA_SERVICE_ENDPOINT", "gcp": "GCE_METADATA_H
 
 
 class Watch:
-    """A watch on a thread of its own, which runs until it is closed.
+    """A watch on a thread of its own, which calls `on_notice` once for each kind of notice.
 
-    Args:
-        source: ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers.
-        on_notice: Called from that thread, once for each kind of notice; must not block.
-        metadata: ``host[:port]`` of the metadata server; None for where the environment says.
+    `source` is ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers;
+    `metadata` is ``host[:port]`` of the metadata server, None for where the environment says.
     """
 
     def __init__(

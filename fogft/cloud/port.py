@@ -103,8 +103,7 @@ class RealCloud(Protocol):
     ) -> Sequence[str]:
         """Return, in sentences, unneeded credentials and open ports of machines there.
 
-        `open_port` is the link's; None where the replicas dial out. Raises `CloudError`: it cannot
-        be told now.
+        `open_port`: the link's, None where replicas dial out. CloudError: it cannot be told now.
         """
 
     def unverified(self, cloud: str) -> str:
@@ -116,8 +115,7 @@ class RealCloud(Protocol):
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
         """Write the build context of an image with a replica's environment into an empty folder.
 
-        `task` is a pool file's, with absolute paths; `image` is what it is built on. Raises
-        `SpecError` for what an image cannot have.
+        `task` has absolute paths; `image` is the base. SpecError: an image cannot have that.
         """
 
 

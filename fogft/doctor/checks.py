@@ -5,12 +5,16 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from fogft.doctor import machine, pools, ros
-from fogft.doctor.finding import Finding, Situation, run
+from fogft.doctor.finding import Check, Finding, Situation, run
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 from fogft.poolfile.file import read
 
-ALL = (*machine.CHECKS, *ros.CHECKS, *pools.CHECKS)
+ALL: tuple[Check, ...] = (
+    *(machine.installation, machine.state_folder, machine.shared_memory, machine.ports),
+    *(machine.clock, ros.rclpy, ros.domain, ros.profile, ros.discovery),
+    *(pools.orphaned_processes, pools.chaos, pools.pool_file, pools.certificates, pools.processes),
+)
 
 
 def examine(file: Path | None = None) -> Iterator[Finding]:
@@ -18,4 +22,4 @@ def examine(file: Path | None = None) -> Iterator[Finding]:
     spec = None if file is None else read(file)
     pools_here = tuple(composition.pools())
     for check in ALL:  # some take seconds, and a report's age is told from now
-        yield from run((check,), Situation(home(), pools_here, spec, time.time()))
+        yield from run(check, Situation(home(), pools_here, spec, time.time()))

@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import fogft
-from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
+from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.model.names import LINK_PORT
 
 _SHARED_MEMORY = Path("/dev/shm")
@@ -112,6 +112,3 @@ def clock(situation: Situation) -> Iterator[Finding]:
 
 def _megabytes(size: float) -> str:
     return f"{size / 2**30:.1f} GiB" if size >= 2**30 else f"{size / 2**20:.0f} MiB"
-
-
-CHECKS: tuple[Check, ...] = (installation, state_folder, shared_memory, ports, clock)

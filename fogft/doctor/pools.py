@@ -8,7 +8,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.cloud.local import faults
 from fogft.cloud.local.processes import find
-from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
+from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.errors import CredentialError, FogftError, StateError
 from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
@@ -236,6 +236,3 @@ def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
         )
     elif up:
         yield ok("links", f"pool `{pool}`: {len(up)} of {len(reported)} up")
-
-
-CHECKS: tuple[Check, ...] = (orphaned_processes, chaos, pool_file, certificates, processes)

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import fogft
 from fogft.child import how_it_ended
-from fogft.doctor.finding import Check, Finding, Situation, fail, ok, warn
+from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.ros import environment
 
 _LIMIT_S = 30.0
@@ -219,6 +219,3 @@ def _environ() -> dict[str, str]:
     ours = str(Path(fogft.__file__).parent.parent)  # or fogft's sources are not importable there
     path = filter(None, (ours, os.environ.get("PYTHONPATH")))
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
-
-
-CHECKS: tuple[Check, ...] = (rclpy, domain, profile, discovery)

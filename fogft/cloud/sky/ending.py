@@ -1,8 +1,7 @@
 """End a replica reliably: abort its launch, take it down, and verify that it is gone.
 
-"Down" that returned without an error is not believed. SkyPilot's list is read again with a
-refresh from the cloud, and the provider is asked itself where it can be. What SkyPilot has
-forgotten is ended through the provider, by its labels.
+A "down" without an error is not believed: SkyPilot's list is read again, and the provider asked
+where it can be. What SkyPilot has forgotten is ended through the provider, by its labels.
 """
 
 import contextlib

@@ -1,8 +1,7 @@
 """Follow a launch from the order to the running job, one level-triggered step at a time.
 
-Each step reads where the launch stands, asks SkyPilot once, and writes where it stands now.
-So a step can be lost, repeated, or made by another process after a crash. A launch that
-fails or hangs is taken down at once: a machine that was made before would cost money.
+A step can be lost, repeated, or made by another process after a crash. A launch that fails or hangs
+is taken down at once: a machine that was made before would cost money.
 """
 
 import logging

@@ -48,19 +48,50 @@ LAUNCH_LIMIT_S = 120.0  # uploads `workdir` and `file_mounts`, and may start the
 DOWN_LIMIT_S = 300.0
 
 
-class Calls:
-    """Runs calls to SkyPilot with a time limit, which its client lacks.
+def _run(call: Callable[[], T], outcome: Future[T]) -> None:
+    try:
+        outcome.set_result(call())
+    except BaseException as error:  # SystemExit too: SkyPilot's client uses it
+        outcome.set_exception(error)
 
-    A call that is given up still runs, here and on the API server. Until it has ended the same
-    question is not asked again, so that a slow server is not buried under repetitions; its late
-    answer is thrown away, since it may be older than what the next asker wants to know.
+
+def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
+    """Give a call a limit; `subject` says what it is about, with its arguments filled in."""
+
+    def decorate(call: F) -> F:
+        @functools.wraps(call)
+        def limited(self: InstalledSky, *args: Any) -> Any:
+            def run() -> Any:
+                self._load()
+                return call(self, *args)
+
+            return self.within(limit_s, subject.format(*args), run)
+
+        return cast(F, limited)
+
+    return decorate
+
+
+class InstalledSky:
+    """SkyPilot's public SDK, as far as fogft uses it. From any thread.
+
+    Every call has a limit, and ends in a value or in one of these errors: `CloudUnreachable`, where
+    nothing is known and nothing may be concluded; `RefusedError`, where the answer is no.
     """
 
     def __init__(self) -> None:
-        self._given_up: dict[str, Future[Any]] = {}  # by subject
+        self._lock = threading.Lock()
+        self.sky: Any = None  # the two modules, once they are used
+        self.sdk: Any = None
+        self._given_up: dict[str, Future[Any]] = {}  # calls, by subject
+        self._settings = Settings()
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
-        """Run a call on its own thread within a limit; `subject` tells which question it is."""
+        """Run a call on its own thread within a limit, which SkyPilot's client lacks.
+
+        One that is given up still runs, here and on the API server. Until it has ended the same
+        question (`subject`) is not asked again; its late answer, old by then, is thrown away.
+        """
         ends_at = time.monotonic() + limit_s
         running = self._given_up.get(subject)
         if running is not None:
@@ -82,52 +113,9 @@ class Calls:
             "`sky api info` and `sky api logs` show the state of its API server",
         )
 
-
-def _run(call: Callable[[], T], outcome: Future[T]) -> None:
-    try:
-        outcome.set_result(call())
-    except BaseException as error:  # SystemExit too: SkyPilot's client uses it
-        outcome.set_exception(error)
-
-
-def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
-    """Give a call a limit; `subject` says what it is about, with its arguments filled in."""
-
-    def decorate(call: F) -> F:
-        @functools.wraps(call)
-        def limited(self: InstalledSky, *args: Any) -> Any:
-            def run() -> Any:
-                self._load()
-                return call(self, *args)
-
-            return self._calls.within(limit_s, subject.format(*args), run)
-
-        return cast(F, limited)
-
-    return decorate
-
-
-class InstalledSky:
-    """SkyPilot's public SDK, as far as fogft uses it. From any thread.
-
-    Every call has a limit, and ends in a value or in one of these errors, whatever SkyPilot, its
-    API server and the network do: `CloudUnreachable`, where nothing is known and nothing may be
-    concluded; `RefusedError`, where SkyPilot did the work and the answer is no.
-    """
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self.sky: Any = None  # the two modules, once they are used
-        self.sdk: Any = None
-        self._calls = Calls()
-        self._settings = Settings()
-
     @_limited(LAUNCH_LIMIT_S, "the launch of `{1}`")
     def launch(self, task: Mapping[str, Any], name: str, group: str = "") -> str:
-        """Order a cluster; return the request's id, long before the cluster runs.
-
-        `group` is the security group that it is in, on AWS; empty for SkyPilot's own.
-        """
+        """Order a cluster, in a security group on AWS; return the request's id, before it runs."""
         with as_answer():
             made = self.sky.Task.from_yaml_config(dict(task))
         cloud = str((task.get("resources") or {}).get("infra", "")).split("/")[0]
@@ -174,7 +162,7 @@ class InstalledSky:
 
         limit_s = REFRESH_LIMIT_S if refresh else ASK_LIMIT_S
         subject = f"cluster `{name}`" if name else "the list of clusters"
-        return self._calls.within(limit_s, subject, run)
+        return self.within(limit_s, subject, run)
 
     @_limited(JOB_LIMIT_S, "the job of `{0}`")
     def job(self, name: str, number: int | None) -> JobState:
@@ -284,7 +272,7 @@ class InstalledSky:
         self._load()
         out = io.StringIO()
         with contextlib.suppress(CloudError):  # a log that is missing must not hide the failure
-            self._calls.within(
+            self.within(
                 JOB_LIMIT_S,
                 f"log {id(out)}",
                 lambda: read(follow=False, tail=lines, output_stream=out),

@@ -1,9 +1,8 @@
 """The journal of launches requested from SkyPilot: one small file for each replica.
 
-SkyPilot's own list misses a launch in its first seconds, and forgets why one failed. The
-journal is written before SkyPilot is asked, so a replica is listed from then on, even
-if the manager dies in that moment. Losing it loses no machine: names and labels in the cloud
-say the same. All raise `StateError` where a file cannot be read or written.
+SkyPilot's own list misses a launch in its first seconds, and forgets why one failed. Losing the
+journal loses no machine: names and labels in the cloud say the same. All raise `StateError` where a
+file cannot be read or written.
 """
 
 import contextlib

@@ -12,17 +12,14 @@ T = TypeVar("T")
 
 @dataclass
 class Kept(Generic[T]):
-    """The answer to `ask`: asked anew by `submit` after `fresh_s`, waited for after `usable_s`.
-
-    `failed` hears why it was not renewed elsewhere.
-    """
+    """The answer to `ask`: asked anew by `submit` after `fresh_s`, waited for after `usable_s`."""
 
     ask: Callable[[], T]
     fresh_s: float
     usable_s: float
     clock: Callable[[], float]
     submit: Callable[[Callable[[], None]], object]
-    failed: Callable[[CloudError | SpecError], None]
+    failed: Callable[[CloudError | SpecError], None]  # hears why it was not renewed elsewhere
     answer: T | None = field(default=None, init=False)  # None: there was none yet
     _at: float = field(default=-math.inf, init=False)
     _renewing: bool = field(default=False, init=False)

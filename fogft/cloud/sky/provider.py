@@ -1,7 +1,6 @@
 """The provider itself, asked directly: what exists with our labels, and what it costs.
 
-SkyPilot's database is a file that can be lost; the provider's own list cannot. So every "it is
-gone" is checked there, and what SkyPilot has forgotten is found and ended there.
+SkyPilot's database can be lost; the provider's own list cannot.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -48,10 +47,9 @@ class Provider(Protocol):
         return
 
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
-        """See to what lets only some networks reach some ports; return its name for SkyPilot.
+        """Let only some networks reach some ports; return the rule's name, empty for none.
 
-        Repeatable. Raises `CloudError` where something else goes by that name. Empty where
-        SkyPilot cannot hold it.
+        Repeatable. Raises `CloudError` where something else goes by that name.
         """
         return ""
 

@@ -1,9 +1,8 @@
 """SkyPilot settings that fogft applies to a launch, unless the user has set them.
 
-A VM gets no credentials: by SkyPilot's default it would get the files of every cloud that they
-exist for, and with any of them SkyPilot's own ssh key. On AWS it gets a guard that ends it where
-no replica ever runs on it: SkyPilot sets `autostop` only when a machine is wholly set up. To an API
-server elsewhere goes the guard only: what that gives away its administrator has decided.
+A VM gets no credentials: by default it would get those of every cloud, and with any of them
+SkyPilot's own ssh key. On AWS a guard ends it where no replica ever runs on it: SkyPilot sets
+`autostop` only when a machine is wholly set up. To an API server elsewhere goes the guard only.
 """
 
 import base64

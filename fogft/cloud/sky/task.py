@@ -1,7 +1,6 @@
 """Make the SkyPilot task of one replica: the pool file's task on `templates/sky_task.yaml`.
 
-What the pool file says passes through untouched, but for the few fields that a pool decides
-itself; those are refused, since a field that is ignored is a promise broken in silence.
+All else passes through untouched; fields that a pool decides itself are refused, not ignored.
 """
 
 import copy
@@ -79,7 +78,6 @@ def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[s
 
 def build(
     order: Launch,
-    template: Mapping[str, Any],
     *,
     files: Path,
     wheel: Path,
@@ -93,6 +91,7 @@ def build(
     where the order's own placement has no capacity.
     """
     refuse_what_cannot_be_honoured(order.task)
+    template = read()
     marks = {
         "@FILES@": str(files),
         "@WHEEL@": str(wheel),
