@@ -1,4 +1,1 @@
-"""Where replicas run: the port `Cloud`, the clouds behind it, and their preemption notices.
-
-Not here: which offer is bought (`fogft.planning`).
-"""
+"""Where replicas run, and preemption notices. Not here: what is bought (`fogft.planning`)."""

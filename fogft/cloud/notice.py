@@ -54,8 +54,7 @@ class Watch:
         self._told: set[NoticeKind] = set()
         self._source: _Source | None = None
         self._closed = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="notice", daemon=True)
-        self._thread.start()
+        threading.Thread(target=self._run, name="notice", daemon=True).start()
 
     @property
     def silent(self) -> bool:

@@ -162,10 +162,8 @@ def discovery(_: Situation) -> Iterator[Finding]:
         try:
             result = _self_test("ask", name)
         finally:
-            if answering.stdin:
-                answering.stdin.close()
             try:
-                answering.wait(5)
+                answering.communicate(timeout=5)  # ends its input
             except subprocess.TimeoutExpired:
                 answering.kill()
     if "error" not in result:

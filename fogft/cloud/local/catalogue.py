@@ -1,7 +1,6 @@
 """The local cloud's catalogue: regions, zones, instance types and prices.
 
-Prices are made up, in the proportions of real ones. ``regions.yaml`` in the cloud's folder
-replaces any of it; docs/design/local-cloud.md shows one.
+Prices are made up. ``regions.yaml`` in the cloud's folder replaces any of it.
 """
 
 import re
@@ -51,11 +50,6 @@ class Catalogue:
 
     zones: tuple[Zone, ...]
     instances: tuple[Instance, ...]
-
-    @property
-    def regions(self) -> list[str]:
-        """Names of the regions, sorted."""
-        return sorted({zone.region for zone in self.zones})
 
 
 # Region: what its prices are multiplied by, and its boot time.

@@ -25,17 +25,14 @@ from fogft.poolfile.tree import nearest
 
 log = logging.getLogger(__name__)
 
-SERVE = (sys.executable, "-m", "fogft", "serve")
+SERVE = (sys.executable, "-m", "fogft", "serve")  # starts a server proxy; without its options
 # What ties a process to the session that it was started from, and is wrong in a machine.
 _NOT_INHERITED = ("NOTIFY_SOCKET", "LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "WATCHDOG_USEC")
 _UNKNOWN = Placement("local", "unknown", "unknown", "unknown")
 
 
 class LocalCloud:
-    """Replicas as processes on this machine (`fogft.cloud.port.Cloud`). Any thread, any process.
-
-    `serve` is the command that starts a server proxy, without its options.
-    """
+    """Replicas as processes on this machine (`fogft.cloud.port.Cloud`). Any thread, any process."""
 
     def __init__(self, root: Path, serve: Sequence[str] = SERVE) -> None:
         self.root = Path(os.path.abspath(root))

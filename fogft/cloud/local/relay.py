@@ -117,14 +117,9 @@ class Relay:
         self._connections: dict[asyncio.Task[None], tuple[_Pipe, ...]] = {}
         self._listener = socket.create_server(("127.0.0.1", 0), backlog=128)
         self._listener.setblocking(False)
+        self.endpoint = f"127.0.0.1:{self._listener.getsockname()[1]}"  # where it listens
         self._accepting = self._loop.create_task(self._accept())
         self.reached = False  # whether the server has ever accepted a connection
-
-    @property
-    def endpoint(self) -> str:
-        """``host:port`` where it listens."""
-        host, port = self._listener.getsockname()
-        return f"{host}:{port}"
 
     @property
     def connections(self) -> int:

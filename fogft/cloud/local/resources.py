@@ -1,8 +1,4 @@
-"""Which of the local cloud's offers meet a task's `resources`. Pure.
-
-A pool written for another cloud can run here: ``aws/us-west-1`` is then the local region of that
-name. Keys of SkyPilot's that say neither where a machine may be nor what it is do nothing.
-"""
+"""Which of the local cloud's offers meet a task's `resources`, written for any cloud. Pure."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,7 +15,7 @@ from fogft.poolfile.tree import nearest, shown
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)
 _PLACE_KEYS = ("infra", "cloud", "region", "zone")
 _MACHINE_KEYS = ("use_spot", "instance_type", "cpus", "memory", "accelerators")
-_IDLE_KEYS = (
+_IDLE_KEYS = (  # they say neither where a machine may be nor what it is
     *("accelerator_args", "autostop", "disk_size", "disk_tier", "ephemeral_storage", "hooks"),
     *("image_id", "job_recovery", "labels", "local_disk", "max_hourly_cost", "network_tier"),
     *("ports", "priority", "priority_class", "volumes"),
@@ -88,8 +84,9 @@ def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Z
     cloud, region, name = place(entry)
     if cloud not in ("", *CLOUDS):
         raise wrong("cloud", "there is no cloud", cloud, CLOUDS)
-    if region and region not in catalogue.regions:
-        raise wrong("region", "the local cloud has no region", region, catalogue.regions)
+    regions = {zone.region for zone in catalogue.zones}
+    if region and region not in regions:
+        raise wrong("region", "the local cloud has no region", region, regions)
     there = [zone for zone in catalogue.zones if region in ("", zone.region)]
     # Other clouds' zones begin with their region: us-west-1a, us-west1-a.
     found = [z for z in there if name in ("", z.name, z.region + z.name, f"{z.region}-{z.name}")]

@@ -1,4 +1,1 @@
-"""Real clouds through SkyPilot's public SDK: a cluster for each replica. See docs/design/sky.md.
-
-Not here: which offer is bought (`fogft.planning`).
-"""
+"""Real clouds through SkyPilot's public SDK. Not here: which offer is bought (`fogft.planning`)."""

@@ -67,9 +67,8 @@ _NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # who asked may ha
 _FOR_AWS = "Encoded authorization failure message"  # a thousand characters
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")
 _DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # what SkyPilot says of its own doing
-_LOGGED = re.compile(
-    r"^[A-Z] [\d-]+ [\d:.]+ (?:PID=\d+ )?\S+:\d+\] "
-)  # what begins its log's lines
+# What begins its log's lines.
+_LOGGED = re.compile(r"^[A-Z] [\d-]+ [\d:.]+ (?:PID=\d+ )?\S+:\d+\] ")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 

@@ -57,7 +57,9 @@ class Gcp(Provider):
 
     def _ask(self, method: str, path: str, asked: Any = None) -> Mapping[str, Any]:
         try:
-            session, project = self._session()
+            with self._lock:
+                self._known = self._known or signed_in()
+                session, project = self._known
             url = f"{self._api}/{project}/{path}"
             answer = session.request(method, url, params=asked, timeout=_LIMIT_S)
             told = answer.json() if answer.content else {}
@@ -75,12 +77,6 @@ class Gcp(Provider):
         if status in (403, 404):
             raise NotAllowedError(words)
         raise CloudUnreachable(f"GCP did not answer: {words}")
-
-    def _session(self) -> tuple[Any, str]:
-        with self._lock:
-            if self._known is None:
-                self._known = signed_in()
-            return self._known
 
 
 def signed_in() -> tuple[Any, str]:

@@ -1,7 +1,6 @@
 """What can be bought, and for how much: SkyPilot's catalogue, live spot prices, disks, quotas.
 
-The catalogue is a file that SkyPilot renews every few hours; spot prices move meanwhile. So an
-offer says where its price comes from and how old it is.
+SkyPilot renews its catalogue every few hours; spot prices move meanwhile.
 """
 
 import json

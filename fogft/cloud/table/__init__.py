@@ -1,10 +1,8 @@
-"""Prices from a dated table: a CSV file in the columns of SkyPilot's catalogues.
+"""Prices from a CSV table in the columns of SkyPilot's catalogues. Not here: launching.
 
 ``InstanceType, vCPUs, MemoryGiB, AcceleratorName, AcceleratorCount, Region,
 AvailabilityZone, Price, SpotPrice``; with ``Cloud``, ``AsOf`` (YYYY-MM-DD) and ``Source``
 where a table spans clouds or is dated. Without ``Cloud`` the file's folder names it.
-
-Not here: launching, which a table cannot do.
 """
 
 import csv
