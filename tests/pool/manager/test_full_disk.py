@@ -63,9 +63,12 @@ def test_a_full_disk_ends_nothing_and_is_waited_out(small: Scene) -> None:
     time.sleep(ROUNDS_S)
     assert manager.poll() is None, small.output()
     assert small.running() == ["0.1"]
-    seen = status.read(small.paths, time.time())
-    assert not seen.stale
-    assert any("No space left" in note for note in seen.to_json()["notes"])
+
+    def says_so() -> bool:
+        seen = status.read(small.paths, time.time())
+        return not seen.stale and any("No space left" in one for one in seen.to_json()["notes"])
+
+    small.wait(says_so)
     filler.unlink()
     scaled_by(small, 1)
     small.wait(lambda: small.whole(2))
