@@ -106,8 +106,7 @@ _THREADS = "OPENBLAS_NUM_THREADS"
 def load_numpy() -> None:
     """Load numpy, where there is one, without threads, unless the user has set their number.
 
-    ROS's types load it, and the threads of its OpenBLAS spin before they sleep: 30 to 100 ms of a
-    start. Nothing of it is left in the environment: the user's command may want BLAS.
+    ROS's types load it, and its OpenBLAS's threads spin before they sleep: 30 to 100 ms of a start.
     """
     if _THREADS in os.environ:
         return
@@ -116,7 +115,7 @@ def load_numpy() -> None:
         with contextlib.suppress(Exception):  # what is wrong with it, its next user tells
             importlib.import_module("numpy")
     finally:
-        del os.environ[_THREADS]
+        del os.environ[_THREADS]  # the user's command may want BLAS
 
 
 def begin_start() -> None:

@@ -28,8 +28,6 @@ FILE_POLL_S = 0.1  # costs nothing, and a local machine may live for a second on
 LOST_POLL_S = 30.0
 _TIMEOUT_S = 2.0
 _METADATA = "169.254.169.254"
-# The variables that the clouds' own clients know. Azure's have none.
-_ELSEWHERE = {"aws": "AWS_EC2_METADATA_SERVICE_ENDPOINT", "gcp": "GCE_METADATA_HOST"}
 
 
 class Watch:
@@ -87,10 +85,8 @@ class Watch:
             if notice is None or notice.kind in self._told or self._closed.is_set():
                 continue
             self._told.add(notice.kind)
-            kind, source_name = notice.kind.value, notice.source
-            log.warning(
-                "notice_received kind=%s source=%s detail=%r", kind, source_name, notice.detail
-            )
+            said = notice.kind.value, notice.source, notice.detail
+            log.warning("notice_received kind=%s source=%s detail=%r", *said)
             self._on_notice(notice)
 
 
@@ -102,17 +98,17 @@ def _sources(source: str, metadata: str | None) -> list[_Source]:
             f"unknown source of preemption notices `{source}`",
             f"`file:PATH`, {', '.join(f'`{name}`' for name in NOTICE_SOURCES)}",
         )
+    # The variables are those that the clouds' own clients know. Azure's have none.
     known: dict[str, _Source] = {
-        "aws": _Aws(metadata or _address("aws")),
-        "gcp": _Gcp(metadata or _address("gcp"), **{"Metadata-Flavor": "Google"}),
+        "aws": _Aws(metadata or _address("AWS_EC2_METADATA_SERVICE_ENDPOINT")),
+        "gcp": _Gcp(metadata or _address("GCE_METADATA_HOST"), **{"Metadata-Flavor": "Google"}),
         "azure": _Azure(metadata or _METADATA, Metadata="true"),
     }
     return list(known.values()) if source == "auto" else [known[source]]
 
 
-def _address(cloud: str) -> str:
-    told = os.environ.get(_ELSEWHERE[cloud], "").split("//")[-1].rstrip("/")
-    return told or _METADATA
+def _address(variable: str) -> str:
+    return os.environ.get(variable, "").split("//")[-1].rstrip("/") or _METADATA
 
 
 def _is_here(source: _Source) -> bool:

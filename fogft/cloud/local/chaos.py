@@ -30,7 +30,6 @@ class Chaos:
 
     def __init__(self, root: Path) -> None:
         self._cloud = LocalCloud(root)
-        self._root = self._cloud.root
 
     def preempt(self, id: ReplicaId, notice_s: float | None = None) -> float:
         """Preempt a machine with notice (None: its zone's); return the seconds until it ends."""
@@ -42,7 +41,7 @@ class Chaos:
 
     def kill(self, id: ReplicaId) -> None:
         """End a machine at once, with SIGKILL; return when it is gone."""
-        ending.end(self._root, self._living(id))
+        ending.end(self._cloud.root, self._living(id))
 
     def freeze(self, id: ReplicaId) -> int:
         """Stop all processes of a machine (SIGSTOP); return how many. Its kernel still answers."""
@@ -101,8 +100,8 @@ class Chaos:
 
     def clear(self) -> None:
         """Clear all lasting faults: slow and dead links, frozen machines, outages, capacities."""
-        with ending.cloud_lock(self._root):
-            faults.write(self._root / faults.FILE, CloudFaults())
+        with ending.cloud_lock(self._cloud.root):
+            faults.write(self._cloud.root / faults.FILE, CloudFaults())
         for folder, _ in self._cloud.living():
             with contextlib.suppress(CloudError):  # it has just ended, or has no relay
                 self.thaw(folder.id)
@@ -129,9 +128,9 @@ class Chaos:
             faults.write(path, replace(faults.read_link(path), **changes))
 
     def _change_cloud(self, change: Callable[[CloudFaults], CloudFaults]) -> None:
-        with ending.cloud_lock(self._root):
-            known = faults.read_cloud(self._root)
-            faults.write(self._root / faults.FILE, change(known))
+        with ending.cloud_lock(self._cloud.root):
+            known = faults.read_cloud(self._cloud.root)
+            faults.write(self._cloud.root / faults.FILE, change(known))
 
     def _location(self, text: str) -> str:
         """Return a location in full, if it exists."""

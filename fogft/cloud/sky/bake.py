@@ -1,7 +1,6 @@
 """An image with a replica's environment: the set-up of `task`, run once by Docker.
 
-A VM that starts from it runs the same set-up, which finds what there is already: the image is never
-wrong, only late. It holds no certificate, key or secret.
+A VM that starts from it runs the same set-up again. It holds no certificate, key or secret.
 """
 
 import shlex

@@ -36,11 +36,8 @@ class Census:
         self._seen: set[ReplicaId] = set()
 
     def of(self, id: ReplicaId, entry: Entry | None) -> list[Instance] | None:
-        """Return a replica's instances, asked now; None if only SkyPilot can be asked.
-
-        Without an `entry` of the journal it may be anywhere.
-        """
-        if entry is None:
+        """Return a replica's instances, asked now; None if only SkyPilot can be asked."""
+        if entry is None:  # it may be anywhere
             found, _ = self.everywhere(id.pool_uid)
             return [i for i in found if i.id == id] or None
         provider = self.providers.get(entry.placement.cloud)
@@ -69,10 +66,7 @@ class Census:
         return cloud in self.providers and cloud not in self._refused
 
     def latest(self, pool_uid: str, regions: Mapping[str, Iterable[str]]) -> Sequence[Instance]:
-        """Return the last census of a pool, and start another if it is old.
-
-        The first one looks everywhere, later ones where machines of the pool can be, if known.
-        """
+        """Return a pool's last census; start another if it is old. The first looks everywhere."""
         now = self.clock()
         with self._lock:
             begun_at = self._begun_at.get(pool_uid)

@@ -23,7 +23,6 @@ from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 
 log = logging.getLogger(__name__)
 
-NOWHERE = Placement("", "", "", "")
 CLUSTERS_FRESH_S = 5.0
 CLUSTERS_USABLE_S = 15.0  # so long nobody waits for a newer list, which is under way
 PROVIDER_SURE_AFTER_S = 60.0  # a provider's list may miss a machine in its first seconds
@@ -86,7 +85,7 @@ def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
         failure = _error(f"SkyPilot says {cluster.state.value}: {cluster.progress or 'no reason'}")
     return Machine(
         id=id,
-        placement=cluster.placement or NOWHERE,
+        placement=cluster.placement or Placement("", "", "", ""),
         phase=phase,
         launched_at=cluster.launched_at,
         endpoint=endpoint,

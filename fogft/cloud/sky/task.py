@@ -87,8 +87,7 @@ def build(
 ) -> dict[str, Any]:
     """Return the task of one replica, for exactly one location.
 
-    Relative paths of the pool file start from `base`. `instead` is tried there, in this order,
-    where the order's own placement has no capacity.
+    Relative paths start from `base`; `instead` is tried, in order, where there is no capacity.
     """
     refuse_what_cannot_be_honoured(order.task)
     template = read()

@@ -1,7 +1,6 @@
 """What a VM installs: the running fogft as a wheel, and a lock file of its dependencies.
 
-The wheel is made of the imported package's own files and of what pip recorded of it, the same bytes
-each time. `up` makes the lock; a generation keeps the one of its first launch for all replicas.
+The wheel has the same bytes each time. `up` makes the lock; a generation keeps its first one.
 """
 
 import base64
