@@ -279,9 +279,8 @@ def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:
 
 
 def _permission(port: int, source: str) -> dict[str, Any]:
-    ranges = {"Ipv6Ranges": [{"CidrIpv6": source}]} if ":" in source else {}
-    ranges = ranges or {"IpRanges": [{"CidrIp": source}]}
-    return {"IpProtocol": "tcp", "FromPort": port, "ToPort": port, **ranges}
+    ranges, key = ("Ipv6Ranges", "CidrIpv6") if ":" in source else ("IpRanges", "CidrIp")
+    return {"IpProtocol": "tcp", "FromPort": port, "ToPort": port, ranges: [{key: source}]}
 
 
 @contextlib.contextmanager

@@ -32,9 +32,9 @@ _LIMIT_S = 120.0
 _SHOWN = 400  # characters of what `uv` says
 
 
-def make(folder: Path, package: Path = _PACKAGE) -> Path:
+def make(folder: Path) -> Path:
     """Write the wheel into a folder below `folder` that is named after its content; return that."""
-    name, content = pack(package)
+    name, content = pack()
     target = folder / hashlib.sha256(content).hexdigest()[:16]
     if not (target / name).is_file():
         make_folder(target)
@@ -42,7 +42,7 @@ def make(folder: Path, package: Path = _PACKAGE) -> Path:
     return target
 
 
-def pack(package: Path = _PACKAGE) -> tuple[str, bytes]:
+def pack() -> tuple[str, bytes]:
     """Return the wheel's file name and content. Raises CloudError: fogft is not installed here."""
     try:
         installed = importlib.metadata.distribution("fogft")
@@ -53,7 +53,7 @@ def pack(package: Path = _PACKAGE) -> tuple[str, bytes]:
         ) from error
     stem = f"fogft-{installed.version}"
     info = f"{stem}.dist-info"
-    files = {f"fogft/{name}": content for name, content in _sources(package).items()}
+    files = {f"fogft/{name}": content for name, content in _sources().items()}
     for name in _KEPT:
         text = installed.read_text(name)
         if name == "WHEEL" and text is not None:
@@ -76,11 +76,11 @@ def pack(package: Path = _PACKAGE) -> tuple[str, bytes]:
     return f"{stem}-py3-none-any.whl", out.getvalue()
 
 
-def _sources(package: Path) -> dict[str, bytes]:
-    paths = {str(path.relative_to(package)): path for path in package.rglob("*")}
-    beside = package.parent / "templates"
-    if not (package / "templates").is_dir():  # a checkout, not an installation
-        paths |= {str(path.relative_to(package.parent)): path for path in beside.rglob("*")}
+def _sources() -> dict[str, bytes]:
+    paths = {str(path.relative_to(_PACKAGE)): path for path in _PACKAGE.rglob("*")}
+    if not (_PACKAGE / "templates").is_dir():  # a checkout, not an installation
+        beside = (_PACKAGE.parent / "templates").rglob("*")
+        paths |= {str(path.relative_to(_PACKAGE.parent)): path for path in beside}
     return {
         name: path.read_bytes()
         for name, path in sorted(paths.items())
