@@ -38,9 +38,7 @@ E = TypeVar("E", Server, Client, Publisher, Subscription)
 
 _CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
 _KEPT = 5000  # Fast DDS keeps no more of any kind
-_KNOWN_AFTER_S = (
-    2.0  # until those that run have been told of a new node, many or busy as they may be
-)
+_KNOWN_AFTER_S = 2.0  # until those that run know of a new node, many or busy as they may be
 _NO_LIMIT = -1  # of rcl_wait: until something happens
 _REST = 9  # times what a new wait set takes, until the next one: many entities may be made in a row
 
@@ -419,5 +417,7 @@ class SerialisedNode:
         self._introduction.close()
         self._ports.close()
         self._guard.destroy()
+        if self._early is not None:
+            self._early.end_node()
         self._node.destroy_node()
         self._context.try_shutdown()

@@ -28,7 +28,7 @@ import re
 import struct
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from fogft.ros import spdp
@@ -43,11 +43,11 @@ _REMOVED = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+) \(deleted\)")
 # A port begins, in Fast DDS 2.14 and 3.2, with: its number, how many read it, two limits in ms (one
 # a third of the other), how many messages it holds, how many wait; flags, the lowest "not broken".
 _PORT, _HEAD_BYTES = struct.Struct("=7I"), 1024
-_ASIDE = "_aside"
+_ASIDE = "_aside"  # behind the name of a port, in that of its mutex
 _SEGMENT = re.compile(r"fast(?:dds|rtps)_[0-9a-f]{16}")
 _OURS = re.compile(
     r"(?:sem\.)?(?P<group>fast(?:dds|rtps)_(?:port\d+|[0-9a-f]+)|fast_datasharing_[^/]+?"
-    rf"|lttng-ust-wait-[\w-]+?)(?:_el|_sl|_mutex|_mutex{_ASIDE})?"
+    rf"|lttng-ust-wait-[\w-]+?)(?:_el|_sl|(?:{_ASIDE})?_mutex)?"
 )
 
 
@@ -242,27 +242,32 @@ def _remove(unused: set[str]) -> list[str]:
             if group in unused and not any(map(_locked, names)):
                 going += names
         removed = [name for name in going if not name.startswith("sem.") and unlink_name(name)]
-        return removed + _remove_mutexes([name for name in going if name.startswith("sem.")])
+        mutexes = [name for name in going if name.startswith("sem.")]
+        new_names = {name: name.replace("_mutex", f"{_ASIDE}_mutex") for name in mutexes}
+        used = _set_aside(new_names)
     finally:
-        for group in held:
-            semaphore(group, "sem_post")
+        for group in held:  # where ours went aside, somebody may have made another by now
+            aside = _ASIDE if f"sem.{group}_mutex" in going else ""
+            semaphore(group + aside, "sem_post")
+    return removed + [name for name in mutexes if unlink_name(new_names[name]) and name not in used]
 
 
-def _remove_mutexes(names: list[str]) -> list[str]:
-    """Remove mutexes that nobody waits for, whom the next one to open the port would not wait for.
+def _set_aside(new_names: Mapping[str, str]) -> set[str]:
+    """Rename mutexes, and give those back that somebody waits for; return these.
 
-    Both would make the port, and the one that lost would leave the other without its file for good:
-    each ROS process that starts afterwards prints `Failed init_port`.
+    The next one to open the port would not wait for him. Both would make the port, and the one that
+    lost would leave the other without its file for good: each ROS process that starts afterwards
+    prints `Failed init_port`.
     """
-    with contextlib.suppress(OSError):
-        for name in names:
-            (FOLDER / name).rename(FOLDER / (name + _ASIDE))  # nobody can come to it any more
-    used = names_in_use() if names else set()
-    for name in names:
-        if name + _ASIDE in used:
-            with contextlib.suppress(OSError):  # somebody has made another
-                os.link(FOLDER / (name + _ASIDE), FOLDER / name)
-    return [name for name in names if unlink_name(name + _ASIDE) and name + _ASIDE not in used]
+    for name, aside in new_names.items():
+        with contextlib.suppress(OSError):
+            (FOLDER / name).rename(FOLDER / aside)  # nobody can come to it any more
+    in_use = names_in_use() if new_names else set()
+    used = {name for name, aside in new_names.items() if aside in in_use}
+    for name in used:
+        with contextlib.suppress(OSError):  # somebody has made another
+            os.link(FOLDER / new_names[name], FOLDER / name)
+    return used
 
 
 def unlink_name(name: str) -> bool:

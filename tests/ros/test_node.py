@@ -61,6 +61,10 @@ def test_a_first_node_ends_once_the_next_one_is_known(ros_domain: int) -> None:
         wait_for(lambda: {"_first", "next"} <= set(watcher.get_node_names()), "discovery")
         wait_for(lambda: (node.look(), "_first" not in watcher.get_node_names())[1], "its end")
         assert "next" in watcher.get_node_names()
+    early = EarlyJoin("_first", ros_domain)
+    with closing(SerialisedNode("next", ros_domain, early=early)):
+        wait_for(lambda: {"_first", "next"} <= set(watcher.get_node_names()), "discovery")
+    wait_for(lambda: watcher.get_node_names() == ["watcher"], "their end, before `early` goes")
     watcher.context.try_shutdown()
 
 

@@ -161,8 +161,8 @@ def test_a_port_is_judged_under_its_mutex(
         "look",
         "fastdds_port7411",
         "look",
-        "sem.fastdds_port7411_mutex_aside",
-        "fastdds_port7411 sem_post",
+        "fastdds_port7411_aside sem_post",
+        "sem.fastdds_port7411_aside_mutex",
     ]
 
 
@@ -172,11 +172,28 @@ def test_a_mutex_that_somebody_waits_for_meanwhile_stays(
     """The next one to open the port would not wait for the one that waits."""
     leave("fastdds_port7411")
     mutex = leave("sem.fastdds_port7411_mutex")
-    looks = iter([set[str](), set[str](), {f"{mutex.name}_aside"}])
+    looks = iter([set[str](), set[str](), {"sem.fastdds_port7411_aside_mutex"}])
     monkeypatch.setattr(shared_memory, "names_in_use", lambda: next(looks))
     assert shared_memory.sweep() == ["fastdds_port7411"]
     assert os.listdir(mutex.parent) == [mutex.name]
     assert mutex.read_bytes() == b"left"
+
+
+def test_a_mutex_that_somebody_makes_meanwhile_is_not_posted(
+    leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would let two at once to the port from then on."""
+    posted: list[str] = []
+    monkeypatch.setattr(
+        shared_memory, "semaphore", lambda group, what: posted.append(group + what) or True
+    )
+    leave("fastdds_port7411")
+    mutex = leave("sem.fastdds_port7411_mutex")
+    looks = iter([list, list, lambda: mutex.write_bytes(b"another")])
+    monkeypatch.setattr(shared_memory, "names_in_use", lambda: (next(looks)(), set[str]())[1])
+    shared_memory.sweep()
+    assert mutex.read_bytes() == b"another"
+    assert "fastdds_port7411sem_post" not in posted
 
 
 def test_a_mutex_is_had_once_and_leaves_no_mapping() -> None:
