@@ -122,9 +122,10 @@ def correlation(one: Timeline, other: Timeline) -> float | None:
     spread = mean_a * (1 - mean_a) * mean_b * (1 - mean_b)
     if spread <= 0:
         return None
-    times = sorted({at for at, _ in (*a.changes, *b.changes)})
-    both_s = 0.0
-    for at, end in zip(times, [*times[1:], length_s], strict=True):
-        if a.capacity(at) and b.capacity(at):
-            both_s += end - at
+    changes = sorted((at, which, n) for which, line in enumerate((a, b)) for at, n in line.changes)
+    both_s, since_s, room = 0.0, 0.0, [0, 0]
+    for at, which, n in [*changes, (length_s, 0, 0)]:
+        if all(room):
+            both_s += at - since_s
+        since_s, room[which] = at, n
     return (both_s / length_s - mean_a * mean_b) / math.sqrt(spread)

@@ -246,4 +246,4 @@ class _Generator:
             times = [self._begin_s, *self._times(1 / self._model.regime_s)]
             self._regimes[domain] = [(time, self._chance.random()) for time in times]
         regimes = self._regimes[domain]
-        return regimes[bisect_right(regimes, at, key=lambda moment: moment[0]) - 1][1]
+        return regimes[bisect_right(regimes, (at, math.inf)) - 1][1]

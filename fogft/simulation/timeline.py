@@ -5,6 +5,7 @@ Not here: where it comes from (`traces`, `model`) and who is taken away (`market
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ class Timeline:
 
     def capacity(self, at_s: float) -> int:
         """Return how many machines fit at a time."""
-        index = bisect_right(self.changes, at_s, key=lambda change: change[0]) - 1
+        index = bisect_right(self.changes, (at_s, math.inf)) - 1
         return self.changes[max(index, 0)][1]
 
     def window(self, begin_s: float, length_s: float) -> Timeline:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import secrets
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
@@ -15,9 +14,8 @@ from fogft.cloud.local.chaos import Chaos
 from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.port import Launch
 from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
-from tests.cloud.waiting import wait_for
+from tests.cloud.waiting import STAND_IN, wait_for
 
-STAND_IN = (sys.executable, str(Path(__file__).with_name("stand_in.py")))
 REGIONS = """
 boot_s: 0.01
 regions:

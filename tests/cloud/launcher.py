@@ -18,7 +18,7 @@ from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.port import Launch
 from fogft.errors import CloudError
 from fogft.model.replica import Placement, ReplicaId
-from tests.cloud.conftest import STAND_IN
+from tests.cloud.waiting import STAND_IN
 
 root, uid, slot, where, step = sys.argv[1:]
 

@@ -32,7 +32,7 @@ def echo(endpoint: str, data: bytes = HELLO) -> bytes:
     return received
 
 
-def test_a_machine_is_listed_runs_and_answers(local):
+def test_a_machine_is_listed_runs_answers_and_is_ended_for_good(local):
     id = local.launch()
     listed = local.machine(id)
     assert listed is not None
@@ -41,6 +41,34 @@ def test_a_machine_is_listed_runs_and_answers(local):
     assert (machine.placement.location, machine.spec_hash) == ("local/us-west-1/a", "abc")
     assert (machine.usd_per_hour, machine.notice, machine.failure) == (0.07, False, None)
     assert echo(machine.endpoint) == HELLO
+
+    what_is_secret_is_readable_by_its_owner_only(local.folder(id))
+    terminate_leaves_nothing_but_the_log(local, id)
+    local.cloud.terminate(id)  # it may be repeated, and asked for what never was
+    local.cloud.terminate(ReplicaId(local.uid, 99, 1))
+    assert local.cloud.machines(local.uid) == []
+    local.cloud.launch(local.order())  # of a superseded manager, late
+    assert local.machine(id) is None, "an ended machine is never launched again"
+    assert processes.find(machine=str(id)) == []
+
+
+def what_is_secret_is_readable_by_its_owner_only(folder):
+    modes = {p.name: stat.S_IMODE(p.stat().st_mode) for p in folder.iterdir()}
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    for name in ("replica.key", "replica.yaml", "machine.json", "state.json", "machine.log"):
+        assert modes[name] == 0o600, name
+
+
+def terminate_leaves_nothing_but_the_log(local, id):
+    assert processes.find(machine=str(id))
+    local.given(id)
+    local.cloud.terminate(id)
+    assert processes.find(machine=str(id)) == []
+    assert local.machine(id) is None
+    assert os.listdir(local.root / "machines") == []
+    log = local.cloud.log(id)
+    assert log is not None
+    assert "stand-in begins" in Path(log).read_text()
 
 
 def test_the_server_gets_its_place_its_files_and_marks_in_its_environment(local, tmp_path):
@@ -62,14 +90,6 @@ def test_the_server_gets_its_place_its_files_and_marks_in_its_environment(local,
     assert others, "where fogft itself lies"
 
 
-def test_what_is_secret_is_readable_by_its_owner_only(local):
-    id = local.running().id
-    modes = {p.name: stat.S_IMODE(p.stat().st_mode) for p in local.folder(id).iterdir()}
-    assert stat.S_IMODE(local.folder(id).stat().st_mode) == 0o700
-    for name in ("replica.key", "replica.yaml", "machine.json", "state.json", "machine.log"):
-        assert modes[name] == 0o600, name
-
-
 def test_machines_have_different_domains_and_not_the_robots(local, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     ids = [local.launch(slot) for slot in range(4)]
@@ -78,40 +98,10 @@ def test_machines_have_different_domains_and_not_the_robots(local, monkeypatch):
     assert 7 not in domains
 
 
-def test_terminate_leaves_nothing_but_the_log(local):
-    id = local.running().id
-    assert processes.find(machine=str(id))
-    local.given(id)
-    local.cloud.terminate(id)
-    assert processes.find(machine=str(id)) == []
-    assert local.machine(id) is None
-    assert os.listdir(local.root / "machines") == []
-    log = local.cloud.log(id)
-    assert log is not None
-    assert "stand-in begins" in Path(log).read_text()
-
-
-def test_terminate_may_be_repeated_and_asked_for_what_never_was(local):
-    id = local.running().id
-    local.cloud.terminate(id)
-    local.cloud.terminate(id)
-    local.cloud.terminate(ReplicaId(local.uid, 99, 1))
-    assert local.cloud.machines(local.uid) == []
-
-
 def test_terminate_while_booting(local):
     id = local.launch(where="slow-1/a")
     wait_for(lambda: local.machine(id).progress == "booting")
     local.cloud.terminate(id)
-    assert local.machine(id) is None
-    assert processes.find(machine=str(id)) == []
-
-
-def test_an_ended_machine_is_never_launched_again(local):
-    """A late order of a superseded manager cannot bring an ended replica back."""
-    id = local.running().id
-    local.cloud.terminate(id)
-    local.cloud.launch(local.order())
     assert local.machine(id) is None
     assert processes.find(machine=str(id)) == []
 
@@ -278,10 +268,10 @@ def test_a_machine_whose_folder_was_removed_ends(local):
     wait_for(lambda: not processes.find(machine=str(id)))
 
 
-@pytest.mark.parametrize("name", [folders.NOTICE, folders.END])
-def test_a_damaged_notice_ends_nobody(local, name):
+def test_a_damaged_notice_ends_nobody(local):
     id = local.running().id
-    (local.folder(id) / name).write_text("{")
+    for name in (folders.NOTICE, folders.END):
+        (local.folder(id) / name).write_text("{")
     local.chaos.slow(id, 0.01)  # it looks at its files in turn, this one last
     wait_for(lambda: "link_changed" in Path(local.cloud.log(id)).read_text())
     assert local.machine(id).phase is MachinePhase.RUNNING

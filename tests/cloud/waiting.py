@@ -1,12 +1,16 @@
-"""Wait for conditions, never for a time."""
+"""What a machine of these tests serves, and waiting: for conditions, never for a time."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
+# Without `site`: it needs the standard library only.
+STAND_IN = (sys.executable, "-S", str(Path(__file__).with_name("stand_in.py")))
 
 
 def wait_for(condition: Callable[[], T], limit_s: float = 30.0) -> T:

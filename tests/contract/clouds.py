@@ -20,8 +20,7 @@ from fogft.cloud.port import Cloud, Launch
 from fogft.cloud.sky.naming import cluster_name
 from fogft.errors import CloudUnreachable
 from fogft.model.replica import Placement, ReplicaId
-from tests.cloud.conftest import STAND_IN
-from tests.cloud.waiting import wait_for
+from tests.cloud.waiting import STAND_IN, wait_for
 from tests.fakes.cloud import MockCloud, zones
 from tests.sky.scene import Scene as SkyScene
 

@@ -164,12 +164,9 @@ class Process:
         self.start()
 
     def start(self) -> None:
-        command = [sys.executable, "-m", "fogft", "gateway", "--config", str(self._config)]
+        words = ("gateway", "--config", str(self._config))
         with _inside(self._where), self._log.open("ab") as log:
-            self.process: forked.Forked | subprocess.Popen[str] = subprocess.Popen(
-                tied(command), cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                stderr=log, text=True,
-            )  # fmt: skip
+            self.process = forked.start("tests.records.part", *words, stderr=log.fileno())
 
     def report(self) -> dict[str, Any]:
         try:

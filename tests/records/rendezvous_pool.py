@@ -18,6 +18,7 @@ from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind
 from fogft.records.roster import SlotState, admission, admission_content, located
 from tests import certificate_names
+from tests.link import forked
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.ports import free_port
 
@@ -43,17 +44,20 @@ class Rendezvous:
             f'pool_uid: "{POOL_UID}"\nlisten: {self.endpoint}\nstatus: status.json\n'
             f"credentials: {{ca: {files.ca}, certificate: {files.certificate}, key: {files.key}}}\n"
         )
-        self.process: subprocess.Popen[bytes] | None = None
+        self.process: forked.Forked | subprocess.Popen[str] | subprocess.Popen[bytes] | None = None
         self.start()
 
     def start(self) -> None:
         self._status.unlink(missing_ok=True)
+        words = ("rendezvous", "--config", str(self.config))
         with (self.folder / "log").open("ab") as log:
-            self.process = subprocess.Popen(
-                [*self._prefix, sys.executable, "-m", "fogft", "rendezvous",
-                 "--config", str(self.config)],
-                cwd=ROOT, stdout=log, stderr=log,
-            )  # fmt: skip
+            if self._prefix:
+                self.process = subprocess.Popen(
+                    [*self._prefix, sys.executable, "-m", "fogft", *words],
+                    cwd=ROOT, stdout=log, stderr=log,
+                )  # fmt: skip
+            else:
+                self.process = forked.start("tests.records.part", *words, stderr=log.fileno())
         wait_for(self._status.exists, 120.0)
 
     def forget(self) -> None:

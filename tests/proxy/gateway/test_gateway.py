@@ -82,7 +82,7 @@ def test_one_of_two_gateways_dies_and_nothing_is_lost(pool, how):
     for _ in range(10):
         robot.ask(5)
     robot.all_right()
-    os.kill(used.process.pid, signal.SIGKILL)
+    used.process.kill()
 
 
 def test_a_gateway_cut_off_from_its_replicas_hands_back_what_it_holds(pool):
