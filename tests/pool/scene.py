@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -18,8 +17,10 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, PoolStore, write_identity
 from fogft.pool.manager import shutdown
 from fogft.poolfile import file as pool_file
+from tests.link import forked
 from tests.pool.folder_cloud import FolderCloud
 
+MANAGER = "tests.pool.manager.manager_process"
 FILE = """\
 name: pool
 run: exec ./serve
@@ -50,7 +51,7 @@ class Scene:
         self.store = store_of(home)
         self.paths = self.store.paths
         self.cloud = cloud_of(home)
-        self.started: list[subprocess.Popen[bytes]] = []
+        self.started: list[forked.Forked] = []
 
     def write(
         self, *, replicas: int = 2, timeout_s: float = 5.0, max_hours: float = 100.0
@@ -63,7 +64,7 @@ class Scene:
         return self.store.identity()
 
     def command(self, name: str = "pool") -> list[str]:
-        return [sys.executable, "-m", "tests.pool.manager.manager_process", str(self.home), name]
+        return [sys.executable, "-m", MANAGER, str(self.home), name]
 
     def let_hours_pass(self, hours: float) -> None:
         """Make the pool older than it is."""
@@ -71,11 +72,13 @@ class Scene:
         older = replace(identity, created_at=identity.created_at - hours * 3600)
         write_identity(self.paths, older)
 
-    def start_manager(self) -> subprocess.Popen[bytes]:
+    def start_manager(self) -> forked.Forked:
         """Start a manager; it need not get into office."""
         self.home.mkdir(exist_ok=True)
         with (self.home / "manager-output").open("ab") as output:
-            process = subprocess.Popen(self.command(), stdout=output, stderr=output)
+            process = forked.Forked(MANAGER, [str(self.home), "pool"], output.fileno())
+        process.stdin.close()
+        process.stdout.close()
         self.started.append(process)
         return process
 
