@@ -16,6 +16,7 @@ import pytest
 from fogft.cloud.local import processes
 from tests.docs.documents import ROOT, console_commands
 from tests.e2e.pool import Pool
+from tests.e2e.pool import run as command
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(500)]
 
@@ -44,19 +45,25 @@ def run(pool: Pool) -> Run:
         (programs / name).chmod(0o755)
     pool.environ |= {
         "PATH": f"{programs}:{os.environ['PATH']}",
-        "PYTHONPATH": str(ROOT),
         "ROS_LOG_DIR": str(pool.folder / "ros-log"),
     }
 
-    def line(command: str) -> subprocess.CompletedProcess[str]:
+    def line(typed: str) -> subprocess.CompletedProcess[str]:
         done = subprocess.run(
-            ["bash", "-c", command], env=pool.environ, cwd=pool.folder, capture_output=True,
-            text=True, timeout=120, check=False,
+            ["bash", "-c", typed], env={**pool.environ, "PYTHONPATH": str(ROOT)},
+            cwd=pool.folder, capture_output=True, text=True, timeout=120, check=False,
         )  # fmt: skip
-        assert done.returncode == 0, f"$ {command}\n{done.stdout}\n{done.stderr}"
+        assert done.returncode == 0, f"$ {typed}\n{done.stdout}\n{done.stderr}"
         return done
 
     return line
+
+
+def asked(pool: Pool, words: str) -> subprocess.CompletedProcess[str]:
+    """Run a command that the page does not have, in a process that need not import it."""
+    done = command(words.split(), pool.environ, pool.folder, 120)
+    assert done.returncode == 0, f"fogft {words}\n{done.stdout}\n{done.stderr}"
+    return done
 
 
 def ready(status: dict[str, Any]) -> dict[int, int]:
@@ -82,9 +89,9 @@ def test_the_quick_start_works_as_it_is_written(pool: Pool, run: Run):
         """Return the first status that is good."""
         return pool.wait(lambda: (status := pool.status()) and good(status) and status, 200)
 
-    for command in commands:
-        run(command)
-        if command == "fogft chaos kill 0":
+    for typed in commands:
+        run(typed)
+        if typed == "fogft chaos kill 0":
             seen(lambda s: ready(s).get(0, 0) > 1)  # as the page says, soon
     status = seen(
         lambda s: (
@@ -95,30 +102,30 @@ def test_the_quick_start_works_as_it_is_written(pool: Pool, run: Run):
     assert status["manager_alive"]
     seen(lambda s: s["services"][0]["ready_replicas"] == 2)
     uid = status["uid"]
-    assert json.loads(run("fogft status --json").stdout)["uid"] == uid
+    assert json.loads(asked(pool, "status --json").stdout)["uid"] == uid
     slot = min(ready(status))
-    run(f"fogft chaos freeze {slot}")
+    asked(pool, f"chaos freeze {slot}")
     seen(lambda s: any(r["link"] == "suspect" for r in s["replicas"]))
-    run(f"fogft chaos thaw {slot}")
-    run("fogft scale down 1")
+    asked(pool, f"chaos thaw {slot}")
+    asked(pool, "scale down 1")
     seen(lambda s: len(s["replicas"]) == 1 and s["target"] == 1)
 
     os.kill(status["manager_pid"], signal.SIGKILL)
     again = seen(lambda s: s["manager_alive"] and s["epoch"] > status["epoch"])
     os.kill(again["manager_pid"], signal.SIGTERM)
     seen(lambda s: not s["manager_alive"])
-    asked = run("fogft status --refresh")
-    assert "no manager is running" in asked.stderr
-    assert "1 of 1 ready" in asked.stdout
+    orphaned = asked(pool, "status --refresh")
+    assert "no manager is running" in orphaned.stderr
+    assert "1 of 1 ready" in orphaned.stdout
     assert "the pool had no manager" in run(up).stderr
-    renewed = json.loads(run("fogft status --refresh --json").stdout)
+    renewed = json.loads(asked(pool, "status --refresh --json").stdout)
     assert renewed["manager_alive"]
     assert renewed["epoch"] > again["epoch"]
 
-    logs = run("fogft logs -n 1000").stdout
+    logs = asked(pool, "logs -n 1000").stdout
     assert {line.split()[0] for line in logs.splitlines()} >= {"manager", "proxy", "0.1", "0.2"}
     assert "replica_ready" in logs
-    doctor = json.loads(run(f"fogft doctor {file} --json").stdout)
+    doctor = json.loads(asked(pool, f"doctor {file} --json").stdout)
     assert not [finding for finding in doctor if finding["verdict"] == "fail"]
 
     ended = run(down).stderr
