@@ -15,7 +15,6 @@ from enum import Enum
 from typing import Any, TypeVar
 
 from fogft.errors import SpecError
-from fogft.poolfile.removed import VALUE_HINTS, Hint
 
 SMALLEST = 1e-12  # of a number above 0: a smaller one is a slip of the pen
 Choice = TypeVar("Choice", bound=Enum)
@@ -111,7 +110,7 @@ class Section:
         self,
         known: Iterable[str],
         *,
-        hints: Mapping[str, Hint] | None = None,
+        hints: Mapping[str, tuple[str, str]] | None = None,
         elsewhere: Mapping[str, str] | None = None,
     ) -> Iterator[SpecError]:
         """Yield an error for each key that is not known; `hints` are for past and future ones."""
@@ -193,6 +192,8 @@ class Section:
         allowed = " or ".join(f"`{value}`" for value in by_value)
         text = self.text(key, f"write {allowed}")
         if text not in by_value:
+            from fogft.poolfile.removed import VALUE_HINTS  # late: it loads all of a pool's model
+
             hint = VALUE_HINTS.get((type(members[0]), text)) or nearest(text, by_value)
             raise self.error(key, f"must be {allowed}, not {shown(text)}", hint)
         return by_value[text]
