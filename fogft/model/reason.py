@@ -126,7 +126,7 @@ class Cause(str, Enum):
 class Reason:
     """A cause with its data. Fields that do not apply to the cause keep their defaults."""
 
-    omits_defaults: ClassVar = True  # written as plain data, it is the cause and what belongs to it
+    omits_defaults: ClassVar[bool] = True  # plain data is the cause and what belongs to it
 
     cause: Cause
     slot: int | None = None

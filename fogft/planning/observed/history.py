@@ -56,7 +56,7 @@ CLOSING = frozenset({EventKind.REFUSED, EventKind.ENDED, EventKind.GONE})
 class Event:
     """One event in the history."""
 
-    omits_defaults: ClassVar = True  # written as plain data
+    omits_defaults: ClassVar[bool] = True  # written as plain data
 
     at: Moment  # seconds since the epoch
     kind: EventKind
