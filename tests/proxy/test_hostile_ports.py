@@ -54,6 +54,7 @@ class Scene:
         pool.lay_out({"edge": (self.port, ())}, {"ada": ["edge"]})
         self.robot = pool.robot("ada", extra=self._door("ada"))
         wait_for(self.robot.ready, LIMIT_S)
+        wait_for(lambda: self.gateway.report()["links"][0]["state"] == "up", LIMIT_S)
 
     def _door(self, name: str) -> str:
         """Return keys of a configuration; a busy machine shall make nobody suspected."""
