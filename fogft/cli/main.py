@@ -22,11 +22,10 @@ INTERRUPTED = 130
 STDOUT_CLOSED = 141
 # What Typer's checker of values says, and what we say.
 _OTHER_WORDS = (
-    (", unable to parse string as an integer", ""),
-    (", unable to parse string as a number", ""),
-    ("Input should be a valid integer", "must be a whole number"),
-    ("Input should be a valid number", "must be a number"),
-    ("Input should be", "must be"),
+    (" range.", "."),
+    ("a valid integer", "a whole number"),
+    ("a valid int", "a whole number"),
+    ("a valid float", "a number"),
 )
 
 app = typer.Typer(

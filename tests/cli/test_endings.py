@@ -84,9 +84,9 @@ def test_wrong_usage_is_2_with_a_way_to_help(arguments, message, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [
-        (["drain", "2.1"], "'SLOT': must be a whole number", "the slot of replica `2.1` is 2"),
-        (["scale", "up", "101"], "'N': must be less than or equal to 100", "see `fogft scale up"),
-        (["up", "--timeout", "x"], "'--timeout': must be a number", "see `fogft up --help`"),
+        (["drain", "2.1"], "'SLOT': '2.1' is not a whole number", "the slot of replica `2.1` is 2"),
+        (["scale", "up", "101"], "'N': 101 is not in the range 1<=x<=100", "see `fogft scale up"),
+        (["up", "--timeout", "x"], "'--timeout': 'x' is not a number", "see `fogft up --help`"),
     ],
 )
 def test_a_wrong_value_is_told_in_our_words(arguments, message, hint, capsys):
