@@ -299,8 +299,8 @@ class PendingRequests:
 
     def idle(self) -> list[bytes]:
         """Return the requests that no replica works on and that have a rejected answer."""
-        found = ((request, self._pending[request]) for request in self._short)
-        return [r for r, pending in found if pending.rejection is not None and not pending.open]
+        all_of = self._pending
+        return [r for r in self._short if (p := all_of[r]).rejection is not None and not p.open]
 
     def settle(self, request: bytes, able: Iterable[int]) -> Pending | None:
         """Remove a request that is answered by its rejection, as no other replica can be asked."""
