@@ -75,9 +75,11 @@ def export(
                 moved = _Moved(identity, files, lease.read_epoch(paths))
                 disk.write_whole(unfinished, bundle.seal(label, to_plain(moved), passphrase))
                 os.replace(paths.identity, paths.exported)
-        except (FogftError, OSError):
+        except (FogftError, OSError) as error:
             unfinished.unlink(missing_ok=True)
             startup.start_manager(store)
+            if isinstance(error, OSError):
+                raise FogftError(f"`{error.filename}` is needed: {error.strerror}") from None
             raise
         try:
             os.replace(unfinished, file)

@@ -117,3 +117,16 @@ def test_a_pool_whose_file_cannot_be_written_stays(made, tmp_path, monkeypatch):
         export(store, tmp_path / "no folder" / "planner.pool")
     assert started == [store]
     assert store.identity().name == "planner"
+
+
+def test_a_pool_without_its_credentials_stays(made, monkeypatch):
+    """What the file must hold cannot be read: the manager is started again."""
+    store, file = made
+    started = []
+    monkeypatch.setattr(moving.startup, "start_manager", started.append)
+    store.paths.credentials.rename(store.paths.folder / "lost")
+    with pytest.raises(FogftError, match=r"`.*credentials` is needed: No such file"):
+        export(store, file)
+    assert started == [store]
+    assert not file.exists()
+    assert store.identity()
