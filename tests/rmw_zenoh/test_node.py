@@ -179,10 +179,12 @@ class PlainClient:
         self._executor.start()
 
     def _spin(self) -> None:
+        began = time.monotonic()
         while self._open:
-            began = time.monotonic()
             time.sleep(TURN_S)  # its callback
-            self.longest_turn_s = max(self.longest_turn_s, time.monotonic() - began)
+            now = time.monotonic()
+            self.longest_turn_s = max(self.longest_turn_s, now - began)
+            began = now
             if self._answers:
                 self._answers.popleft()
                 self.taken += 1
