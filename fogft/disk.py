@@ -7,6 +7,7 @@ import contextlib
 import errno
 import json
 import os
+import select
 import sys
 import tempfile
 import time
@@ -21,6 +22,8 @@ if sys.platform != "win32":  # where files are only read and written by one proc
     import fcntl
 
 _PATIENCE_S = 0.2
+_ENDING_S = 1.0
+_PID_BYTES = 20
 _ROOM_BYTES = 64 << 10  # for a status file
 T = TypeVar("T")
 
@@ -165,6 +168,7 @@ class Lock:
                 return False
             time.sleep(0.01)
         assert self._descriptor is not None
+        _wait_for_end(self._descriptor)
         with contextlib.suppress(OSError):  # no room: then it says nothing
             os.ftruncate(self._descriptor, 0)
             os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
@@ -191,6 +195,19 @@ class Lock:
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)
+
+
+def _wait_for_end(descriptor: int) -> None:
+    """Wait until a killed process that had this lock has ended completely.
+
+    The kernel frees one lock after the other, and this one may come before those of DDS.
+    """
+    with contextlib.suppress(OSError, ValueError):
+        pid = int(os.pread(descriptor, _PID_BYTES, 0))
+        if not any(map(int, Path(f"/proc/{pid}/statm").read_bytes().split())):  # no memory left
+            ended = os.pidfd_open(pid)
+            select.select([ended], [], [], _ENDING_S)
+            os.close(ended)
 
 
 def standby_lock(path: Path) -> Path:

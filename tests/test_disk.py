@@ -11,6 +11,7 @@ import stat
 import subprocess
 import sys
 import threading
+import time
 
 import pytest
 
@@ -105,6 +106,36 @@ def test_a_lock_ends_with_its_process_whatever_ends_it(tmp_path):
         assert disk.is_locked(path)
         holder.send_signal(signal.SIGKILL)
     assert not disk.is_locked(path)
+
+
+def test_who_waits_for_a_lock_gets_it_when_its_killed_holder_has_ended_completely(tmp_path):
+    dying = """if True:
+        import ctypes, os, sys, threading, time
+        from pathlib import Path
+        from fogft.disk import Lock
+        lock = Lock(Path(sys.argv[1]))
+        assert lock.acquire(wait=False)
+        def end_slowly():
+            while Path("/proc/self/statm").read_bytes().split()[0] != b"0":
+                time.sleep(0.01)
+            time.sleep(0.2)
+            lock.release()
+            time.sleep(0.2)
+            Path(sys.argv[2]).touch()
+            os._exit(0)
+        threading.Thread(target=end_slowly).start()
+        ctypes.CDLL(None).pthread_exit(None)
+    """
+    path, ended = tmp_path / "lock", tmp_path / "ended"
+    holder = subprocess.Popen([sys.executable, "-c", dying, str(path), str(ended)])
+    try:
+        while not disk.is_locked(path):
+            time.sleep(0.01)
+        assert disk.Lock(path).acquire(wait=True)
+        assert ended.exists()
+    finally:
+        holder.kill()
+        holder.wait()
 
 
 def test_a_glance_at_a_lock_refuses_nobody(tmp_path):

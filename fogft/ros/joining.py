@@ -23,7 +23,7 @@ _ROS_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs", "--disable-stdout
 
 
 def new_context(domain_id: int | None) -> Any:
-    """Return a new rclpy context. Raises rclpy's errors, and ImportError."""
+    """Return a new rclpy context; its first node joins. Raises rclpy's errors, and ImportError."""
     import rclpy
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
@@ -35,6 +35,7 @@ def new_context(domain_id: int | None) -> Any:
         domain_id=domain_id,
         signal_handler_options=SignalHandlerOptions.NO,
     )
+    break_dead_ports(context.get_domain_id())
     return context
 
 
@@ -43,7 +44,6 @@ def bare_node(name: str, context: Any) -> Any:
     import rclpy
     from rclpy.parameter import Parameter
 
-    break_dead_ports(context.get_domain_id())
     node = rclpy.create_node(
         name,
         context=context,
