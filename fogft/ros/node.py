@@ -102,8 +102,8 @@ class SerialisedNode:
         except BaseException:
             self._context.try_shutdown()
             raise
-        self._ports = PortWatch()
         domain_id = self._context.get_domain_id()
+        self._ports = PortWatch(domain_id)
         self._early, self._known_at = early, time.monotonic() + _KNOWN_AFTER_S
         self._introduction = early.introduction if early else spdp.Introduction(domain_id)
 

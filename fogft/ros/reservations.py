@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fogft.ros.spdp import BASE_PORT, DOMAIN_GAIN
+from fogft.ros.spdp import domain_of
 
 DOMAINS = range(1, 102)  # above, the ports of a domain reach Linux's ephemeral ones
 _LOW_DOMAINS = 60  # robots' own, chosen by hand or by tests, tend to be 0 or above these
@@ -85,5 +85,5 @@ def _domains_in_use() -> set[int]:
         with contextlib.suppress(OSError):
             for line in Path(table).read_text().splitlines()[1:]:
                 port = int(line.split()[1].rpartition(":")[2], 16)
-                domains.add((port - BASE_PORT) // DOMAIN_GAIN)
+                domains.add(domain_of(port))
     return domains

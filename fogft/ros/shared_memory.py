@@ -38,7 +38,9 @@ FOLDER = Path("/dev/shm")
 
 _TURN_LIMIT_S = 5.0
 _IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
-_PORT_EVENT = re.compile(rb"\0fast(?:dds|rtps)_port\d+\0")
+_PORT_EVENT = re.compile(rb"\0fast(?:dds|rtps)_port(\d+)\0")
+# A process that begins or ends removes dozens of files within some ms: one look sees many of them.
+_REST_S = 0.02
 _REMOVED = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+) \(deleted\)")
 # A port begins, in Fast DDS 2.14 and 3.2, with: its number, how many read it, two limits in ms (one
 # a third of the other), how many messages it holds, how many wait; flags, the lowest "not broken".
@@ -155,9 +157,10 @@ def break_dead_ports(domain_id: int) -> set[str]:
 
 
 class PortWatch:
-    """Has this process open anew each port that another process removes, on a thread."""
+    """Has this process open anew each port of a domain that another removes, on a thread."""
 
-    def __init__(self) -> None:
+    def __init__(self, domain_id: int) -> None:
+        self._domain_id = domain_id
         self._libc, self._closed, self._id = ctypes.CDLL(None), False, -1
         with contextlib.suppress(AttributeError):  # no Linux
             self._watch = self._libc.inotify_init1(os.O_CLOEXEC)
@@ -168,8 +171,11 @@ class PortWatch:
     def _run(self) -> None:
         reopen_ports()
         while self._id >= 0 and not self._closed:
-            if _PORT_EVENT.search(os.read(self._watch, _EVENTS_BYTES)):
+            removed = _PORT_EVENT.findall(os.read(self._watch, _EVENTS_BYTES))
+            domains = {spdp.domain_of(int(port)) for port in removed}
+            if self._domain_id in domains or min(domains, default=0) < 0:
                 reopen_ports()
+            time.sleep(_REST_S)
         if self._id >= 0:
             os.close(self._watch)
 

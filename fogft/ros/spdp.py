@@ -69,6 +69,11 @@ def _here(prefix: bytes, port: int) -> bytes:
     return _message(prefix, 1, _DATA, b"\x00\x03\x00\x00" + told)
 
 
+def domain_of(port: int) -> int:
+    """Return the domain of a port; less than 0 for one below those of all domains."""
+    return (port - BASE_PORT) // DOMAIN_GAIN
+
+
 def first_port(domain_id: int) -> int:
     """Return the UDP port at which a machine's first participant of a domain hears of others."""
     return BASE_PORT + DOMAIN_GAIN * domain_id + _UNICAST_OFFSET

@@ -277,11 +277,12 @@ def test_a_live_node_survives_and_a_killed_one_is_swept(
 def test_ports_are_looked_at_when_one_goes_and_not_for_the_files_beside_it(
     leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Those beside it go with each ROS process of the machine, of whatever domain."""
+    """Those beside it, and other domains' ports, go with each ROS process of the machine."""
     looks: SimpleQueue[None] = SimpleQueue()
     monkeypatch.setattr(shared_memory, "reopen_ports", lambda: looks.put(None))
-    left = [leave(f"fastdds_port7411{beside}") for beside in ("_el", "_sl", "")]
-    watch = shared_memory.PortWatch()
+    names = ("port7661", "port7411_el", "port7411_sl", "port7411")
+    left = [leave(f"fastdds_{name}") for name in names]
+    watch = shared_memory.PortWatch(0)
     looks.get(timeout=LIMIT_S)
     for path in left:
         path.unlink()
