@@ -7,12 +7,14 @@ import json
 import statistics
 import subprocess
 import sys
+import threading
 import time
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from fogft.link import frame
+from fogft.link.compression import unpack
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.model.credentials import CredentialPaths
 from tests.hostile.robot import greets, session_at, target
@@ -89,15 +91,38 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
     good: ZenohLink,
     owner: Owner,
 ) -> None:
-    """Its requests are unpacked in a thread of its own; others' probes and requests go on."""
-    calm_s = round_trip_s(good, owner, 0)
+    """Its requests are unpacked in a thread of its own; others' probes and requests go on.
+
+    The calm run is beside who unpacks the same elsewhere: a busy machine slows both.
+    """
     bomb = zlib.compress(bytes(63 << 20), 9)
+    thrown, enough = 0, threading.Event()
+
+    def round_trips_s(first: int, before: Callable[[], None] = lambda: None) -> float:
+        """Return the median of some calls, with a pause after each."""
+        took_s = []
+        for number in range(first, first + by_day(10, at_night=50)):
+            before()
+            took_s.append(round_trip_s(good, owner, number, 1))
+            time.sleep(0.05)
+        return statistics.median(took_s)
+
+    def unpack_elsewhere() -> None:
+        while not enough.is_set():
+            unpack(bomb)
+
+    elsewhere = threading.Thread(target=unpack_elsewhere)
+    elsewhere.start()
+    try:
+        calm_s = round_trips_s(0)
+    finally:
+        enough.set()
+        elsewhere.join()
     files = authority.robot("eve")
     at = target(replica.endpoint)
     with session_at(at, files) as session:
         token = greets(session, files, at)
         origin = frame.origin("eve", token)
-        thrown = 0
 
         def throw() -> None:
             nonlocal thrown
@@ -106,12 +131,8 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
             # Cut short: it is unpacked to its end, and then refused.
             session.put(keys(0)[SERVICE], bomb[:-1], attachment=header)
 
-        took_s = []
-        for number in range(1000, 1000 + by_day(10, at_night=50)):
-            throw()
-            took_s.append(round_trip_s(good, owner, number, 1))
-            time.sleep(0.05)
+        attacked_s = round_trips_s(1000, throw)
         wait_for(lambda: replica.count("malformed") == thrown)
-    print(f"calm {calm_s * 1e3:.2f} ms, attacked {statistics.median(took_s) * 1e3:.2f} ms")
-    assert statistics.median(took_s) < max(NO_SLOWER * calm_s, ANY_CASE_S)
+    print(f"calm {calm_s * 1e3:.2f} ms, attacked {attacked_s * 1e3:.2f} ms")
+    assert attacked_s < max(NO_SLOWER * calm_s, ANY_CASE_S)
     assert good.status().reopened == 0
