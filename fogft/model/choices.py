@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from fogft.errors import SpecError
 from fogft.model.keys import (
     DAY_S,
     Flag,
@@ -234,7 +235,7 @@ def _days(written: Any) -> frozenset[int]:
         first, _, last = str(part).strip().lower().partition("-")
         for name in (first, last or first):
             if name not in DAYS:
-                raise ValueError(f"{name!r:.40} is not a day; write `mon-fri` or `[sat, sun]`")
+                raise SpecError(f"{name!r:.40} is not a day", "write `mon-fri` or `[sat, sun]`")
         begin, end = DAYS.index(first), DAYS.index(last or first)
         found |= {(begin + n) % 7 for n in range((end - begin) % 7 + 1)}
     return frozenset(found)
@@ -247,7 +248,8 @@ def _clock(written: Any) -> int:
     if match and int(match[2]) < 60:
         minutes = int(match[1]) * 60 + int(match[2])
     if not 0 <= minutes <= 24 * 60:
-        raise ValueError(f"{written!r:.40} is not a time of the day; write hours and minutes: 8:30")
+        hint = "write hours and minutes: 8:30"
+        raise SpecError(f"{written!r:.40} is not a time of the day", hint)
     return minutes * 60
 
 
@@ -323,14 +325,13 @@ class MigrationSpec:
 def _robot_at(written: Any) -> tuple[float, float]:
     is_pair = isinstance(written, list) and len(written) == 2
     if not is_pair or any(isinstance(n, bool) or not isinstance(n, (int, float)) for n in written):
-        raise ValueError(
-            f"must be a latitude and a longitude, not {written!r:.40}; "
-            "write degrees, such as `[37.87, -122.26]`"
+        raise SpecError(
+            f"must be a latitude and a longitude, not {written!r:.40}",
+            "write degrees, such as `[37.87, -122.26]`",
         )
     if not (-90 <= written[0] <= 90 and -180 <= written[1] <= 180):
-        raise ValueError(
-            f"{written!r:.40} is not on Earth; write `[latitude, longitude]` in degrees"
-        )
+        hint = "write `[latitude, longitude]` in degrees"
+        raise SpecError(f"{written!r:.40} is not on Earth", hint)
     return float(written[0]), float(written[1])
 
 

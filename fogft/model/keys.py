@@ -120,7 +120,7 @@ class Special:
     """Any other form: its description, its reader and its JSON Schema."""
 
     what: str
-    read: Callable[[Any], Any]  # raises ValueError; a hint may follow ``; ``
+    read: Callable[[Any], Any]  # raises SpecError
     schema: dict[str, Any]
 
 

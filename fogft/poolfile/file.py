@@ -65,7 +65,7 @@ def read_text(path: Path | str) -> str:
         raise SpecError(f"{path}:{line}: is not UTF-8 text: {error.reason}", hint) from None
 
 
-def _no_folder(base: Path, workdir: str) -> str | None:
+def _no_folder(base: Path, workdir: str) -> SpecError | None:
     if "://" in workdir:  # a repository, not a folder of this machine
         return None
     try:
@@ -73,8 +73,9 @@ def _no_folder(base: Path, workdir: str) -> str | None:
         if folder.is_dir():
             return None
     except (OSError, ValueError, RuntimeError) as error:
-        return f"`{workdir}` cannot be read: {error}"
-    return f"there is no folder `{folder}`; a relative path begins at the pool file's own folder"
+        return SpecError(f"`{workdir}` cannot be read: {error}")
+    hint = "a relative path begins at the pool file's own folder"
+    return SpecError(f"there is no folder `{folder}`", hint)
 
 
 def _too_large(file: str) -> SpecError:

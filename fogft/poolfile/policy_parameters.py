@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, TypeAlias
 
-from fogft.errors import SpecError
+from fogft.errors import FogftError, SpecError, told
 from fogft.model.keys import LONGEST_S, keys_of
 from fogft.model.plain import to_plain
 from fogft.model.spec import OnTimeout, Part, ServiceSpec
@@ -13,7 +13,7 @@ from fogft.poolfile.rules import NOT_WITH_QUORUM, NOT_WITH_STATE, RULES
 from fogft.poolfile.tree import Section, tree
 
 Value: TypeAlias = "bool | float | str"
-FieldCheck: TypeAlias = "Callable[[str, str], str | None]"  # of a type and a boolean response field
+FieldCheck: TypeAlias = "Callable[[str, str], FogftError | None]"  # of a type and a boolean field
 
 KEYS = tuple(entry.name for entry in keys_of(ServiceSpec) if entry.key.parameter)
 _ADVANCED = frozenset(entry.name for entry in keys_of(ServiceSpec) if entry.key.advanced)
@@ -109,9 +109,9 @@ class Policies:
         for name, news in merged.items():
             spec = changed(self._file[name], news)
             if spec.ok_field and spec.ok_field != self._file[name].ok_field:
-                reason = self._check_field(spec.type, spec.ok_field)
-                if reason:
-                    raise ValueError(f"{prefix(name)}.ok_field: {reason}")
+                found = self._check_field(spec.type, spec.ok_field)
+                if found is not None:
+                    raise ValueError(f"{prefix(name)}.ok_field: {told(found)}")
         self._set.update(merged)
 
     def services(self) -> tuple[ServiceSpec, ...]:

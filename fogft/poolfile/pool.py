@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
-from fogft.errors import SpecError
+from fogft.errors import FogftError, SpecError
 from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
 from fogft.model.groups import MAX_GROUPS
 from fogft.model.names import NAMES_BYTES_LIMIT, POOL_NAME_PATTERN
@@ -27,14 +27,16 @@ def _nothing(*_: object) -> None:
 class Checks:
     """Checks that depend on this machine, made when all else is valid.
 
-    Each returns what is wrong, None if nothing is; what to do may follow after ``; ``.
+    Each returns what is wrong and what to do; None if nothing is.
     """
 
-    types: Callable[[str], str | None] = _nothing  # why it cannot be loaded
-    fields: Callable[[str, str], str | None] = _nothing  # why a type's response has no such boolean
-    states: Callable[[StateSpec], str | None] = _nothing
-    tolerances: Callable[[str, Mapping[str, float]], str | None] = _nothing  # of a type, by field
-    workdir: Callable[[str], str | None] = _nothing
+    types: Callable[[str], FogftError | None] = _nothing  # why it cannot be loaded
+    # Why a type's response has no such boolean.
+    fields: Callable[[str, str], FogftError | None] = _nothing
+    states: Callable[[StateSpec], FogftError | None] = _nothing
+    # Of a type, by field.
+    tolerances: Callable[[str, Mapping[str, float]], FogftError | None] = _nothing
+    workdir: Callable[[str], FogftError | None] = _nothing
 
 
 UNCHECKED = Checks()
@@ -199,10 +201,9 @@ def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> Non
         )
 
 
-def _judge(section: Section, key: str, reason: str | None) -> None:
-    if reason is not None:
-        what, _, todo = reason.partition("; ")
-        raise section.error(key, shown(what, 300)[1:-1], shown(todo, 300)[1:-1])
+def _judge(section: Section, key: str, found: FogftError | None) -> None:
+    if found is not None:
+        raise section.error(key, shown(found.message, 300)[1:-1], shown(found.hint, 300)[1:-1])
 
 
 def _name(top: Section) -> str:

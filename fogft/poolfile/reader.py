@@ -148,9 +148,8 @@ def _table(form: keys.Table, section: Section) -> Any:
 def _special(form: keys.Special, section: Section, key: str) -> Any:
     try:
         return form.read(plain(section.children[key]))
-    except ValueError as error:
-        what, _, hint = str(error).partition("; ")
-        raise section.error(key, shown(what, 300)[1:-1], hint) from None
+    except SpecError as error:
+        raise section.error(key, shown(error.message, 300)[1:-1], error.hint) from None
 
 
 def _hint(entry: Entry) -> str:

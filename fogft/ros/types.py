@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from fogft.errors import RosError, told
+from fogft.errors import RosError
 from fogft.model.cdr import Shape
 from fogft.model.plain import as_line
 from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
@@ -64,17 +64,15 @@ def load_type(name: str) -> Any:
     return load_message_type(name) if "/msg/" in name else load_service_type(name)
 
 
-def trouble(make: Callable[..., object], *arguments: Any) -> str | None:
-    """Return why a ROS object cannot be created here, with a hint; None if it can."""
+def trouble(make: Callable[..., object], *arguments: Any) -> RosError | None:
+    """Return why a ROS object cannot be created here; None if it can."""
     try:
         make(*arguments)
     except RosError as error:
-        return told(error)
+        return error
     except ImportError as error:
-        return (
-            f"ROS 2 cannot be used here: {error}; install `fogft[ros]` "
-            "or source a ROS 2 installation"
-        )
+        hint = "install `fogft[ros]` or source a ROS 2 installation"
+        return RosError(f"ROS 2 cannot be used here: {error}", hint)
     return None
 
 

@@ -570,11 +570,12 @@ def test_a_mistake_is_told_exactly(source, message, hint):
 
 def test_a_type_that_cannot_be_loaded():
     def check(type_name):
-        return "`b/srv/B` has no module\n`b`; install it" if type_name == "b/srv/B" else None
+        lacking = SpecError("`b/srv/B`; it has no module\n`b`", "install it")
+        return lacking if type_name == "b/srv/B" else None
 
     source = pool(services="\n    - {name: a, type: a/srv/A}\n    - name: b\n      type: b/srv/B")
     assert fault(source, types=check) == (
-        "pool.yaml:6: fogft.services[1].type: `b/srv/B` has no module\\n`b`",
+        "pool.yaml:6: fogft.services[1].type: `b/srv/B`; it has no module\\n`b`",
         "install it",
     )
 
@@ -582,7 +583,8 @@ def test_a_type_that_cannot_be_loaded():
 def test_a_field_that_the_response_lacks():
     def check(type_name, field):
         assert (type_name, field) == ("b/srv/B", "done")
-        return "the response of `b/srv/B` has no boolean field `done`; its boolean fields: ok"
+        what = "the response of `b/srv/B` has no boolean field `done`"
+        return SpecError(what, "its boolean fields: ok")
 
     source = pool(
         services="\n    - {name: a, type: a/srv/A}\n"

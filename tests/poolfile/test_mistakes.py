@@ -60,7 +60,8 @@ def test_what_only_this_machine_tells_is_asked_of_each_service():
     text = "run: x\nfogft:\n  services:\n" + "".join(
         f"    - {{name: /s{n}, type: p/srv/T{n}}}\n" for n in range(3)
     )
-    told = found(text, types=lambda name: None if name == "p/srv/T1" else "no package; install it")
+    lacking = SpecError("no package", "install it")
+    told = found(text, types=lambda name: None if name == "p/srv/T1" else lacking)
     assert [(one.line, one.key) for one in told] == [
         (4, "fogft.services[0].type"),
         (6, "fogft.services[2].type"),

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.errors import RosError
 from fogft.model.choices import FallbackSpec, TrafficSpec
 from fogft.model.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
 from fogft.model.state import StateService, StateSpec
@@ -122,7 +123,7 @@ def test_a_value_holds_until_the_file_changes_that_key():
 
 
 def test_a_refused_set_changes_nothing_even_in_part():
-    policies = Policies(lambda kind, field: f"{kind} has no boolean field {field}")
+    policies = Policies(lambda kind, field: RosError(f"{kind} has no boolean field {field}"))
     policies.follow([PLAN])
     for news in ({"timeout_s": 3.0, "hedging": "some"}, {"timeout_s": 3.0, "ok_field": "success"}):
         with pytest.raises(ValueError):

@@ -252,7 +252,7 @@ def test_rmw_is_one_of_the_ways_there_are(rmw):
 
 def test_a_robot_over_zenoh_needs_no_type_but_where_a_policy_looks_into_responses():
     """What passes through untouched need not be known; what is made or read must be."""
-    refuse = {"types": lambda name: f"there is no `{name}`"}
+    refuse = {"types": lambda name: SpecError(f"there is no `{name}`")}
     assert read(document(rmw="zenoh"), **refuse).rmw.robot is Speaks.ZENOH
     for rmw in ("rclpy", {"replica": "zenoh"}):
         with pytest.raises(SpecError, match="there is no"):

@@ -108,7 +108,7 @@ def test_what_does_not_go_with_state_is_refused(line):
 
 def test_types_are_judged_where_they_can_be():
     with pytest.raises(SpecError, match=r"p.yaml:8: fogft.services\[0\].state: no such field"):
-        parse(SHORT, states=lambda state: "no such field; name another")
+        parse(SHORT, states=lambda state: SpecError("no such field", "name another"))
 
 
 VOTING = FILE + "      quorum: 2\n"

@@ -62,8 +62,9 @@ def test_types_are_looked_up_by_name():
     parse("topics", "[{name: a, type: p/msg/T, from: robot}]", types=asked.append)
     parse("actions", "[{name: a, type: p/action/T}]", types=asked.append)
     assert asked == ["p/msg/T", "p/action/T_SendGoal"]
+    lacking = SpecError("there is none", "x")
     with pytest.raises(SpecError, match="type: there is none") as found:
-        parse("actions", "[{name: a, type: p/action/T}]", types=lambda _: "there is none; x")
+        parse("actions", "[{name: a, type: p/action/T}]", types=lambda _: lacking)
     assert found.value.hint == "x"
 
 

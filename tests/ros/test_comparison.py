@@ -94,9 +94,10 @@ def test_noise_is_no_response():
     "path", ["plan", "plan.header.frame_id", "plan.poses.x", "no_such", "plan.header.stamp.sec"]
 )
 def test_only_floats_have_tolerances(path):
-    reason = trouble(Comparison, PLAN, {path: 0.1})
-    assert reason is not None
-    assert f"`{path}`; " in reason
+    found = trouble(Comparison, PLAN, {path: 0.1})
+    assert found is not None
+    assert f"`{path}`" in found.message
+    assert found.hint
 
 
 def test_paths_lead_through_lists():

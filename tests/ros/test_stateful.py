@@ -117,10 +117,10 @@ def test_text_fields_carry_text_and_a_refusal_its_message():
     ],
 )
 def test_what_cannot_carry_a_state_is_told_with_what_to_do(out, into, what):
-    reason = trouble(StateBytes, spec(out, into))
-    assert reason is not None
-    assert what in reason
-    assert "; " in reason
+    found = trouble(StateBytes, spec(out, into))
+    assert found is not None
+    assert what in found.message
+    assert found.hint
 
 
 def test_the_defaults_are_usable():

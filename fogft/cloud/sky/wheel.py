@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from fogft import template_files
 from fogft.disk import locked, make_folder, read_as, write_json, write_whole
 from fogft.errors import CloudError
 from fogft.model.plain import to_plain
@@ -78,9 +79,8 @@ def pack() -> tuple[str, bytes]:
 
 def _sources() -> dict[str, bytes]:
     paths = {str(path.relative_to(_PACKAGE)): path for path in _PACKAGE.rglob("*")}
-    if not (_PACKAGE / "templates").is_dir():  # a checkout, not an installation
-        beside = (_PACKAGE.parent / "templates").rglob("*")
-        paths |= {str(path.relative_to(_PACKAGE.parent)): path for path in beside}
+    templates = template_files.folder()
+    paths |= {str(path.relative_to(templates.parent)): path for path in templates.rglob("*")}
     return {
         name: path.read_bytes()
         for name, path in sorted(paths.items())

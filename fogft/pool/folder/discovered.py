@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fogft import disk
+from fogft.errors import told
 from fogft.model import ros_names
 from fogft.model.choices import Speaks
 from fogft.model.plain import as_line, to_plain
@@ -85,4 +86,5 @@ def _check(name: str, kind: str, *, load: bool) -> str:
             return "its name is not absolute"
     except ValueError as error:
         return str(error)
-    return (trouble(load_service_type, kind) if load else None) or ""
+    found = trouble(load_service_type, kind) if load else None
+    return told(found) if found else ""
