@@ -122,7 +122,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.NOT_READY: "not ready after {r.seconds:.0f} s",
     Cause.NOT_SET_UP: "still setting up after {r.seconds:.0f} s",
     Cause.NOTICE: "preemption notice",
-    Cause.DRAINS_ITSELF: "preemption notice, reported by the replica",
+    Cause.NOTICE_BY_REPLICA: "preemption notice, reported by the replica",
     Cause.SILENT: "silent for {r.seconds:.0f} s",
     Cause.DISAGREES: "its answers differ from the other replicas'",
     Cause.MISREAD: "its answers cannot be read as responses of the service's type",

@@ -65,7 +65,7 @@ class ReplicaWord:
     slot: Count
     generation: Count
     ready: frozenset[Line] = frozenset()  # names of the services that it can answer now
-    draining: bool = False  # it asks to be left alone: its machine will be taken
+    draining: bool = False  # the replica is leaving: its machine said that it will be taken
     at_risk: bool = False  # its cloud recommends to move it; it serves on meanwhile
     restarts: Count = 0  # of the user's `run` command
     detail: Line = ""  # why it is not ready, in words; empty when it is
@@ -183,8 +183,8 @@ class Link(Protocol):
         """Services that the last probe answer called ready; empty unless UP. Cheap."""
 
     @property
-    def draining(self) -> bool:
-        """Whether the replica is draining: it asked for no new requests. Cheap."""
+    def leaving(self) -> bool:
+        """Whether the replica said that its machine will be taken. Cheap."""
 
     def offer(
         self,

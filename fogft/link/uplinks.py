@@ -95,9 +95,9 @@ class UplinksLink:
         return frozenset(name for link in self._links for name in link.ready)
 
     @property
-    def draining(self) -> bool:
-        """Whether the replica is draining."""
-        return any(link.draining for link in self._links)
+    def leaving(self) -> bool:
+        """Whether the replica is leaving."""
+        return any(link.leaving for link in self._links)
 
     def offer(
         self,

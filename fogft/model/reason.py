@@ -26,7 +26,7 @@ class Cause(str, Enum):
 
     # What is wrong with a replica.
     NOTICE = "preemption_notice"
-    DRAINS_ITSELF = "drains_itself"
+    NOTICE_BY_REPLICA = "drains_itself"
     SILENT = "silent"
     DISAGREES = "disagrees"
     MISREAD = "misread"  # its answers are no messages of the type

@@ -176,7 +176,7 @@ class LinkReport:
     id: ReplicaId
     state: LinkState
     ready: frozenset[str] = frozenset()  # services that it says it can answer now
-    leaving: bool = False  # it asks to be left alone itself: its machine will be taken
+    leaving: bool = False  # it says that its machine will be taken
     draining: bool = False  # it is leaving, or marked: nothing new while others can answer
     at_risk: bool = False  # its cloud recommends to move it; it serves on meanwhile
     disagrees: bool = False  # repeatedly, with a quorum; or one of the next two

@@ -51,7 +51,7 @@ class Sequencer:
         self.held_by = ""  # another robot, whose order they obey
         self.handover: Handover | None = None  # this term's end: the next begins from it
         self._versions: Mapping[int, str] = {}
-        self._leaving: frozenset[int] = frozenset()
+        self._draining: frozenset[int] = frozenset()
         self._change_to: str | None = None  # no number is given meanwhile
         self._unanswered: dict[int, None] = {}
         self._replicas = CatchingUp(epoch, self._counts, handed_over=begin is not None)
@@ -105,11 +105,11 @@ class Sequencer:
         now: float,
         *,
         versions: Mapping[int, str] | None = None,
-        leaving: Iterable[int] = (),
+        draining: Iterable[int] = (),
     ) -> None:
         """Set the reachable replicas and their versions; new ones are claimed."""
         wanted = set(replicas)
-        self._versions, self._leaving = versions or {}, frozenset(leaving)
+        self._versions, self._draining = versions or {}, frozenset(draining)
         for replica in [r for r in self._peers if r not in wanted]:
             del self._peers[replica]
             self._fenced.pop(replica, None)
@@ -321,7 +321,7 @@ class Sequencer:
                 if self._counts(replica):
                     self._recall(replica, self._peers[replica].next)
         elif self.handover is None:
-            staying = [self._version(r) for r in joined if r not in self._leaving]
+            staying = [self._version(r) for r in joined if r not in self._draining]
             self._change_to = self.active.wanted(staying)
             self._prepare_handover(now)
 
@@ -330,7 +330,7 @@ class Sequencer:
         if self._change_to is None or self._unanswered:
             return
         donors = [
-            (r in self._leaving, p.won, r)
+            (r in self._draining, p.won, r)
             for r, p in self._peers.items()
             if p.joined and self._counts(r) and p.acked >= self.log.last and not p.open
         ]

@@ -74,11 +74,11 @@ class Send(NamedTuple):
 
 
 class Reachable(NamedTuple):
-    """The reachable replicas: new ones, all, and those that leave soon."""
+    """The reachable replicas: new ones, all, and those that are draining."""
 
     come: Collection[int]
     versions: Mapping[int, str]  # what each runs
-    leaving: Collection[int]
+    draining: Collection[int]
 
 
 class Decide:

@@ -410,7 +410,7 @@ def test_what_a_probe_says_is_seen_on_the_link(
     replica.answer = ProbeAnswer(
         slot=0, generation=1, incarnation="first", ready=frozenset(), draining=True, detail="starts"
     )
-    world.wait_for(lambda: link.draining)
+    world.wait_for(lambda: link.leaving)
     assert link.ready == frozenset()
     assert link.usable
     probe_answer = link.status().probe_answer

@@ -89,8 +89,8 @@ class MemoryLink:
         return answer.ready if answer is not None and self.usable else frozenset()
 
     @property
-    def draining(self) -> bool:
-        """Whether the replica is draining."""
+    def leaving(self) -> bool:
+        """Whether the replica is leaving."""
         answer = self._status.probe_answer
         return answer is not None and answer.draining
 

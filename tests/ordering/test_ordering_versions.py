@@ -26,7 +26,7 @@ class Versions(World):
 
     def __init__(self, old: int) -> None:
         self.version_of: dict[int, str] = {}
-        self.leaving: set[int] = set()
+        self.draining: set[int] = set()
         self.said: list[tuple[int, str, object, int]] = []  # index, version, question, answer
         self.holder: str | None = None
         super().__init__(counter, 0, replicas=0)
@@ -38,7 +38,7 @@ class Versions(World):
         return self.add_replica()
 
     def leave(self, replica: int) -> None:
-        self.leaving.add(replica)
+        self.draining.add(replica)
         self.reach()
 
     def step_of(self, replica):
@@ -56,7 +56,7 @@ class Versions(World):
         self.said.append((order.index, version, question, eval(payload.decode())))
 
     def reach(self) -> None:
-        self.sequencer.reach(self.hosts, self.now, versions=self.version_of, leaving=self.leaving)
+        self.sequencer.reach(self.hosts, self.now, versions=self.version_of, draining=self.draining)
         self.send()
 
     def new_term(self) -> Sequencer:
@@ -110,7 +110,7 @@ def update(world: Versions, source: random.Random, to: str, *, kills: bool = Fal
         for _ in range(60):  # a manager gives it ten seconds
             drive(world, source, ask_counter, 40, faults=0.0)
             world.tick(0.1)
-            stay = [world.version_of[r] for r in world.hosts if r not in world.leaving]
+            stay = [world.version_of[r] for r in world.hosts if r not in world.draining]
             if 2 * stay.count(to) <= len(stay) or world.sequencer.active.version == to:
                 break
         world.remove_replica(old)

@@ -396,7 +396,7 @@ def test_a_notice_stays_the_reason_while_the_replica_is_drained() -> None:
     world = World(spec(2)).having(replica(0), going, replica(1, generation=2))
     [ending] = world.plan().terminations
     assert ending.id.short == "1.1"
-    assert ending.reason == Reason(Cause.DRAINS_ITSELF)
+    assert ending.reason == Reason(Cause.NOTICE_BY_REPLICA)
 
 
 def test_restarted_proxy_does_not_make_young_ones_of_old_ones() -> None:

@@ -30,7 +30,7 @@ class PoolOnSky:
 
     Attributes:
         boots: Whether launches succeed by themselves; else the test says how they end.
-        draining: Replicas whose server proxies ask to be left alone.
+        leaving: Replicas that say that their machines will be taken.
         late: Replicas whose links are up, and for how many seconds a probe waits for its answer.
     """
 
@@ -42,7 +42,7 @@ class PoolOnSky:
         self.spec = PoolSpec("perception", (SERVICE,), replicas=replicas, task=task, **spec)
         identity = Identity("perception", UID, "sky", "/pool.yaml", self.scene.now)
         self.store = MemoryStore(identity, self.spec)
-        self.draining: set[ReplicaId] = set()
+        self.leaving: set[ReplicaId] = set()
         self.late: dict[ReplicaId, float] = {}
         self.serves: Callable[[str], bool] = lambda cluster: True  # by the cluster's name
         self.last: Tick | None = None
@@ -84,7 +84,7 @@ class PoolOnSky:
         if not runs or cluster is None or cluster.state is not ClusterState.UP:
             return LinkReport(id, LinkState.CONNECTING)
         ready = frozenset({SERVICE.name}) if self.serves(cluster.name) else frozenset[str]()
-        return LinkReport(id, LinkState.UP, ready, leaving=id in self.draining)
+        return LinkReport(id, LinkState.UP, ready, leaving=id in self.leaving)
 
     def tick(self, count: int = 1, seconds: float = 1.0) -> Tick:
         """Let the manager work, its threads too, and time pass; return the last tick."""

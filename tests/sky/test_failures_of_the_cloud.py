@@ -200,7 +200,7 @@ def test_a_manager_killed_in_any_phase_leaves_one_vm(by_hand: PoolOnSky, phase: 
         by_hand.until(by_hand.ready)
     if phase == "ending":
         sky.fail_next("down", CloudUnreachable("no answer"), times=3)
-        by_hand.draining.add(replica(0, 1))
+        by_hand.leaving.add(replica(0, 1))
         sky.boots = True
         by_hand.until(lambda: sky.asked("down"))
     by_hand.kill_the_manager()
@@ -273,7 +273,7 @@ def test_a_notice_is_answered_while_the_machine_still_runs(pool: PoolOnSky):
     """Real clouds tell the machine alone: the replica asks to be left alone, over its link."""
     pool.until(pool.ready)
     pool.sky.boots = False
-    pool.draining.add(replica(0, 1))
+    pool.leaving.add(replica(0, 1))
     pool.tick(2)
     assert pool.ordered() == [infra(EAST), infra(WEST)]
     assert pool.ready() == ["0.1"], "it serves until the next one does"
@@ -291,7 +291,7 @@ def test_the_budget_counts_what_is_being_launched_and_is_never_exceeded(tmp_path
     for slot in (0, 1):
         pool.sky.finish(cluster_name(replica(slot, 1)))
     pool.until(lambda: pool.ready() == ["0.1", "1.1"])
-    pool.draining.add(replica(0, 1))
+    pool.leaving.add(replica(0, 1))
     pool.tick(30)
     assert len(pool.ordered()) == 2
     assert "`max_usd_per_hour` leaves $0.005/h" in pool.notes

@@ -37,7 +37,7 @@ class Verdict(str, Enum):
 
     GOOD = "good"  # serves, will serve, or nothing can be said against it
     FAILED = "failed"  # its launch has failed, or took longer than `start_limit_s`
-    LEAVING = "leaving"  # a preemption notice was given, or the replica is draining
+    LEAVING = "leaving"  # a preemption notice was given, by its cloud or by itself
     UNRESPONSIVE = "unresponsive"  # silent past `replace_after_s` while another answers
     AT_RISK = "at risk"  # serves, and its cloud recommends to move it
     DISAGREES = "disagrees"  # its answers differ from a quorum's, or are none, repeatedly
@@ -236,7 +236,7 @@ def _verdict(  # noqa: PLR0911, PLR0912 - one line a verdict reads better than n
             return Verdict.FAILED, _timeout(Cause.NOT_RUNNING, health.start_limit_s)
         return Verdict.GOOD, None
     if link is not None and link.leaving:
-        return Verdict.LEAVING, Reason(Cause.DRAINS_ITSELF)
+        return Verdict.LEAVING, Reason(Cause.NOTICE_BY_REPLICA)
     silent = link is not None and was_heard(link, record) and link.state is not LinkState.UP
     if link is not None and silent and context.may_doubt and link.silent_for_s > context.patience_s:
         return Verdict.UNRESPONSIVE, Reason(Cause.SILENT, seconds=link.silent_for_s)

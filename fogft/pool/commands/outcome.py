@@ -80,7 +80,7 @@ class Awaited:
 
 @dataclass(frozen=True)
 class Settled:
-    """What `scale` and `drain` wait for: all replicas ready, none leaving, and not `gone` there."""
+    """What `scale` and `drain` wait for: all replicas ready, none draining, no `gone` there."""
 
     since: float
     gone: tuple[int, int] | None = None
@@ -89,12 +89,12 @@ class Settled:
         """Return the outcome for a status."""
         del is_last
         status = seen.status
-        leaving = [
+        draining = [
             one
             for one in status.replicas
             if one.phase == Phase.DRAINING.value or (one.slot, one.generation) == self.gone
         ]
-        if status.observed_at < self.since or leaving or status.ready < status.target:
+        if status.observed_at < self.since or draining or status.ready < status.target:
             return Outcome.PENDING
         return Outcome.ANSWERING
 
@@ -106,7 +106,7 @@ def is_given_up(seen: Seen) -> bool:
 
 
 def staying(seen: Seen) -> list[ReplicaStatus]:
-    """Return the replicas that are not leaving: those of a file before this one leave."""
+    """Return the replicas that are not draining: those of a file before this one are."""
     return [one for one in seen.status.replicas if one.phase != Phase.DRAINING.value]
 
 

@@ -340,8 +340,8 @@ def of_tick(
     health, observed, plan = tick.plan.health, tick.observed, tick.plan
     judged = health.replicas if health is not None else ()
     said = [*plan.notes, *_without_certificate(tick), *notes]
-    leaving = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
-    replicas = [_replica(one, leaving, history, observed.now) for one in judged]
+    draining = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
+    replicas = [_replica(one, draining, history, observed.now) for one in judged]
     members = tick.membership.members if tick.membership is not None else ()
     by_hand = [member.id for member in members if member.id.slot >= FIRST_BY_HAND]
     starting = Phase.STARTING.value
@@ -406,16 +406,16 @@ def _without_certificate(tick: Tick) -> list[Reason]:
 
 
 def _replica(
-    one: Assessment, leaving: set[ReplicaId], history: History, now: float
+    one: Assessment, draining: set[ReplicaId], history: History, now: float
 ) -> ReplicaStatus:
     machine = one.machine
     record = history.record(one.id.slot, one.id.generation)
     launched_at = record.launched_at if record is not None else machine.launched_at
-    leaves = one.id in leaving and one.phase is not Phase.GONE
+    drains = one.id in draining and one.phase is not Phase.GONE
     return ReplicaStatus(
         slot=one.id.slot,
         generation=one.id.generation,
-        phase=(Phase.DRAINING if leaves else one.phase).value,
+        phase=(Phase.DRAINING if drains else one.phase).value,
         verdict=one.verdict.value,
         location=machine.placement.location,
         instance=machine.placement.instance,

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # Upper bounds of buckets, seconds: from the local cloud to a VM with a long `setup`.
 BUCKETS_S = (1.0, 5.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1200.0, 3600.0)
-_NOTICES = (Cause.NOTICE, Cause.DRAINS_ITSELF)
+_NOTICES = (Cause.NOTICE, Cause.NOTICE_BY_REPLICA)
 _PHASES = ("provisioning", "starting", "total")
 
 

@@ -268,13 +268,13 @@ class ClientProxy:
         self._topics.route({key_of(link): link for link in links})
         differ = {link.peer.id: self._differences(link) for link in links}
         versions = {id: member.version for id, member in self.links.members.items()}
-        leaving = frozenset(link.peer.id for link in links if self.links.draining(link))
+        draining = frozenset(link.peer.id for link in links if self.links.draining(link))
         hanging = self.links.hanging()
         for service in self._services.values():
             name = service.spec.name
             fit = [link for link in links if name not in differ[link.peer.id]]
             hang = {id for id, names in hanging.items() if name in names}
-            service.dispatcher.route(service.may_ask(fit, leaving), versions, leaving, hang)
+            service.dispatcher.route(service.may_ask(fit, draining), versions, draining, hang)
 
     # -- what people see ------------------------------------------------------------------
 
@@ -324,7 +324,7 @@ class ClientProxy:
         """The services currently offered in ROS."""
         return [name for name, service in self._services.items() if service.server is not None]
 
-    def begin_leaving(self) -> None:
+    def begin_hand_over(self) -> None:
         """Begin a hand-over: leave topics to the other proxy, record requests taken meanwhile."""
         with self._lock:
             for service in self._services.values():
@@ -335,7 +335,7 @@ class ClientProxy:
         """Stop taking requests; another proxy does."""
         with self._lock:
             for service in self._services.values():
-                service.dispatcher.leaving = True
+                service.dispatcher.takes_no_more = True
 
     def waiting(self, *, ordered: bool = False) -> int:
         """Count the unanswered requests, of all or only of stateful services."""

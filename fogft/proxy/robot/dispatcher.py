@@ -74,7 +74,7 @@ class Dispatcher:
         id_of: Callable[[str, Any], bytes] = lambda service, handle: os.urandom(REQUEST_ID_BYTES),
     ) -> None:
         self._id_of = id_of
-        self.leaving = False  # callers' requests are left to another proxy, which gets them too
+        self.takes_no_more = False  # another proxy gets callers' requests, too
         self.taken: list[bytes] | None = None  # those taken, once another proxy may get them too
         self._fault_of = fault_of
         self._malformed: Counter[int] = Counter()
@@ -119,7 +119,7 @@ class Dispatcher:
         """Take a caller's request and offer it to the replicas that the policy chooses."""
         spec = self._ledger.spec
         request = self._id_of(spec.name, handle)
-        if self.leaving:
+        if self.takes_no_more:
             return
         if self.taken is not None:
             self.taken.append(request)

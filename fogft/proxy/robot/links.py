@@ -48,7 +48,7 @@ def link_report(
         "differs": bool(ours),
         "differing": sorted(differ) if ours else [],
         "offered": dict(answer.offered) if answer and link.usable else {},
-        "leaving": link.draining,
+        "leaving": link.leaving,
         "draining": draining,
         "at_risk": bool(answer and answer.at_risk),
         "disagrees": status.ignores or misread or any(one.disagrees(key) for one in dispatchers),
@@ -218,8 +218,8 @@ class Links:
         return self._links.pop(id)
 
     def draining(self, link: Link) -> bool:
-        """Whether a replica is draining, by its own report or the manager's."""
-        return link.draining or self.members[link.peer.id].draining
+        """Whether a replica is draining: leaving by its own word, or marked by the manager."""
+        return link.leaving or self.members[link.peer.id].draining
 
     @property
     def silent_together(self) -> bool:

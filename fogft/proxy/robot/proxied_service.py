@@ -49,14 +49,14 @@ class ProxiedService:
                 old.close()
         self.dispatcher.adopt(spec, self._fallback)
 
-    def may_ask(self, links: Sequence[Link], leaving: Collection[ReplicaId]) -> list[Link]:
+    def may_ask(self, links: Sequence[Link], draining: Collection[ReplicaId]) -> list[Link]:
         """Return the links with our type over which its requests may be sent."""
         if self.spec.state is not None:  # replicas are brought to readiness by what is sent
             return [link for link in links if link.usable]
         ready = [link for link in links if self.spec.name in link.ready]
-        if self.spec.part is Part.CANCEL:  # who is told to stop may leave; who is to work not
+        if self.spec.part is Part.CANCEL:  # who is told to stop may drain; who is to work not
             return ready
-        return [link for link in ready if link.peer.id not in leaving] or ready
+        return [link for link in ready if link.peer.id not in draining] or ready
 
     def advertise(self, node: RosNode, now: float) -> None:
         """Offer or withdraw the service, as required now (monotonic seconds)."""

@@ -60,7 +60,7 @@ class Sender:
         self,
         links: Sequence[Link],
         versions: Mapping[ReplicaId, str] = MappingProxyType({}),
-        leaving: Collection[ReplicaId] = (),
+        draining: Collection[ReplicaId] = (),
         hanging: Collection[ReplicaId] = (),
     ) -> None:
         """Set the links that may be asked now, and offer them open requests.
@@ -79,8 +79,8 @@ class Sender:
                 self._ledger.requests.came(added)
             if replication is not None:
                 known = {key: versions.get(x.peer.id, "") for key, x in routed.items()}
-                going = [key for key, link in routed.items() if link.peer.id in leaving]
-                replication.reach(Reachable(added, known, going), now)
+                drain = [key for key, link in routed.items() if link.peer.id in draining]
+                replication.reach(Reachable(added, known, drain), now)
             told, self._hanging = hang - self._hanging, hang
             for key in told:
                 self._ledger.requests.choose.hangs(key)

@@ -184,8 +184,8 @@ class ServiceOrder(Decide):
         self._reach(now)
 
     def _reach(self, now: float) -> None:
-        _, versions, leaving = self._replicas
-        self._term.reach(versions, now, versions=versions, leaving=leaving)
+        _, versions, draining = self._replicas
+        self._term.reach(versions, now, versions=versions, draining=draining)
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
         """Number waiting requests, and return the orders to send, in order."""

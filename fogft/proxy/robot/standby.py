@@ -177,7 +177,7 @@ def hand_over(
         log.error("handover_failed reason=%r", str(error))
         return False
     log.info("handover_began pool=%s", config.pool)
-    proxy.begin_leaving()
+    proxy.begin_hand_over()
     release()
     if _run(proxy, BEGIN_LIMIT_S, lambda: _takes(config.status, callers())):
         _run(proxy, KNOWN_AFTER_S, lambda: False)

@@ -147,7 +147,7 @@ def test_another_proxy_orders_what_was_not_taken_and_nothing_twice(scene, known)
     assert second.able
     first.taken = []
     for i in range(3):
-        first.leaving = i == 2
+        first.takes_no_more = i == 2
         first.submit(b"q%d" % i, i)
         second.submit(b"q%d" % i, i)
         scene.run()

@@ -113,7 +113,7 @@ def test_a_replica_that_is_not_ready_gets_nothing():
 def test_a_draining_replica_is_spared_while_another_can_answer(by):
     scene = Scene()
     scene.follow(member(0, draining=by == "member"), member(1))
-    scene.dialer.links[0].draining = by == "link"
+    scene.dialer.links[0].leaving = by == "link"
     scene.ready(*scene.dialer.links)
     scene.ask()
     assert [len(link.offered) for link in scene.dialer.links] == [0, 1]

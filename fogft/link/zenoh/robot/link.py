@@ -101,8 +101,8 @@ class ZenohLink:
         return live is not None and live.attempts.sending
 
     @property
-    def draining(self) -> bool:
-        """Whether the replica is draining."""
+    def leaving(self) -> bool:
+        """Whether the replica is leaving."""
         answer = self._probing.answer
         return answer is not None and answer.draining
 

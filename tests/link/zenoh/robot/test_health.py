@@ -112,7 +112,7 @@ def test_a_change_of_readiness_arrives(
     wait_for(lambda: link.ready == frozenset())
     assert link.usable
     replica.ask(ready=[SERVICE], draining=True)
-    wait_for(lambda: link.draining)
+    wait_for(lambda: link.leaving)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
