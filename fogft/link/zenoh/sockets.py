@@ -67,6 +67,13 @@ def listening(port: int) -> socket.socket | None:
     return None
 
 
+def refuse(port: int) -> None:
+    """Listen at a port no longer: who comes is refused."""
+    if (listener := listening(port)) is not None:
+        with listener:
+            listener.shutdown(socket.SHUT_RDWR)
+
+
 class OwnSocket:
     """One connection of this process. Looked up on each use and not kept open."""
 
