@@ -44,9 +44,10 @@ from fogft.planning.rollout import Update
 from fogft.planning.sizing import Inputs
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import offers
+from fogft.pool.manager.event_recorder import EventRecorder
 from fogft.pool.manager.launched_gateway import LaunchedGateway
 from fogft.pool.manager.operations import Operations, Submit
-from fogft.pool.manager.timekeeping import Remembering, Timekeeping
+from fogft.pool.manager.timekeeping import Timekeeping
 from fogft.pool.manager.updating import Updating
 from fogft.reason_words import words
 
@@ -140,7 +141,7 @@ class Reconciler:
         self._offers_for: tuple[str, float] | None = None
         self._updating = Updating(store)
         self._time = Timekeeping(store, self._updating, clock)
-        self._remember = Remembering(store, lambda: self._time.now)
+        self._recorder = EventRecorder(store, lambda: self._time.now)
         self._membership: Membership | None = store.membership()
         self._published_for: tuple[Any, ...] | None = None  # what it follows from
         self._log_tail = ""  # of the last replica that was ended because it was never ready
@@ -162,10 +163,10 @@ class Reconciler:
             observed, trouble = self._observe(identity, spec)
         health, judged_at = None, 0
         if observed.machines is not None:
-            self._remember.losses(observed)
+            self._recorder.losses(observed)
             self._ask_about_silent(observed, history)
             health, judged_at = judge(identity.uid, spec, observed, history), history.version
-            self._remember.health(health, history)
+            self._recorder.health(health, history)
         if history.version != judged_at:  # it remembers more now: judge by all of it
             health = None
         begun_at = lifetime.begun_at(intent, identity.created_at, history)
@@ -211,7 +212,7 @@ class Reconciler:
                 cause = _refusal(error)
                 if cause:
                     reason = Reason(cause, words=str(error))
-                    self._remember.add(EventKind.REFUSED, id, reason=reason)
+                    self._recorder.add(EventKind.REFUSED, id, reason=reason)
 
     def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[Reason]]:
         trouble: list[Reason] = []
@@ -286,13 +287,13 @@ class Reconciler:
             record = history.record(machine.id.slot, machine.id.generation)
             was_up = record is not None and record.first_ready_at is not None
             if is_seen and not was_up:
-                self._remember.add(EventKind.READY, machine.id)
+                self._recorder.add(EventKind.READY, machine.id)
             elif is_doubted and was_up and cloud is not None:  # one that boots is left alone
                 ask = functools.partial(cloud.refresh, machine.id)
                 self._refreshes.start(machine.id, None, ask)
         for id, reason in step.ends:
             if id in step.failed:
-                self._remember.add(EventKind.FAILED, id, reason=reason)
+                self._recorder.add(EventKind.FAILED, id, reason=reason)
             self._terminate(id, reason, history)
         if step.launch is not None:
             generation = history.generations[GATEWAY_SLOT] + 1
@@ -331,9 +332,9 @@ class Reconciler:
                 continue
             if machine.id in plan.draining:
                 if record.draining_since is None:
-                    self._remember.add(EventKind.DRAINING, machine.id)
+                    self._recorder.add(EventKind.DRAINING, machine.id)
             elif record.draining_since is not None and machine.id not in ends:
-                self._remember.add(EventKind.UNDRAINED, machine.id)
+                self._recorder.add(EventKind.UNDRAINED, machine.id)
 
     def _publish(self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan) -> None:
         revoked = self._revoked()
@@ -372,7 +373,7 @@ class Reconciler:
 
     def _order(self, order: Launch, reason: Reason) -> None:
         location = order.placement.location
-        self._remember.add(
+        self._recorder.add(
             EventKind.LAUNCH,
             order.id,
             location=location,
@@ -399,7 +400,7 @@ class Reconciler:
             return  # its launch is under way: a later tick ends it
         record = history.record(id.slot, id.generation)
         if record is None or not record.ending:
-            self._remember.add(EventKind.ENDING, id, reason=reason)
+            self._recorder.add(EventKind.ENDING, id, reason=reason)
             log.info("terminate_ordered replica=%s reason=%r", id.short, words(reason))
         never_ready = fault_of(reason) is Cause.NOT_READY
         if stopped is None:

@@ -1,8 +1,6 @@
-"""Record in the history what happened to each replica and to the clock.
+"""Take one time for a whole tick, and write into the history where the clock jumped.
 
-One tick has one time. Where the clock was set, or the machine slept, that is written into the
-history first, and all that is remembered moves along.
-
+Where it was set, or the machine slept, all that is remembered moves along.
 Not here: what a jump is (`planning.observed.clock_jumps`), and what moves (`history`, `updating`).
 """
 
@@ -10,87 +8,11 @@ import logging
 import time
 from collections.abc import Callable
 
-from fogft.model.reason import Cause, Reason
-from fogft.model.replica import Observed, ReplicaId
+from fogft.model.reason import Reason
 from fogft.planning.observed.clock_jumps import Reading, Watch
-from fogft.planning.observed.health import Health, Verdict
-from fogft.planning.observed.history import Event, EventKind, History
+from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.folder.store import PoolStore
 from fogft.pool.manager.updating import Updating
-from fogft.reason_words import words
-
-
-class Remembering:
-    """Adds to a pool's history. Events are on disk before a method returns, or `StateError`.
-
-    `clock` gives the observation's time: the plan that follows must not take a loss for something
-    of the future, and go to the same place again.
-    """
-
-    def __init__(self, store: PoolStore, clock: Callable[[], float]) -> None:
-        self._store = store
-        self._clock = clock
-        self._leaving: dict[ReplicaId, Reason] = {}  # when they were judged last
-
-    def add(
-        self,
-        kind: EventKind,
-        id: ReplicaId,
-        *,
-        location: str = "",
-        reason: Reason | None = None,
-        on_demand: bool = False,
-        version: str = "",
-    ) -> None:
-        """Add one event."""
-        at = self._clock()
-        self._store.append(
-            Event(at, kind, id.slot, id.generation, location, reason, on_demand, version=version)
-        )
-
-    def losses(self, observed: Observed) -> None:
-        """Record replicas that are no longer listed. The cloud's list must be known."""
-        uid = self._store.identity().uid
-        ids = [m.id for m in (*(observed.machines or ()), *observed.gateway)]
-        listed = {(id.slot, id.generation) for id in ids if id.pool_uid == uid}
-        for record in self._store.history().open():
-            if (record.slot, record.generation) not in listed:
-                id = ReplicaId(uid, record.slot, record.generation)
-                kind = EventKind.ENDED if record.ending else EventKind.GONE
-                log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
-                why = None if record.ending else self._leaving.get(id, Reason(Cause.NOT_LISTED))
-                self.add(kind, id, reason=why)
-
-    def health(self, health: Health, history: History) -> None:
-        """Record replicas that became ready, became unready or failed."""
-        leaving = (judged for judged in health.replicas if judged.verdict is Verdict.LEAVING)
-        self._leaving = {judged.id: judged.fault for judged in leaving if judged.fault}
-        for judged in health.replicas:
-            machine, record = judged.machine, judged.record
-            id = machine.id
-            if record is None or record.closed is not None:  # the cloud's list is the record
-                place = machine.placement
-                self.add(
-                    EventKind.LAUNCH,
-                    id,
-                    location=place.location,
-                    on_demand=not place.spot,
-                    version=machine.spec_hash,
-                )
-                record = history.record(id.slot, id.generation)
-            if record is None:
-                continue
-            if judged.serving:
-                if record.first_ready_at is None or record.unready_since:
-                    log.info("replica_ready replica=%s zone=%s", id.short, record.location)
-                    self.add(EventKind.READY, id)
-            elif record.first_ready_at and not record.unready_since and judged.answers:
-                log.warning("replica_unready replica=%s zone=%s", id.short, record.location)
-                self.add(EventKind.UNREADY, id)
-            if judged.verdict is Verdict.FAILED and not (record.failed or record.ending):
-                log.warning("replica_failed replica=%s reason=%r", id.short, words(judged.why))
-                self.add(EventKind.FAILED, id, reason=judged.why)
-
 
 log = logging.getLogger(__name__)
 
