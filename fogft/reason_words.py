@@ -129,7 +129,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.IGNORES: "it takes requests and never answers them",
     Cause.AT_RISK: "the cloud recommends moving it (rebalance)",
     Cause.SERVICE_AWAY: "its service has been unavailable for {r.seconds:.0f} s",
-    Cause.NOT_LISTED: "no longer listed by the cloud",
+    Cause.NOT_LISTED: "no longer listed by the cloud{after}",
     Cause.DRAINED: "drained by the user",
     Cause.EXCLUDED: lambda r: (
         f"excluded location {r.location}" if r.location else "excluded by `fogft exclude`"

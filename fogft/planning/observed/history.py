@@ -91,6 +91,7 @@ class Record:
     draining_since: float | None = None
     failed: bool = False
     ending: bool = False
+    ends_for: Reason | None = None
     closed: EventKind | None = None
     closed_at: float = 0.0
     on_demand: bool = False
@@ -238,7 +239,7 @@ class History:
         elif kind is EventKind.UNDRAINED:
             record.draining_since = None
         elif kind is EventKind.ENDING:
-            record.ending = True
+            record.ending, record.ends_for = True, event.reason
         elif kind is EventKind.FAILED:
             record.failed = True
             record.fault = event.reason or _NO_FAULT

@@ -26,7 +26,7 @@ class EventRecorder:
     def __init__(self, store: PoolStore, clock: Callable[[], float]) -> None:
         self._store = store
         self._clock = clock
-        self._leaving: dict[ReplicaId, Reason] = {}  # when they were judged last
+        self._lost_for: dict[ReplicaId, Reason] = {}  # if they went now
 
     def add(
         self,
@@ -54,13 +54,18 @@ class EventRecorder:
                 id = ReplicaId(uid, record.slot, record.generation)
                 kind = EventKind.ENDED if record.ending else EventKind.GONE
                 log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
-                why = None if record.ending else self._leaving.get(id, Reason(Cause.NOT_LISTED))
-                self.add(kind, id, reason=why)
+                gone = self._lost_for.get(id, Reason(Cause.NOT_LISTED))
+                self.add(kind, id, reason=record.ends_for if record.ending else gone)
 
     def health(self, health: Health, history: History) -> None:
         """Record replicas that became ready, became unready or failed."""
-        leaving = (judged for judged in health.replicas if judged.verdict is Verdict.LEAVING)
-        self._leaving = {judged.id: judged.fault for judged in leaving if judged.fault}
+        self._lost_for = {
+            judged.id: judged.fault
+            if judged.verdict is Verdict.LEAVING
+            else Reason(Cause.NOT_LISTED, because=(judged.fault,))
+            for judged in health.replicas
+            if judged.fault
+        }
         for judged in health.replicas:
             machine, record = judged.machine, judged.record
             id = machine.id

@@ -64,7 +64,7 @@ class Bench:
         self.cloud = MockCloud(lambda: self.now, zones("east/one/a", "west/one/a"))
         self.store = MemoryStore(Identity("pool", UID, "mock", "/p", NOW), spec(replicas))
         self.waiting: list = []
-        self.ready = True
+        self.ready, self.disagrees = True, False
         self.reconciler = Reconciler(
             self.cloud,
             self.store,
@@ -76,7 +76,9 @@ class Bench:
     def links(self, uid: str, now: float) -> tuple[LinkReport, ...]:
         members = self.store.published.members if self.store.published else ()
         ready = frozenset({SERVICE.name}) if self.ready else frozenset()
-        return tuple(LinkReport(m.id, LinkState.UP, ready) for m in members)
+        return tuple(
+            LinkReport(m.id, LinkState.UP, ready, disagrees=self.disagrees) for m in members
+        )
 
     def run(self) -> None:
         while self.waiting:
@@ -123,20 +125,48 @@ def test_launch_of_unknown_outcome_is_looked_up() -> None:
     assert bench.kinds() == [EventKind.LAUNCH, EventKind.GONE, EventKind.LAUNCH]
 
 
-@pytest.mark.parametrize(("notice_s", "cause"), [(1.5, Cause.NOTICE), (0.0, Cause.NOT_LISTED)])
-def test_why_a_machine_went_is_remembered(notice_s: float, cause: Cause) -> None:
-    """A preemption notice, if there was one; else that its cloud lists it no more."""
+@pytest.mark.parametrize(
+    ("notice_s", "fault", "reason"),
+    [
+        (1.5, None, Reason(Cause.NOTICE)),
+        (0.0, None, Reason(Cause.NOT_LISTED)),
+        (0.0, Cause.DISAGREES, Reason(Cause.NOT_LISTED, because=(Reason(Cause.DISAGREES),))),
+    ],
+)
+def test_why_a_machine_went_is_remembered(
+    notice_s: float, fault: Cause | None, reason: Reason
+) -> None:
+    """A preemption notice, if there was one; else that it is not listed, and its last fault."""
     bench = Bench()
     for _ in range(5):
         bench.reconciler.tick()
         bench.run()
         bench.now += 30.0
+    bench.disagrees = fault is not None
+    bench.reconciler.tick()
     bench.cloud.preempt(bench.cloud.machines(UID)[0].id, notice_s=notice_s)
     for _ in range(3):
         bench.reconciler.tick()
         bench.now += 1.0
     went = [event for event in bench.store.events if event.kind is EventKind.GONE]
-    assert [event.reason for event in went] == [Reason(cause)]
+    assert [event.reason for event in went] == [reason]
+
+
+@pytest.mark.parametrize("reason", [Reason(Cause.NOT_WANTED), None])
+def test_why_a_machine_was_ended_is_told_when_it_has_ended(reason: Reason | None) -> None:
+    """By a later manager, too; histories of earlier versions may have no reason."""
+    bench = Bench()
+    for _ in range(5):
+        bench.reconciler.tick()
+        bench.run()
+        bench.now += 30.0
+    (machine,) = bench.cloud.machines(UID)
+    bench.store.events.append(Event(bench.now, EventKind.ENDING, 0, 1, reason=reason))
+    bench.store.reopen()
+    bench.cloud.preempt(machine.id)
+    bench.reconciler.tick()
+    ended = [event for event in bench.store.events if event.kind is EventKind.ENDED]
+    assert [event.reason for event in ended] == [reason]
 
 
 def test_readiness_is_remembered_once_for_each_change() -> None:
