@@ -1,6 +1,6 @@
 """The client proxy: the robot's side of every proxied service.
 
-Owns: the services, and which links each of them uses now.
+Owns: the services, and telling each its links.
 Not here: which links there are (`links`), files and signals (`process`), requests (`dispatcher`).
 """
 

@@ -4,7 +4,7 @@ Seen through a gateway a replica is put as if it were linked directly, so that t
 as it judges all others; of several sights the best counts. A replica whose types differ from ours
 is not asked: its bytes would be read as another message.
 
-Under the client proxy's lock. Not here: which of them a service uses (`client`).
+Under the client proxy's lock. Not here: which of them a service may ask (`proxied_service`).
 """
 
 import logging

@@ -1,6 +1,7 @@
 """Offer one service's requests to links, and cancel requests at links.
 
-Owns: which links may be asked. This is the one place where a request leaves for a replica.
+This is the one place where a request leaves for a replica.
+Not here: which links may be asked (`proxied_service`), and whom of them (`requests.pending`).
 """
 
 import threading
