@@ -3,8 +3,10 @@
 A new kind of refusal is a row here, the code that raises it, and a test. The comment above a row
 is published: `scripts/docs` writes it into docs/reference/diagnostics.md. Requests are refused
 in `proxy/replica/responder` (services), `.goals_once`, `.topics`, `.ordered_responder` with
-`ordering/replica` (services with `state`), `proxy/gateway/gateway`, `link/zenoh/replica` (who may
-not ask), and on the robot in `link/zenoh/robot/attempts` and `link/uplinks` (what is lost).
+`ordering/replica` (services with `state`), `proxy/gateway/gateway`, `link/zenoh/replica/listener`
+(who may not ask) and `.reply_queue` (answers that are lost), and on the robot in
+`link/zenoh/robot/attempts` and `link/uplinks` (what is lost). A robot of an earlier version reads a
+new kind as UNKNOWN, without effect: it counts towards its three attempts (`requests/pending`).
 """
 
 from __future__ import annotations
@@ -37,11 +39,11 @@ class Refusal(str, Enum):
 
     # The service is not available
     NOT_READY = "not-ready", Effect.BLAMELESS | Effect.GOALS_LOST
-    # The replica's own window is full
+    # The replica has too many requests, or would miss the deadline
     OVERLOADED = "overloaded", Effect.BLAMELESS
     # The service died while it worked on this
     CRASHED = "crashed", Effect.FAULT | Effect.GOALS_LOST
-    # Its deadline had passed on arrival
+    # Its deadline passed before it was answered
     EXPIRED = "expired", Effect.FINAL
     # The request was run, but its answer is no longer stored
     FORGOTTEN = "forgotten", Effect.FINAL
@@ -53,7 +55,7 @@ class Refusal(str, Enum):
     REVOKED = "revoked", Effect.BLAMELESS
     # The sender's certificate has expired by the replica's clock
     EXPIRED_CERTIFICATE = "expired-certificate"
-    # Dropped because another replica answered first
+    # Dropped because another replica answered first, or the caller gave up
     CANCELLED = "cancelled"
     # It was run, but another replica answered first
     LATE = "late"
@@ -74,7 +76,7 @@ class Refusal(str, Enum):
     SUPERSEDED = "superseded", Effect.BLAMELESS
     # It would not arrive in time over this link
     TOO_SLOW = "too-slow", Effect.BLAMELESS | Effect.OTHER_UPLINK
-    # The link died before an answer came
+    # The link died, or the replica lost the answer
     LOST = "lost", Effect.BLAMELESS | Effect.OTHER_UPLINK | Effect.GOALS_LOST
     # Unknown to this version; the detail has the original text
     UNKNOWN = "unknown"

@@ -57,14 +57,14 @@ def choose_endings(
         dear_first: The pool is over its cap: of those that are too many the dearest go first.
     """
     wanted, machines, standing_in = part.wanted, part.others, part.standing_in
-    spare = fallback.spare(part, now)
+    extra = fallback.surplus(part, now)
     surplus = len(machines.good) + len(machines.replaced) - wanted
     unwanted = [s for s in standing_in if s.unwanted]
-    if surplus <= 0 and not machines.lost and first is None and not unwanted and spare <= 0:
+    if surplus <= 0 and not machines.lost and first is None and not unwanted and extra <= 0:
         return
     chooser = _Chooser(out, wanted, (*machines.good, *machines.replaced, *standing_in), now)
     if health.uplink_suspected or not health.links_known:
-        if surplus > 0 or machines.lost or unwanted or spare > 0:
+        if surplus > 0 or machines.lost or unwanted or extra > 0:
             out.notes.append(Reason(Cause.NOBODY_HEARD))
         return
     for replica in machines.lost:
@@ -86,11 +86,11 @@ def choose_endings(
     chooser.end_some(replaced, left, Cause.REPLACED, coming=coming)
     if unwanted:
         chooser.end_some(unwanted, len(unwanted), Cause.REPLACED)
-        spare -= len(unwanted)
-    if spare > 0:
+        extra -= len(unwanted)
+    if extra > 0:
         kept = [s for s in standing_in if not s.unwanted]
         kept.sort(key=lambda s: (s.ever_ready, s.marked_at, -s.machine.usd_per_hour, -s.slot))
-        chooser.end_some(kept, spare, Cause.ENOUGH_SPOT)
+        chooser.end_some(kept, extra, Cause.ENOUGH_SPOT)
 
 
 def _by_expendability(replicas: list[Assessment], *, dear_first: bool) -> list[Assessment]:

@@ -80,7 +80,7 @@ def missing(part: Part, begun: int, history: History, *, safe: bool) -> int:
     return wanted + racing - covered - len(standing_in)
 
 
-def spare(part: Part, now: float) -> int:
+def surplus(part: Part, now: float) -> int:
     """Return how many stand-ins are no longer needed, given enough others that have settled.
 
     Beside one that is held, and serves, a spot machine needs no time to settle.
