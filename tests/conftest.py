@@ -67,6 +67,34 @@ COMPUTING = {
     "topics",
 }
 
+# About how long one test takes, in files whose tests take long: see `dealing`.
+TAKES_S = {
+    "e2e/test_connectivity.py": 25,
+    "e2e/test_discovery.py": 20,
+    "e2e/test_inspection.py": 25,
+    "e2e/test_keys_and_moving.py": 50,
+    "e2e/test_monitoring.py": 15,
+    "e2e/test_own_types.py": 40,
+    "e2e/test_pool.py": 40,
+    "e2e/test_quickstart_page.py": 60,
+    "e2e/test_rolling_update.py": 50,
+    "hostile/test_flood.py": 5,
+    "hostile/test_greedy.py": 5,
+    "hostile/test_pool.py": 50,
+    "hostile/test_replica.py": 15,
+    "link/zenoh/robot/test_thin_downlink.py": 12,
+    "link/zenoh/robot/test_thin_links.py": 15,
+    "link/zenoh/test_hostile.py": 4,
+    "proxy/test_broken_machine.py": 12,
+    "proxy/test_connectivity.py": 10,
+    "proxy/test_processes.py": 30,
+    "proxy/test_sharing_processes.py": 10,
+    "proxy/test_stateful_processes.py": 30,
+    "proxy/test_topics_processes.py": 8,
+    "ros/test_discovery_settings.py": 4,
+    "ros/test_plain_clients.py": 5,
+}
+
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
@@ -86,12 +114,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         marker = item.get_closest_marker("timeout")
         return float(marker.args[0]) if marker and marker.args else 0.0
 
+    def takes_s(item: pytest.Item) -> float:
+        return TAKES_S.get(item.path.relative_to(TESTS).as_posix(), 0.0)
+
     def computes(item: pytest.Item) -> bool:
         return item.path.relative_to(TESTS).parts[0] in COMPUTING
 
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers > 1:
-        items[:] = dealt(items, limit_s, computes, workers)
+        items[:] = dealt(items, limit_s, takes_s, computes, workers)
 
 
 def pytest_configure() -> None:

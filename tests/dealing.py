@@ -4,9 +4,9 @@
 left at the end of theirs. A long test at the end would be waited for alone. Long is a test that
 sets a time limit of its own: it starts a whole pool.
 
-Three blocks have long tests, as two cores can bear three pools. The others wait beside them for
-what needs little of a processor, and then take what does nothing but compute, which fills the time
-in which all pools wait.
+Three blocks have long tests, as two cores can bear three pools, those first that take longest. The
+others wait beside them for what needs little of a processor, longest first too, and then take what
+does nothing but compute, which fills the time in which all pools wait.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ POOLS = 3  # at a time
 def dealt(
     tests: Sequence[T],
     limit_s: Callable[[T], float],
+    takes_s: Callable[[T], float],
     computes: Callable[[T], bool],
     workers: int,
 ) -> list[T]:
@@ -30,11 +31,16 @@ def dealt(
         tests: All of them. Others than the long ones stay beside their neighbours, with whom
             they share fixtures.
         limit_s: A test's own time limit; 0 if it sets none.
+        takes_s: About how long a test takes; 0 if not long.
         computes: Whether a test waits for nothing.
         workers: How many blocks.
     """
-    long = sorted(filter(limit_s, tests), key=limit_s, reverse=True)
-    others = sorted((test for test in tests if not limit_s(test)), key=computes, reverse=True)
+    long = sorted(filter(limit_s, tests), key=lambda t: (takes_s(t), limit_s(t)), reverse=True)
+    others = sorted(
+        (test for test in tests if not limit_s(test)),
+        key=lambda t: (computes(t), takes_s(t)),
+        reverse=True,
+    )
     for_long = max(1, min(POOLS, workers - 1))
     out: list[T] = []
     for worker in range(workers):
