@@ -3,7 +3,7 @@
 Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage; 130 interrupted;
 141 nobody reads stdout any more. Anything else is a defect of ours and keeps its trace.
 
-Imports that take long are made inside the command that needs them (tests/cli/test_laziness).
+Imports that take long are made inside the command that needs them (tests/cli/test_elsewhere).
 """
 
 import os

@@ -32,7 +32,7 @@ from fogft.model.choices import Speaks
 from fogft.proxy import middleware
 from fogft.ros import memory_tuning
 from tests.bench.floor import configuration
-from tests.bench.service import FLAG, MAP
+from tests.bench.nodes.service import FLAG, MAP
 
 KEYS = {FLAG: "bare/flag", MAP: "bare/map"}
 _ANSWERS = "bare/answers"

@@ -13,7 +13,7 @@ from typing import Any
 
 from fogft.model.choices import Speaks
 from fogft.proxy import middleware
-from tests.bench.service import FLAG, MAP
+from tests.bench.nodes.service import FLAG, MAP
 
 LARGE_BYTES = 640 * 480 * 3
 CALL_LIMIT_S = 10.0

@@ -39,8 +39,8 @@ from tests.bench.load import (
     ray_serve,
 )
 from tests.bench.machine import cpu_s
+from tests.bench.nodes.service import FLAG
 from tests.bench.rig import ROOT, Replica, Rig
-from tests.bench.service import FLAG
 from tests.estimates import percentile
 
 PAGE = ROOT / "docs" / "measurements.md"

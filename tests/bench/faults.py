@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.nodes.service import FLAG, MAP
 from tests.bench.rig import Replica, Rig
-from tests.bench.service import FLAG, MAP
 from tests.estimates import estimate, estimate_of_rounds, longest_gap, median, percentile
 
 SLEEP_S = 0.02

@@ -21,8 +21,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.nodes.service import FLAG
 from tests.bench.rig import Rig, free_domains
-from tests.bench.service import FLAG
 from tests.estimates import estimate_of_rounds, median
 
 SERVICES, TYPE = ("/bench_one", "/bench_two"), "std_srvs/srv/SetBool"

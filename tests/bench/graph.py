@@ -17,8 +17,8 @@ from typing import Any
 from fogft.ros.environment import child_environment
 from tests.bench.caller import CALL_LIMIT_S, Caller, milliseconds, payloads
 from tests.bench.floor import Floor
+from tests.bench.nodes.service import ACTION_SERVICES, FLAG, TOPICS
 from tests.bench.rig import ROOT, Rig
-from tests.bench.service import ACTION_SERVICES, FLAG, TOPICS
 from tests.estimates import estimate_of_rounds, median, overhead_ratio, percentile
 
 _WARM_UP = 30
@@ -191,7 +191,7 @@ def _burst(
 
 def _plain_client(domain: int, words: Sequence[str]) -> int:
     """Run a plain client; return how many answers it got."""
-    command = [sys.executable, str(ROOT / "tests" / "ros" / "plain_client.py"), *words]
+    command = [sys.executable, str(ROOT / "tests" / "ros" / "nodes" / "plain_client.py"), *words]
     environ = {**child_environment(), "ROS_DOMAIN_ID": str(domain)}
     done = subprocess.run(command, env=environ, input=b"\n", capture_output=True, check=True)
     return int(done.stdout.split()[-1])

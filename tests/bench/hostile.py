@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.nodes.service import FLAG
 from tests.bench.rig import Rig
-from tests.bench.service import FLAG
 from tests.estimates import percentile
 
 SLEEP_S = 0.02

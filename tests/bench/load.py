@@ -24,8 +24,8 @@ from typing import Any
 
 from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.machine import cpu_s, family
+from tests.bench.nodes.service import FLAG
 from tests.bench.rig import Rig, free_ports
-from tests.bench.service import FLAG
 from tests.estimates import percentile
 
 REPLICAS = 3
@@ -225,7 +225,7 @@ def haproxy(folder: Path, words: str, balance: str = "leastconn") -> Iterator[Ba
 def ray_serve(folder: Path, words: str, python: str) -> Iterator[Balanced]:
     """Start Ray Serve with three replicas, by a Python that has it."""
     [port] = free_ports(1)
-    script = str(Path(__file__).with_name("ray_serve.py"))
+    script = str(Path(__file__).parent / "nodes" / "ray_serve.py")
     environ = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     process = subprocess.Popen(
         [python, script, str(port), str(folder), *words.split()],

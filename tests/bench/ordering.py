@@ -10,8 +10,8 @@ from typing import Any
 
 from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.floor import Floor
+from tests.bench.nodes.service import FLAG, MAP
 from tests.bench.rig import Rig
-from tests.bench.service import FLAG, MAP
 from tests.estimates import estimate_of_rounds, median, overhead_ratio, percentile
 
 _WARM_UP = 30

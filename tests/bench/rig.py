@@ -31,9 +31,9 @@ from fogft.model.topic import TopicSpec
 from fogft.pool.credentials import authority
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
-from tests import certificate_names
-from tests.bench.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
+from tests.bench.nodes.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
 from tests.hostile.orders import HOSTILE
+from tests.records import certificate_names
 
 ROOT = Path(__file__).resolve().parents[2]
 _READY_LIMIT_S = 60.0
@@ -230,7 +230,7 @@ class Rig:
             "generation": 1,
             "listen": f"127.0.0.1:{port}",
             "services": self._services(self._of_replica),
-            "run": f"exec {sys.executable} -m tests.bench.service {self._arguments[slot]}",
+            "run": f"exec {sys.executable} -m tests.bench.nodes.service {self._arguments[slot]}",
             "envs": {
                 SPEAKS: self._rmw,
                 **({STATEFUL: "1"} if self._stateful else {}),
@@ -329,7 +329,7 @@ class Rig:
             name = f"bare-service-{number}"
             environ = {"ROS_DOMAIN_ID": str(domain), SPEAKS: self._rmw}
             words = self._arguments[number].split()
-            started.append(self._start(name, "tests.bench.service", *words, environ=environ))
+            started.append(self._start(name, "tests.bench.nodes.service", *words, environ=environ))
             started.append(self._bare_end(f"bare-{number}", "replica", domain, [port]))
         return [self._bare_end("bare-robot", "robot", self.bare_domain, ports), *started]
 

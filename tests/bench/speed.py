@@ -16,8 +16,8 @@ from fogft.model.choices import Speaks
 from tests.bench import machine
 from tests.bench.caller import Caller, Flood, map_request, milliseconds, payloads
 from tests.bench.floor import Floor
+from tests.bench.nodes.service import FLAG, MAP
 from tests.bench.rig import Rig
-from tests.bench.service import FLAG, MAP
 from tests.estimates import Estimate, estimate_of_rounds, median, overhead_ratio, percentile
 from tests.rmw_zenoh import rmw_router
 

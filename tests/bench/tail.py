@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.bench.caller import Caller, milliseconds, payloads
+from tests.bench.nodes.service import CANCEL, FLAG
 from tests.bench.rig import Rig
-from tests.bench.service import CANCEL, FLAG
 from tests.estimates import percentile
 
 # Service times of facts that robots meet: lognormal, and one request in a hundred stalls.

@@ -11,7 +11,7 @@ import pytest
 from fogft import disk
 from fogft.cli import main, progress
 from fogft.pool.commands.status import Seen
-from tests.cli.pools import FILE, REPLICA, STATUS, alive, lay_down
+from tests.fakes.pools import FILE, REPLICA, STATUS, alive, lay_down
 
 
 def wish(paths):

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from fogft.cli import options
-from tests.cli.pools import STATUS, lay_down
+from tests.fakes.pools import STATUS, lay_down
 
 
 def offered(*words: str) -> list[str]:

@@ -20,7 +20,7 @@ from fogft.pool.credentials import authority, bundle
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, write_identity
-from tests import certificate_names
+from tests.records import certificate_names
 
 UID = "0123456789abcdef"
 POOL_FILE = """

@@ -1,4 +1,7 @@
-"""On macOS and Windows files can be written, checked, planned, simulated; the rest says Linux."""
+"""On macOS and Windows files can be written, checked, planned, simulated; the rest says Linux.
+
+And what is loaded anywhere, and when: a command line starts at once.
+"""
 
 from __future__ import annotations
 
@@ -61,3 +64,30 @@ def test_files_can_be_judged_and_the_rest_is_one_error_that_says_linux(platform,
     for (status, _, told), words in zip(rest, NEEDS_LINUX, strict=True):
         error = f"error: `fogft {words[0]}` needs Linux; this is {platform}\n\nhint: "
         assert (status, told[: len(error)]) == (1, error)
+
+
+HEAVY = {"zenoh", "sky", "rclpy", "cryptography", "boto3", "numpy", "rich", "yaml"}
+
+
+def loaded(code: str) -> set[str]:
+    """Run code in a fresh Python; return the top-level modules that it loaded."""
+    report = "import sys, json; print(); print(json.dumps([m.split('.')[0] for m in sys.modules]))"
+    ended = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], capture_output=True, text=True, check=True
+    )
+    return set(json.loads(ended.stdout.splitlines()[-1]))
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "import fogft",
+        "import fogft.pool.commands.composition",
+        "import fogft.cli.main",
+        "from fogft.cli import main; assert main.run(['--help']) == 0",
+        "from fogft.cli import main; assert main.run(['up', '--help']) == 0",
+        "from fogft.cli import main; assert main.run(['--version']) == 0",
+    ],
+)
+def test_nothing_heavy_is_loaded(code):
+    assert loaded(code) & HEAVY == set()

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +14,7 @@ import fogft
 from fogft.cli import main
 from fogft.errors import PoolNotFound
 from fogft.pool.commands import composition
+from tests.fakes.pools import lay_down
 
 
 def run_failing(monkeypatch: pytest.MonkeyPatch, problem: BaseException) -> int:
@@ -137,3 +139,21 @@ def test_control_c_while_it_waits_is_one_line(tmp_path):
         _, stderr = process.communicate(timeout=100)
     assert stderr == "interrupted\n"
     assert process.returncode == 130
+
+
+def test_a_manager_run_by_hand_tells_why_it_cannot(home: Path) -> None:
+    """It ends as every command does: an error and a hint, no trace."""
+    identity = lay_down(home, None).identity
+    identity.write_text(identity.read_text().replace('"local"', '"mars"'))
+    said = run_by_hand()
+    assert said.startswith("error: there is no cloud `mars`\n\nhint: clouds: `local`, `sky`")
+    identity.unlink()
+    assert "error: there is no pool `planner`" in run_by_hand()
+
+
+def run_by_hand() -> str:
+    """Run it, which fails; return what it says."""
+    words = [sys.executable, "-m", "fogft", "manager", "planner"]
+    ended = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1, ended.stderr
+    return ended.stderr

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 from fogft import disk
-from tests.cli.pools import STATUS, alive, lay_down
+from tests.fakes.pools import STATUS, alive, lay_down
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +12,8 @@ from fogft.cli import main
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
-from tests.cli.pools import FILE, STATUS, alive, lay_down
+from tests.fakes.pools import FILE, STATUS, alive, lay_down
+from tests.pool.folder.test_costs import NOON, STEADY, UID, CostBook, machine
 
 LAUNCH = Event(1_000_000.0, EventKind.LAUNCH, 0, 1, "local/us-west-2/a", Reason(Cause.NEW_SLOT))
 GONE = Event(1_000_060.0, EventKind.GONE, 0, 1, reason=Reason(Cause.NOTICE))
@@ -70,3 +72,28 @@ def test_a_pool_is_named_in_the_same_ways_everywhere(home, capsys, words):
     assert main.run([*words, "--pool", "planner"]) == 0
     assert main.run([*words, "no-such"]) == 1
     assert "error: there is no pool `no-such`" in capsys.readouterr().err
+
+
+def test_what_was_spent_is_shown_by_day_and_replica(home: Path, capsys):
+    for name, price in (("perception", 0.5), ("planner", 0.25)):
+        kept = CostBook(home / "costs", name, UID)
+        kept.look(NOON + 18 * 3600, [machine(0, STEADY, usd_per_hour=price)], [], 600.0)
+    assert main.run(["cost", "perception"]) == 0
+    shown = capsys.readouterr().out
+    assert "perception: $9.000" in shown
+    assert "planner" not in shown
+    assert [line.split()[-2:] for line in shown.splitlines()[1:3]] == [
+        ["12.00", "6.000"],
+        ["6.00", "3.000"],
+    ]
+    assert main.run(["cost", "--json"]) == 0
+    first, second = json.loads(capsys.readouterr().out)
+    assert (first["usd"], second["usd"]) == (9.0, 4.5)
+    assert [day["usd"] for day in first["days"]] == [6.0, 3.0]
+    assert first["days"][0]["replicas"][0]["instance"] == "m6i.large"
+
+
+def test_a_pool_of_which_nothing_is_known_is_an_error(home: Path, capsys):
+    assert main.run(["cost"]) == 0
+    assert main.run(["cost", "nobody"]) == 1
+    assert "no costs are recorded" in capsys.readouterr().err

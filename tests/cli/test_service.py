@@ -15,7 +15,7 @@ from fogft.cli import main
 from fogft.pool.commands import service
 from fogft.pool.folder.paths import PoolPaths
 from fogft.process import Watchdog, notify
-from tests.cli.pools import lay_down
+from tests.fakes.pools import lay_down
 from tests.needs import needs
 
 

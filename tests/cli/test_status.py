@@ -23,7 +23,7 @@ from fogft.cli import main, status
 from fogft.cli.status_text import age, milliseconds, number
 from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus
-from tests.cli.pools import FILE, STATUS, alive, lay_down, report
+from tests.fakes.pools import FILE, STATUS, alive, lay_down, report
 
 SCREEN = """\
 planner  answering  1 of 3 ready  $0.063/h on local  seen 0.4 s ago

@@ -18,7 +18,7 @@ from fogft.pool.commands.status import Seen, status_schema
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager import status
 from fogft.pool.manager.reconciler import Tick
-from tests.cli.pools import STATUS, lay_down
+from tests.fakes.pools import STATUS, lay_down
 from tests.planning.pool_worlds import NOW, UID, World, worlds
 
 SCHEMA = status_schema()

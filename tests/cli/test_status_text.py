@@ -1,4 +1,4 @@
-"""What stands below the tables of `fogft status`."""
+"""What stands below the tables of `fogft status`, and who talks through whom, drawn."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import pytest
 
+from fogft.cli import output
 from fogft.cli.lifecycle import services_at_fault
-from fogft.cli.status_text import notes, rendered, troubles
+from fogft.cli.status_text import notes, rendered, topology, troubles
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
 from fogft.pool.commands.status import Seen, current
 from fogft.pool.manager.proxy_report import ProxyReport, TopicCounted
 from fogft.pool.manager.status import ServiceStatus, TopicStatus
-from tests.cli.pools import REPLICA, STATUS, UID
+from tests.fakes.pools import REPLICA, STATUS, UID
 
 SCAN = TopicStatus("/scan", "sensor_msgs/msg/LaserScan", "robot")
 SETBOOL = "std_srvs/srv/SetBool"
@@ -94,4 +95,45 @@ def test_a_pool_that_is_too_small_says_how_many_replicas_would_do():
     status = replace(STATUS, notes=(), excluded=(), services=(service,))
     assert [line.plain for line in notes(status)] == [
         f"note: `{service.name}`: load exceeds the capacity of its replicas; 6 would suffice"
+    ]
+
+
+def gateway(name, through=(), generations=(1,)):
+    return {"name": name, "endpoint": f"{name}:7470", "through": list(through),
+            "generations": list(generations)}  # fmt: skip
+
+
+def test_a_pool_without_gateways_draws_nothing():
+    assert topology({}) == []
+
+
+def test_robots_gateways_and_what_lies_behind(capsys):
+    """This robot's links with their state; others' and deeper ones without: nobody here knows."""
+    seen = {
+        "robot": "ada",
+        "gateways": [gateway("edge"), gateway("lab", ["edge"], [])],
+        "robots": {"bob": []},
+        "through": ["edge", "lab"],
+        "links": [
+            {"name": "edge", "generation": 1, "state": "suspect", "rtt_s": None, "detail": "x"},
+            {"name": "edge", "generation": 2, "state": "up", "rtt_s": 0.0012, "detail": ""},
+        ],
+    }
+    output.show(*topology(seen))
+    assert capsys.readouterr().out.splitlines() == [
+        "TOPOLOGY",
+        "robot ada",
+        "├── gateway edge  edge:7470  up  1.20 ms",
+        "│   └── replicas",
+        "└── gateway lab  lab:7470  no certificate",
+        "    └── gateway edge  edge:7470",
+        "        └── replicas",
+        "robot bob",
+        "└── replicas",
+        "all other robots",
+        "├── gateway edge  edge:7470",
+        "│   └── replicas",
+        "└── gateway lab  lab:7470  no certificate",
+        "    └── gateway edge  edge:7470",
+        "        └── replicas",
     ]

@@ -17,10 +17,10 @@ from fogft.errors import CloudUnreachable
 from fogft.pool.commands import preview
 from fogft.pool.commands.sweep import left_of
 from fogft.pool.folder.paths import PoolPaths
-from tests.cli.pools import SPEC, STATUS, lay_down
 from tests.cloud.conftest import Local
+from tests.fakes.pools import SPEC, STATUS, lay_down
+from tests.fakes.sky import replica
 from tests.sky.scene import Scene
-from tests.sky.scripted_sky import replica
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from fogft.pool.commands.status import Seen, renewed
 from fogft.pool.folder.store import digest
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from fogft.reason_words import words
-from tests.cli.pools import REPLICA, SPEC, STATUS, lay_down
+from tests.fakes.pools import REPLICA, SPEC, STATUS, lay_down
 
 POOL = SPEC + "resources: {infra: local/us-west-2, use_spot: true}\n"
 STARTING = replace(REPLICA, phase="starting", link="connecting", detail="`/plan` is not up yet")

@@ -15,8 +15,8 @@ from fogft.cloud.sky import adapter as sky
 from fogft.errors import CloudUnreachable
 from fogft.pool.commands import startup
 from fogft.pool.commands.status import Seen
-from tests.cli.pools import SPEC, lay_down
 from tests.cli.test_up import UP
+from tests.fakes.pools import SPEC, lay_down
 from tests.sky.scene import Scene
 
 POOL = SPEC + "resources: {infra: aws, use_spot: true}\n"

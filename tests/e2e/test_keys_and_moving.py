@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.pool import Client, Machine, Pool
-from tests.freezing import freeze
+from tests.link.freezing import freeze
 
 pytestmark = [pytest.mark.e2e, pytest.mark.ros, pytest.mark.timeout(400)]
 SECRET = "a passphrase that unknown"

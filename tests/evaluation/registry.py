@@ -8,16 +8,16 @@ from tests.evaluation.experiment import Experiment
 
 # Name -> module with an object `EXPERIMENT`.
 MODULES = {
-    "planning": "tests.evaluation.planning",
-    "detection": "tests.evaluation.detection",
-    "segmentation": "tests.evaluation.segmentation",
-    "picking": "tests.evaluation.picking",
-    "costs": "tests.evaluation.costs",
-    "failures": "tests.evaluation.failures",
-    "overhead": "tests.evaluation.overhead",
-    "uplink": "tests.evaluation.uplink",
-    "recovery": "tests.evaluation.recovery",
-    "markets": "tests.evaluation.markets",
+    "planning": "tests.evaluation.experiments.planning",
+    "detection": "tests.evaluation.experiments.detection",
+    "segmentation": "tests.evaluation.experiments.segmentation",
+    "picking": "tests.evaluation.experiments.picking",
+    "costs": "tests.evaluation.experiments.costs",
+    "failures": "tests.evaluation.experiments.failures",
+    "overhead": "tests.evaluation.experiments.overhead",
+    "uplink": "tests.evaluation.experiments.uplink",
+    "recovery": "tests.evaluation.experiments.recovery",
+    "markets": "tests.evaluation.experiments.markets",
 }
 
 

@@ -8,9 +8,10 @@ import re
 import pytest
 
 from fogft.planning.availability import replicas_needed, unavailability
-from tests.evaluation import costs, failures, planning, registry, report
+from tests.evaluation import registry, report
 from tests.evaluation.experiment import Scale
-from tests.evaluation.planning import Condition, contended_trials
+from tests.evaluation.experiments import costs, failures, planning
+from tests.evaluation.experiments.planning import Condition, contended_trials
 from tests.evaluation.samples import COMMON, Samples
 
 EXPERIMENTS = {name: registry.load(name) for name in registry.MODULES}

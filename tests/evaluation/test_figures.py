@@ -8,17 +8,14 @@ import random
 import pytest
 
 from tests.bench.rig import ROOT
-from tests.evaluation import (
+from tests.evaluation import plotting, registry, report, running
+from tests.evaluation.experiments import (
     costs,
     failures,
     markets,
     overhead,
     planning,
-    plotting,
     recovery,
-    registry,
-    report,
-    running,
     uplink,
 )
 from tests.evaluation.samples import Store

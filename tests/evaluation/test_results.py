@@ -10,7 +10,7 @@ import pytest
 
 from tests.estimates import median
 from tests.evaluation import registry, report, running
-from tests.evaluation.planning import REPLICAS, SCENES, Condition
+from tests.evaluation.experiments.planning import REPLICAS, SCENES, Condition
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 PAGE = (RESULTS / "report.html").read_text()

@@ -13,15 +13,9 @@ import pytest
 
 from tests.bench.rig import ROOT
 from tests.estimates import mean, median
-from tests.evaluation import (
-    comparing,
-    contending,
-    detection,
-    picking,
-    picking_figures,
-    segmentation,
-)
+from tests.evaluation import comparing, contending
 from tests.evaluation.comparing import CONDITIONS
+from tests.evaluation.experiments import detection, picking, picking_figures, segmentation
 from tests.evaluation.samples import Samples, Store
 from tests.needs import needs
 

@@ -43,7 +43,7 @@ from fogft.pool.manager.distances import Latencies
 from fogft.pool.manager.status import EventStatus
 from fogft.records import cache as records_cache
 from fogft.simulation import traces
-from tests.cli.pools import STATUS, UID, lay_down
+from tests.fakes.pools import STATUS, UID, lay_down
 from tests.fuzz.targets import Target, signed_records
 
 NAME = STATUS.pool

@@ -15,8 +15,8 @@ import pytest
 
 from fogft.model.choices import Speaks
 from tests.bench.caller import Caller, payloads
+from tests.bench.nodes.service import FLAG
 from tests.bench.rig import Rig
-from tests.bench.service import FLAG
 from tests.estimates import percentile
 from tests.nightly import NIGHTLY, by_day
 from tests.rmw_zenoh import rmw_router

@@ -15,7 +15,7 @@ from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState
-from tests.freezing import freeze
+from tests.link.freezing import freeze
 from tests.link.wire_pool import (
     LIMIT_S,
     SERVICE,

@@ -14,7 +14,7 @@ from fogft.model.choices import Freshness, UplinkPolicy, is_interface
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
-from tests.proxy.fakes import UID, FakeDialer
+from tests.fakes.proxy import UID, FakeDialer
 
 READY = frozenset({"/s"})
 ID = b"i" * 16

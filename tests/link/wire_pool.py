@@ -21,9 +21,9 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Role
-from tests import certificate_names
-from tests.freezing import freeze
 from tests.link import forked
+from tests.link.freezing import freeze
+from tests.records import certificate_names
 
 POOL_UID = "0123456789abcdef"
 SERVICE, TYPE = "/echo", "plain_msgs/srv/Echo"  # not installed: its bytes are anything

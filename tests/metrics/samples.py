@@ -12,7 +12,7 @@ from fogft.metrics.scrape import Labels, Scrape
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.manager.tally import Tally, of_pool, of_rendezvous
-from tests.cli.pools import STATUS
+from tests.fakes.pools import STATUS
 
 SERVICE = {
     **dict.fromkeys(OUTCOMES_COUNTED, 3),

@@ -16,7 +16,7 @@ import fogft
 from fogft.metrics import proxies
 from fogft.metrics.scrape import counter, gauge, histogram
 from fogft.pool.manager.tally import of_pool
-from tests.cli.pools import STATUS
+from tests.fakes.pools import STATUS
 from tests.metrics.samples import CLIENT, LINK, POOL, PROCESSES, tally, text
 from tests.needs import needs
 

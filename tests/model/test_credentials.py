@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.model.credentials import NAME_PATTERN, Holder, Role, holder_of
 from fogft.model.replica import ReplicaId
-from tests import certificate_names
+from tests.records import certificate_names
 
 UID, OTHER = "0123456789abcdef", "f" * 16
 uids = st.sampled_from([UID, OTHER])

@@ -14,7 +14,7 @@ from fogft.ordering.orders import START
 from fogft.ordering.peer import Order
 from fogft.ordering.replica import OrderedReplica, Refuse
 from fogft.ordering.sequencer import Sequencer
-from tests.linearizability import Call
+from tests.ordering.linearizability import Call
 from tests.ordering.service_world import Asked, Letter, ServiceWorld, lost
 
 

@@ -13,7 +13,7 @@ from typing import Any, Generic, Protocol, TypeVar
 from fogft.model.refusal import Refusal
 from fogft.ordering.orders import Op
 from fogft.ordering.replica import Begin, Refuse, Reply
-from tests.linearizability import Call, Step, linearizable
+from tests.ordering.linearizability import Call, Step, linearizable
 
 S = TypeVar("S")
 

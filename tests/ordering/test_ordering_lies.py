@@ -11,7 +11,7 @@ from fogft.ordering import orders
 from fogft.ordering.orders import INDEX_LIMIT, START, Op, OrderError, Position, Promise
 from fogft.ordering.replica import Refuse, Reply
 from fogft.ordering.sequencer import Sequencer
-from tests.linearizability import counter
+from tests.ordering.linearizability import counter
 from tests.ordering.ordering_world import Letter, Sent, World
 
 LIAR = 0

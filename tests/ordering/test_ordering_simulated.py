@@ -8,8 +8,8 @@ import pytest
 
 from fogft.ordering import peer
 from fogft.ordering.catching_up import WINDOW
-from tests.linearizability import Call, counter, key_value, linearizable
 from tests.nightly import by_day
+from tests.ordering.linearizability import Call, counter, key_value, linearizable
 from tests.ordering.ordering_world import World
 from tests.ordering.service_world import ask_counter, ask_key_value, lost
 

@@ -12,8 +12,8 @@ import pytest
 
 from fogft.ordering.active_version import VACANCY_S, ActiveVersion
 from fogft.ordering.sequencer import Sequencer
-from tests.linearizability import counter
 from tests.nightly import by_day
+from tests.ordering.linearizability import counter
 from tests.ordering.ordering_world import World
 from tests.ordering.service_world import ask_counter
 from tests.ordering.test_ordering_simulated import drive

@@ -15,9 +15,9 @@ from fogft.model import membership
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Topology
 from fogft.pool.credentials import authority
-from tests import certificate_names
 from tests.link import forked
 from tests.ports import free_port
+from tests.records import certificate_names
 
 UID = "0123456789abcdef"
 LIMIT_S = 60.0

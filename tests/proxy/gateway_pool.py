@@ -19,11 +19,11 @@ from fogft.model import membership
 from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Gateway, RobotRoute, Topology
-from tests import certificate_names
 from tests.link import forked
 from tests.link.namespaces import inside
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, ReplicaProcess, wait_for
 from tests.ports import free_port
+from tests.records import certificate_names
 
 ROOT = Path(__file__).parents[2]
 

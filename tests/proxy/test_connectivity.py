@@ -19,9 +19,9 @@ from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
 from fogft.ros import environment
-from tests import certificate_names
 from tests.needs import needs
 from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
+from tests.records import certificate_names
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 environment.prepare(os.environ)

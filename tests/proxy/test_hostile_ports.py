@@ -28,11 +28,10 @@ from fogft.records import frames
 from fogft.records.record import VERSION, Record, RecordKind
 from fogft.records.roster import admission_content
 from fogft.records.signing import Signer
-from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, SERVICE, TYPE, Authority, hears, knows, wait_for
 from tests.ports import free_port
 from tests.proxy.gateway_pool import GatewayPool
-from tests.records import hostile
+from tests.records import certificate_names, hostile
 from tests.records.rendezvous_pool import manager_files
 
 pytestmark = pytest.mark.timeout(120)

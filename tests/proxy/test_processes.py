@@ -15,7 +15,7 @@ import pytest
 from fogft import disk
 from fogft.ros import environment
 from tests.cloud.fake_metadata import serving
-from tests.freezing import freeze
+from tests.link.freezing import freeze
 from tests.needs import BEFORE, needs
 from tests.proxy.by_hand import LIMIT_S, ROOT, Caller, Parts, Replica, Robot, wait_for
 

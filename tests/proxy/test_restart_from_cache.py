@@ -17,10 +17,10 @@ from fogft.model.topology import Gateway, RobotRoute, Topology
 from fogft.records import cache
 from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
-from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, wait_for
 from tests.ports import free_port
 from tests.proxy.gateway_pool import GatewayPool, Process, ServerProxy
+from tests.records import certificate_names
 from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
 
 pytestmark = pytest.mark.timeout(480)

@@ -13,12 +13,12 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.proto.trace.v1.trace_pb2 import Span
 
 from tests.bench.caller import Caller, payloads
-from tests.bench.service import FLAG, MAP
+from tests.bench.nodes.service import FLAG, MAP
 from tests.proxy.by_hand import ROOT, Parts, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 
-NODE = ROOT / "tests/bench/service.py"
+NODE = ROOT / "tests/bench/nodes/service.py"
 REQUESTS = 3
 
 

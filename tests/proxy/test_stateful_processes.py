@@ -14,8 +14,8 @@ from typing import Any
 import pytest
 
 from fogft.ros import environment
-from tests.linearizability import Call, counter, key_value, linearizable
 from tests.nightly import by_day
+from tests.ordering.linearizability import Call, counter, key_value, linearizable
 from tests.proxy.by_hand import LIMIT_S, ROOT, Parts, Replica, Robot, wait_for
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240)]

@@ -17,8 +17,8 @@ from fogft.proxy.replica.topics import HOLD_S, TopicsOnReplica
 from fogft.proxy.robot.topics import TopicsOnRobot
 from fogft.requests.load import Handling
 from fogft.topics.frames import encode_batch
+from tests.fakes.proxy import Clock, FakeLink
 from tests.nightly import by_day
-from tests.proxy.fakes import Clock, FakeLink
 
 JUNK = b"junk"
 

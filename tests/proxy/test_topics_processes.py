@@ -16,7 +16,7 @@ from fogft.poolfile.pool import action_services, action_topics
 from fogft.ros import environment
 from tests.needs import needs
 from tests.proxy.by_hand import Parts, Replica, Robot
-from tests.ros.person import Person
+from tests.ros.nodes.person import Person
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(240), needs("test_msgs")]
 environment.prepare(os.environ)

@@ -23,8 +23,8 @@ from fogft.records import frames
 from fogft.records.record import Record as Statement
 from fogft.records.record import SignedRecord, sign_record
 from fogft.records.signing import Signer
-from tests import certificate_names
 from tests.link.wire_pool import LIMIT_S, POOL_UID, Authority, request_id
+from tests.records import certificate_names
 
 HELLO = b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"  # how a TLS handshake begins
 JUNK: dict[str, Callable[[random.Random], bytes]] = {

@@ -17,10 +17,10 @@ from fogft.pool.credentials.authority import Role
 from fogft.records.client import RendezvousClient
 from fogft.records.record import RecordKind
 from fogft.records.roster import SlotState, admission, admission_content, located
-from tests import certificate_names
 from tests.link import forked
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.ports import free_port
+from tests.records import certificate_names
 
 ROOT = Path(__file__).parents[2]
 

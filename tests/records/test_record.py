@@ -25,7 +25,7 @@ from fogft.records.record import (
 )
 from fogft.records.record_set import RecordSet, Verdict
 from fogft.records.roster import SlotState, admission, located, slot_state
-from tests import certificate_names
+from tests.records import certificate_names
 from tests.records import record_worlds as world
 from tests.records.record_worlds import UID, records, verify
 

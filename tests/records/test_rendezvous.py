@@ -20,10 +20,10 @@ from fogft.records import cache as record_cache
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
 from fogft.records.roster import admission_content
 from fogft.records.signing import Signer
-from tests import certificate_names
+from tests.fakes.proxy import Clock
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
 from tests.ports import free_port
-from tests.proxy.fakes import Clock
+from tests.records import certificate_names
 from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
 
 

@@ -34,9 +34,8 @@ from fogft.records.record import (
 from fogft.records.roster import SlotState, admission_content
 from fogft.records.server import PURPOSE, binding_of
 from fogft.records.signing import Signer
-from tests import certificate_names
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
-from tests.records import fuzz_records
+from tests.records import certificate_names, fuzz_records
 from tests.records.rendezvous_pool import Party, Rendezvous, manager_files
 
 

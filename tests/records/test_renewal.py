@@ -17,7 +17,6 @@ from fogft.pool.credentials.authority import Role
 from fogft.proxy.robot.following import Following
 from fogft.records.record import Record, RecordKind, SignedRecord, sign_record
 from fogft.records.signing import Signer
-from tests import certificate_names
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -29,6 +28,7 @@ from tests.link.wire_pool import (
     request_id,
     wait_for,
 )
+from tests.records import certificate_names
 
 
 @pytest.fixture

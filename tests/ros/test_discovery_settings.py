@@ -14,7 +14,7 @@ from fogft.ros import environment
 from tests.link.namespaces import Namespaces
 
 pytestmark = pytest.mark.ros
-SCRIPT = Path(__file__).with_name("ours.py")
+SCRIPT = Path(__file__).parent / "nodes" / "ours.py"
 SETTINGS = ("ROS_LOCALHOST_ONLY", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_STATIC_PEERS")
 IN_FLIGHT = 100  # a service's default history would lose most of them
 

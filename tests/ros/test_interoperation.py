@@ -19,7 +19,7 @@ pytestmark = pytest.mark.ros
 
 SET_MAP = "nav_msgs/srv/SetMap"
 CELLS = 900_000  # one byte each: larger than Fast DDS's default shared-memory segment
-SCRIPT = Path(__file__).with_name("ordinary.py")
+SCRIPT = Path(__file__).parent / "nodes" / "ordinary.py"
 
 
 @pytest.fixture

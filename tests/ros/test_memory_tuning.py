@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from fogft.ros import memory_tuning
-from tests.proxy.fakes import Clock
+from tests.fakes.proxy import Clock
 
 
 @pytest.mark.parametrize(("own", "times"), [(200, 3), (100, 0)])

@@ -27,7 +27,7 @@ from .conftest import expect_line, wait_for
 pytestmark = pytest.mark.ros
 
 TYPE = "std_srvs/srv/SetBool"
-PROGRAM = str(Path(__file__).with_name("plain_client.py"))
+PROGRAM = str(Path(__file__).parent / "nodes" / "plain_client.py")
 
 
 @pytest.fixture

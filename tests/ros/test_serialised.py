@@ -143,7 +143,7 @@ def test_both_ways_refuse_the_same(payload: bytes) -> None:
 def test_noise_never_crashes_the_reader(seed: int) -> None:
     """Forged lengths, cut messages and random bytes are read or refused, in a process apart."""
     done = subprocess.run(
-        [sys.executable, "-m", "tests.ros.fuzz_reader", str(seed), "400", *TYPES],
+        [sys.executable, "-m", "tests.ros.nodes.fuzz_reader", str(seed), "400", *TYPES],
         cwd=Path(__file__).parents[2],
         timeout=100,
         capture_output=True,

@@ -6,6 +6,7 @@ import socket
 import struct
 
 from fogft.ros import spdp
+from fogft.ros.joining import Pauses
 
 PREFIX = slice(8, 20)  # of a message's sender, in its header
 LIMIT_S = 20.0
@@ -42,3 +43,20 @@ def test_a_killed_participant_is_declared_gone_once_it_is_known(ros_domain: int)
         for prefix, sent in ((known, True), (known[:-1], False), (b"\x07" + known[1:], False)):
             assert spdp.declare_gone(prefix, ros_domain) is sent
         assert other.recv(1 << 16) == spdp.gone(known)
+
+
+def test_a_stop_that_dds_does_not_outlast_is_noticed_once() -> None:
+    """Fast DDS gives up on a participant 20 s after the last sign of life, sent every 3 s."""
+    now = [100.0]
+    pauses = Pauses(lambda: now[0])
+
+    def looked_after(seconds: float) -> bool:
+        now[0] += seconds
+        return pauses.was_long()
+
+    assert [looked_after(seconds) for seconds in (0.2, 14.0, 17.0, 0.2)] == [
+        False,
+        False,
+        True,
+        False,
+    ]

@@ -57,7 +57,12 @@ ON_THIS_MACHINE = (
 
 @contextmanager
 def cyclone(what: str, domain: int) -> Iterator[None]:
-    command = [sys.executable, str(Path(__file__).with_name("cyclone_end.py")), what, "flag"]
+    command = [
+        sys.executable,
+        str(Path(__file__).parent / "nodes" / "cyclone_end.py"),
+        what,
+        "flag",
+    ]
     environ = {**os.environ, "ROS_DOMAIN_ID": str(domain), "CYCLONEDDS_URI": ON_THIS_MACHINE}
     with subprocess.Popen(command, stdin=subprocess.PIPE, env=environ) as process:
         try:

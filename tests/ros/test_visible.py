@@ -11,7 +11,7 @@ import pytest
 
 from fogft.errors import RosError
 from fogft.ros.port import Level, Status
-from tests.ros.person import Person
+from tests.ros.nodes.person import Person
 
 pytestmark = pytest.mark.ros
 STATUS = Status(Level.WARN, "fogft arm: pool", "1 of 2", "robot", {"replicas": "2"})

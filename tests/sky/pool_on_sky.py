@@ -15,9 +15,9 @@ from fogft.planning.observed.clock_jumps import Reading
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager.reconciler import Reconciler, Tick
 from fogft.reason_words import words
+from tests.fakes.sky import EAST, WEST, replica
 from tests.simulation.memory_store import MemoryStore
 from tests.sky.scene import Scene
-from tests.sky.scripted_sky import EAST, WEST, replica
 
 UID = replica().pool_uid
 SERVICE = ServiceSpec("/plan", "nav_msgs/srv/GetPlan")

@@ -11,7 +11,7 @@ from fogft.cloud.sky.adapter import SkyCloud
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.wheel import Locks
 from fogft.model.replica import Machine, Placement, ReplicaId
-from tests.sky.scripted_sky import EAST, ScriptedProvider, ScriptedSky, replica
+from tests.fakes.sky import EAST, ScriptedProvider, ScriptedSky, replica
 
 TASK: Mapping[str, Any] = {"run": "python3 serve.py", "resources": {"infra": "aws", "cpus": "2+"}}
 

@@ -18,8 +18,8 @@ from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Placement
+from tests.fakes.sky import EAST, WEST, ScriptedProvider, ScriptedSky, replica
 from tests.sky.scene import Scene
-from tests.sky.scripted_sky import EAST, WEST, ScriptedProvider, ScriptedSky, replica
 
 ID = replica()
 NAME = naming.cluster_name(ID)

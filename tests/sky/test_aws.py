@@ -15,8 +15,8 @@ from fogft.cloud.sky import naming
 from fogft.cloud.sky.aws import Aws
 from fogft.cloud.sky.provider import NotAllowedError
 from fogft.errors import CloudError, CloudUnreachable
+from tests.fakes.sky import labels, replica
 from tests.needs import needs
-from tests.sky.scripted_sky import labels, replica
 
 IMAGE = "ami-1e749f67"
 OTHER = replica(uid="00000000000000bb")

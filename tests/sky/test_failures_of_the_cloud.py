@@ -17,8 +17,8 @@ from fogft.model.replica import Offer, ReplicaId
 from fogft.planning.observed.backoff import LIMIT_S
 from fogft.planning.observed.history import EventKind
 from fogft.pool.manager import teardown
+from tests.fakes.sky import EAST, WEST, labels, replica
 from tests.sky.pool_on_sky import NORTH, UID, PoolOnSky
-from tests.sky.scripted_sky import EAST, WEST, labels, replica
 
 FIRST = cluster_name(replica(0, 1))
 EVERYWHERE = {infra(EAST), infra(WEST), infra(NORTH)}

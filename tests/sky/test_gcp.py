@@ -19,9 +19,9 @@ from fogft.cloud.sky.gcp import Gcp
 from fogft.cloud.sky.provider import NotAllowedError
 from fogft.errors import CloudUnreachable
 from fogft.model.replica import ReplicaId
+from tests.fakes import sky as scripted_sky
+from tests.fakes.sky import replica
 from tests.needs import needs
-from tests.sky import scripted_sky
-from tests.sky.scripted_sky import replica
 
 pytestmark = needs("skypilot")
 PROJECT = "lab-1"

@@ -28,9 +28,9 @@ from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError, Sale
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.names import VM_CLOUDS
 from fogft.model.replica import Placement
+from tests.fakes.sky import EAST, ScriptedSky, replica
 from tests.needs import needs
 from tests.sky.scene import Scene
-from tests.sky.scripted_sky import EAST, ScriptedSky, replica
 
 SURFACE = [name for name, member in vars(InstalledSky).items() if inspect.isfunction(member)]
 

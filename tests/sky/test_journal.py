@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from fogft.cloud.sky.journal import Entry, Journal, Stage
 from fogft.errors import StateError
 from fogft.model.replica import ReplicaId
+from tests.fakes.sky import EAST, replica
 from tests.nightly import by_day
-from tests.sky.scripted_sky import EAST, replica
 
 
 def entry(id: ReplicaId | None = None) -> Entry:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from fogft.cloud.sky import naming
 from fogft.model.replica import Placement, ReplicaId
-from tests.sky.scripted_sky import labels
+from tests.fakes.sky import labels
 
 ids = st.builds(
     ReplicaId,

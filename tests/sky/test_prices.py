@@ -12,7 +12,7 @@ from fogft.cloud.sky.prices import FRESH_S, USABLE_S, Prices
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudUnreachable, SpecError
 from fogft.model.replica import Offer, Placement
-from tests.sky.scripted_sky import EAST, WEST, ScriptedProvider, ScriptedSky
+from tests.fakes.sky import EAST, WEST, ScriptedProvider, ScriptedSky
 
 MORE = prices.extras_usd_per_hour(EAST, {})
 

@@ -11,8 +11,8 @@ from fogft.cloud.sky.naming import cluster_name
 from fogft.errors import CloudError
 from fogft.model.choices import OnDemandSpec
 from fogft.model.replica import Offer
+from tests.fakes.sky import EAST, WEST, replica
 from tests.sky.pool_on_sky import PoolOnSky
-from tests.sky.scripted_sky import EAST, WEST, replica
 
 ON_DEMAND = replace(WEST, spot=False)
 STANDBY = replica(100)

@@ -24,8 +24,8 @@ from fogft.errors import SpecError
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.replica import Placement
 from tests.cloud.waiting import wait_for
+from tests.fakes.sky import EAST, WEST, replica
 from tests.needs import needs
-from tests.sky.scripted_sky import EAST, WEST, replica
 
 LIMIT_S = 240.0  # of a script that hangs: a machine that is busy with other tests takes long
 

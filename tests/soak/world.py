@@ -24,12 +24,12 @@ from typing import Any
 
 from fogft.child import tied
 from fogft.model.replica import Member, ReplicaId
-from tests import certificate_names
 from tests.link.namespaces import Namespaces, inside
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import POOL_UID
 from tests.ports import free_port
 from tests.proxy.gateway_pool import GatewayPool, Robot, ran, start_server
+from tests.records import certificate_names
 from tests.records.rendezvous_pool import Rendezvous
 from tests.soak.clocks import Clocks, can_set
 

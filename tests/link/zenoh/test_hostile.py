@@ -20,7 +20,6 @@ from fogft.link.zenoh.settings import LinkSettings
 from fogft.model import names
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState
-from tests import certificate_names
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -34,7 +33,7 @@ from tests.link.wire_pool import (
     request_id,
     wait_for,
 )
-from tests.records import hostile
+from tests.records import certificate_names, hostile
 
 
 @pytest.fixture

@@ -17,7 +17,6 @@ from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState
 from fogft.pool.credentials import authority as credentials
 from fogft.pool.credentials.authority import Role
-from tests import certificate_names
 from tests.link.wire_pool import (
     POOL_UID,
     SERVICE,
@@ -30,6 +29,7 @@ from tests.link.wire_pool import (
     request_id,
     wait_for,
 )
+from tests.records import certificate_names
 
 
 @pytest.fixture

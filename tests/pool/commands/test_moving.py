@@ -14,7 +14,7 @@ from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.lease import read_epoch
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
-from tests.cli.pools import UID, lay_down
+from tests.fakes.pools import UID, lay_down
 
 SECRET = "correct horse battery staple"
 NOW = 1_000_000.0

@@ -11,7 +11,7 @@ from fogft.planning.rollout import UpdateState
 from fogft.pool.commands.outcome import HOPELESS_RESTARTS, Awaited, Outcome, Settled
 from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
-from tests.cli.pools import REPLICA, STATUS
+from tests.fakes.pools import REPLICA, STATUS
 
 APPLIED_AT = 10.0
 UP = replace(STATUS, notes=(), replicas=(REPLICA,), target=1, observed_at=20.0)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
 from fogft.pool.commands.status import STALE_AFTER_S, Seen, current
 from fogft.pool.manager.proxy_report import STALE_S, ProxyReport
-from tests.cli.pools import REPLICA, STATUS, UID
+from tests.fakes.pools import REPLICA, STATUS, UID
 
 NOW = 1_000_000.0
 PLAN, DETECT = "/plan", "/detect"

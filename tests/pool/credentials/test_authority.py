@@ -15,7 +15,7 @@ from fogft.errors import CredentialError
 from fogft.model.replica import ReplicaId
 from fogft.pool.credentials import authority as credentials
 from fogft.pool.credentials.authority import Role
-from tests import certificate_names
+from tests.records import certificate_names
 
 UID = "0123456789abcdef"
 REPLICA = ReplicaId(UID, 3, 7).certificate_name

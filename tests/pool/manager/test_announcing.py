@@ -23,8 +23,8 @@ from fogft.records.record_set import RecordSet
 from fogft.records.roster import ServingLease, admission, lease
 from fogft.records.server import RendezvousServer
 from fogft.records.signing import Verifier
-from tests import certificate_names
 from tests.link.wire_pool import wait_for
+from tests.records import certificate_names
 
 UID = "0123456789abcdef"
 LEASE = ServingLease(1e9, 86_400.0)

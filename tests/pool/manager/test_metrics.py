@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from fogft.pool.manager import tally
 from fogft.pool.manager.tally import Tally
-from tests.cli.pools import STATUS
+from tests.fakes.pools import STATUS
 from tests.metrics.samples import text
 
 

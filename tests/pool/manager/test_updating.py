@@ -17,8 +17,8 @@ from fogft.pool.manager.proxy_report import parse as parse_report
 from fogft.pool.manager.updating import Updating
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
+from tests.fakes.proxy import Clock, FakeDialer, FakeNode
 from tests.planning.pool_worlds import NOW, SERVICE, UID, World, replica
-from tests.proxy.fakes import Clock, FakeDialer, FakeNode
 
 
 def parse(text: str, file: str) -> PoolSpec:

@@ -7,7 +7,7 @@ import pytest
 from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.goals_once import GoalsOnce
-from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
+from tests.fakes.proxy import Clock, FakeClient, FakeIncoming
 
 SERVICE = "/count/_action/send_goal"
 OTHER = "/other/_action/send_goal"

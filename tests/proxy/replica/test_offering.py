@@ -9,7 +9,7 @@ from fogft.model.spec import ServiceSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.replica.offering import LOOK_EVERY_S, SETTLED_S
 from fogft.proxy.replica.server import ServerProxy
-from tests.proxy.fakes import UID, Clock, FakeIncoming, FakeListener, FakeNode, FakeSupervisor
+from tests.fakes.proxy import UID, Clock, FakeIncoming, FakeListener, FakeNode, FakeSupervisor
 
 SET_BOOL = "std_srvs/srv/SetBool"
 

@@ -14,7 +14,7 @@ from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.order_mark import OrderMark
 from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.load import Handling
-from tests.proxy.fakes import UID, Clock, FakeClient, FakeLink
+from tests.fakes.proxy import UID, Clock, FakeClient, FakeLink
 
 STATE = StateSpec(StateService("/g", "p/srv/G", "d"), StateService("/s", "p/srv/S", "d"))
 

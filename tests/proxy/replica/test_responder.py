@@ -10,7 +10,7 @@ from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.responder import EMPTY_REQUEST, Responder
 from fogft.requests.load import Handling, Load
-from tests.proxy.fakes import Clock, FakeClient, FakeIncoming
+from tests.fakes.proxy import Clock, FakeClient, FakeIncoming
 
 A = b"a" * 16
 B, C, D = b"b" * 16, b"c" * 16, b"d" * 16

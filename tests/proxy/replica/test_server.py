@@ -9,7 +9,7 @@ from fogft.model.spec import ServiceSpec
 from fogft.model.topic import ActionSpec
 from fogft.poolfile.pool import action_services
 from fogft.proxy.replica.server import ServerProxy
-from tests.proxy.fakes import (
+from tests.fakes.proxy import (
     UID,
     Clock,
     FakeIncoming,

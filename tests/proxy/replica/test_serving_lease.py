@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.proxy.replica.serving_lease import HeldLease
-from tests.proxy.fakes import Clock, lease
+from tests.fakes.proxy import Clock, lease
 
 DAY_S = 86_400.0
 

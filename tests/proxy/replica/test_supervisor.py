@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fogft.proxy.replica.supervisor import Supervisor
-from tests.proxy.fakes import Clock
+from tests.fakes.proxy import Clock
 
 
 def wait_until(condition, limit_s: float = 20.0) -> None:

@@ -10,7 +10,7 @@ from fogft.model.topic import ActionSpec
 from fogft.poolfile.pool import action_services
 from fogft.proxy.robot.actions import Actions
 from fogft.topics.goals import cancel_request, goal_of
-from tests.proxy.fakes import Clock, FakeLink
+from tests.fakes.proxy import Clock, FakeLink
 
 GOAL, CANCEL, RESULT = action_services(ActionSpec("/count", "p/action/T", 5.0, 60.0))
 HEADER = b"\0\1\0\0"

@@ -15,7 +15,7 @@ from fogft.model.type_definition import Definition
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.proxied_service import HOLD_S
-from tests.proxy.fakes import UID, Clock, FakeDialer, FakeNode
+from tests.fakes.proxy import UID, Clock, FakeDialer, FakeNode
 
 SET_BOOL = "std_srvs/srv/SetBool"
 OURS = {SET_BOOL: Definition(fields={"request": (("data", "boolean"),)})}

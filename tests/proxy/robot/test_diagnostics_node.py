@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from fogft.ros import environment
 from tests.proxy.by_hand import Caller, Parts, Replica, Robot, wait_for
-from tests.ros.person import Person
+from tests.ros.nodes.person import Person
 
 pytestmark = [pytest.mark.ros, pytest.mark.timeout(180)]
 environment.prepare(os.environ)

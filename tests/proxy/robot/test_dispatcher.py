@@ -15,7 +15,7 @@ from fogft.model.spec import HedgingMode, OnTimeout, Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import MALFORMED_LIMIT, Dispatcher
 from fogft.proxy.robot.sending import key_of
 from fogft.requests.load import Handling
-from tests.proxy.fakes import Clock, FakeLink
+from tests.fakes.proxy import Clock, FakeLink
 
 ALL = HedgingMode.ALL
 

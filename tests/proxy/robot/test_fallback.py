@@ -13,7 +13,7 @@ from fogft.model.choices import FallbackSpec
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
-from tests.proxy.fakes import Clock, FakeClient, FakeLink
+from tests.fakes.proxy import Clock, FakeClient, FakeLink
 
 
 class Scene:

@@ -17,7 +17,7 @@ from fogft.model import membership
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.proxy.config import read_client, read_server
 from fogft.proxy.robot import process
-from tests.proxy.fakes import UID
+from tests.fakes.proxy import UID
 
 CLIENT = f"""\
 pool: p

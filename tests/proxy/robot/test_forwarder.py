@@ -11,7 +11,7 @@ from fogft.model.spec import ServiceSpec
 from fogft.proxy.gateway.gateway import UNREADY_S, Forwarder
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.links import best_of, seen_through
-from tests.proxy.fakes import UID, Clock, FakeIncoming, FakeLink
+from tests.fakes.proxy import UID, Clock, FakeIncoming, FakeLink
 
 READY = frozenset({"/s"})
 

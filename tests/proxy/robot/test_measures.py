@@ -7,8 +7,8 @@ from fogft.model.spec import ServiceSpec
 from fogft.proxy.gateway.gateway import Forwarder
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
+from tests.fakes.proxy import UID, Clock, FakeDialer, FakeLink
 from tests.metrics.samples import text
-from tests.proxy.fakes import UID, Clock, FakeDialer, FakeLink
 
 
 def dispatcher(clock: Clock) -> tuple[Dispatcher, FakeLink]:

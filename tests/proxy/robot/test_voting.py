@@ -16,8 +16,8 @@ from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.sending import key_of
 from fogft.requests.votes import Quorum
 from fogft.ros import environment
+from tests.fakes.proxy import Clock, FakeLink
 from tests.proxy.by_hand import LIMIT_S, ROOT, Parts, wait_for
-from tests.proxy.fakes import Clock, FakeLink
 
 pytestmark = pytest.mark.timeout(180)
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fogft.link import frame
 from fogft.link.zenoh.replica.reply_streams import CREDIT_LIMIT, ReplyCredit, Streams
-from tests.proxy.fakes import Clock
+from tests.fakes.proxy import Clock
 
 ONE, OTHER = object(), object()  # two connections of a robot
 

@@ -18,7 +18,7 @@ from fogft.link.zenoh.replica.sessions import (
 )
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
-from tests import certificate_names
+from tests.records import certificate_names
 from tests.records.record_worlds import UID, signer, verify
 
 SELF = ReplicaId(UID, 0, 1).certificate_name

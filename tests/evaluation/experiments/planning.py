@@ -19,10 +19,10 @@ from typing import Any
 
 from tests.bench.rig import ROOT
 from tests.estimates import Estimate, mean, p99, ratio
-from tests.evaluation import planning_figures
 from tests.evaluation.caller import Caller
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
+from tests.evaluation.experiments import planning_figures
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
 from tests.evaluation.steal import steal

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.linearizability import Call, counter, key_value, linearizable
 from tests.nightly import by_day
+from tests.ordering.linearizability import Call, counter, key_value, linearizable
 
 ADD = ("add", 1)
 GET = ("get", 0)

@@ -25,9 +25,10 @@ from pathlib import Path
 from typing import Any
 
 from tests.estimates import mean, median, p99
-from tests.evaluation import comparing, picking_figures, workspaces
+from tests.evaluation import comparing, workspaces
 from tests.evaluation.errors import EvaluationError
 from tests.evaluation.experiment import Defaults, Finding, Row, Run, Scale, Stage, Table
+from tests.evaluation.experiments import picking_figures
 from tests.evaluation.pools import Pools
 from tests.evaluation.samples import Samples
 

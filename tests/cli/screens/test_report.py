@@ -10,8 +10,8 @@ from fogft.cli.screens.report import ready_spans
 from fogft.cli.screens.top import sparkline
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.commands import composition
-from tests.cli.pools import alive, lay_down
 from tests.docs.browser import browser
+from tests.fakes.pools import alive, lay_down
 from tests.needs import needs
 
 EVENTS = [

@@ -1,6 +1,6 @@
 """A fast service to measure against: SetBool and SetMap, serialised, with a given delay.
 
-    python tests/bench/service.py SLEEP_S [SIGMA STALLED STALL_S WORKERS]
+    python tests/bench/nodes/service.py SLEEP_S [SIGMA STALLED STALL_S WORKERS]
 
 Answers are made once and sent as bytes, so that the service itself costs next to nothing.
 With a delay requests sleep on WORKERS threads (16), for SLEEP_S, or for lognormal times of

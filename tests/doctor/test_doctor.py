@@ -23,7 +23,7 @@ from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager.status import ReplicaStatus, TopicStatus
 from fogft.ros import environment
-from tests.cli.pools import FILE, STATUS, alive, lay_down, report
+from tests.fakes.pools import FILE, STATUS, alive, lay_down, report
 from tests.needs import needs
 
 UID = "0123456789abcdef"
