@@ -74,7 +74,7 @@ TAKES_S = {
     "e2e/test_inspection.py": 25,
     "e2e/test_keys_and_moving.py": 50,
     "e2e/test_monitoring.py": 15,
-    "e2e/test_own_types.py": 40,
+    "e2e/test_own_types.py": 20,
     "e2e/test_pool.py": 40,
     "e2e/test_quickstart_page.py": 60,
     "e2e/test_rolling_update.py": 50,

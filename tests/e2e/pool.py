@@ -16,6 +16,7 @@ from typing import Any
 
 import yaml
 
+from fogft.disk import holder
 from fogft.pool.commands import status as seen
 from fogft.pool.folder.paths import PoolPaths
 from fogft.ros import shared_memory
@@ -100,10 +101,14 @@ class Pool:
             assert done.returncode == 0, f"fogft {' '.join(words)}\n{done.stdout}\n{done.stderr}"
         return done.stdout if ok else done.stdout + done.stderr
 
+    def paths(self) -> PoolPaths:
+        """Return where the only pool here lies."""
+        [folder] = (self.home / "pools").iterdir()
+        return PoolPaths(folder)
+
     def status(self) -> dict[str, Any]:
         """Return what `fogft status --json` says, without a process: tests look often."""
-        [folder] = (self.home / "pools").iterdir()
-        status = seen.read(PoolPaths(folder), time.time()).to_json()
+        status = seen.read(self.paths(), time.time()).to_json()
         self.uids.add(status["uid"])
         return status
 
@@ -126,6 +131,24 @@ class Pool:
         self.fogft("up", str(self.file), "--yes", *words)
         wanted = self.status()["target"]
         self.wait(lambda: self.ready() == wanted)
+
+    def robot_side(self) -> list[int]:
+        """Return the processes of the robot's side: the manager and the client proxies."""
+        paths = self.paths()
+        waiting = [
+            self.wait(lambda: holder(lock))  # noqa: B023
+            for lock in (paths.standby_lock, paths.spare_lock)
+        ]
+        manager, proxy = holder(paths.manager_lock), self.status()["proxy_pid"]
+        assert manager is not None
+        return [manager, proxy, *waiting]
+
+    def kill_robot_side(self) -> None:
+        """Kill all of it; none has the time to start another."""
+        all_of_it = self.robot_side()
+        for number in (signal.SIGSTOP, signal.SIGKILL):
+            for pid in all_of_it:
+                os.kill(pid, number)
 
     def client(self, seconds: float, rate_hz: float, limit_s: float = 12.0) -> Client:
         """Start an ordinary rclpy client that asks for a while."""

@@ -65,9 +65,10 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
         words, env=pool.environ, capture_output=True, text=True, timeout=100, check=False
     )
     assert (done.stdout, done.returncode) == ("3 words, 11 letters\n", 0), done.stderr
-    pool.fogft("down")
 
-    # The robot's own copy says something else; replicas source what they built.
+    # The robot's own copy says something else; the replica goes on with what it built.
+    pool.kill_robot_side()
+    pool.paths().proxy_status.unlink()  # `up` could believe the last report of who is dead
     other = other_definition(workspace, tmp_path / "other")
     libraries = workspace / "install" / "word_interfaces" / "lib"
     pool.environ = dict(bare)

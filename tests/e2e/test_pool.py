@@ -9,10 +9,8 @@ import time
 
 import pytest
 
-from fogft.disk import holder as lock_holder
 from fogft.doctor.finding import Situation
 from fogft.doctor.pools import processes
-from fogft.pool.folder.paths import PoolPaths
 from tests.e2e.pool import Pool, run
 from tests.nightly import by_day
 
@@ -115,7 +113,7 @@ def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
     assert flawless(client.finish())
 
     status_says_what_is_true_now(pool)
-    manager, proxy, *_ = robot_side(pool)  # the next one is in line
+    manager, proxy, *_ = pool.robot_side()  # the next one is in line
     for pid in (manager, proxy):
         os.kill(pid, signal.SIGKILL)
     pool.fogft("down")
@@ -127,7 +125,7 @@ def test_a_pool_is_scaled_adopted_and_ended_under_load(pool):
 def status_says_what_is_true_now(pool: Pool) -> None:
     """Of a robot's side that hangs nothing is claimed; of a dead one, that nothing is answered."""
     assert answers(pool)
-    all_of_it = robot_side(pool)
+    all_of_it = pool.robot_side()
     for pid in all_of_it:
         os.kill(pid, signal.SIGSTOP)
     pool.wait(lambda: pool.status()["answers"] is None)
@@ -138,10 +136,7 @@ def status_says_what_is_true_now(pool: Pool) -> None:
         os.kill(pid, signal.SIGCONT)
     pool.wait(lambda: answers(pool))
 
-    all_of_it = robot_side(pool)
-    for number in (signal.SIGSTOP, signal.SIGKILL):  # none of them has the time to start another
-        for pid in all_of_it:
-            os.kill(pid, number)
+    pool.kill_robot_side()
     assert not answers(pool)
     seen = pool.status()
     assert (seen["answers"], seen["ready"], seen["proxy_alive"]) == (False, 0, False)
@@ -150,19 +145,6 @@ def status_says_what_is_true_now(pool: Pool) -> None:
     assert "no request is answered" in str([*judged])
     pool.fogft("up", str(pool.file), "--yes")  # what doctor says to do
     pool.wait(lambda: answers(pool))
-
-
-def robot_side(pool: Pool) -> list[int]:
-    """Return the processes of the robot's side: the manager and the client proxies."""
-    [folder] = (pool.folder / "home" / "pools").iterdir()
-    paths = PoolPaths(folder)
-    waiting = [
-        pool.wait(lambda: lock_holder(lock))  # noqa: B023
-        for lock in (paths.standby_lock, paths.spare_lock)
-    ]
-    manager, proxy = lock_holder(paths.manager_lock), pool.status()["proxy_pid"]
-    assert manager is not None
-    return [manager, proxy, *waiting]
 
 
 def answers(pool: Pool) -> bool:
