@@ -40,8 +40,9 @@ _TURN_LIMIT_S = 5.0
 _IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
 _PORT_EVENT = re.compile(rb"\0fast(?:dds|rtps)_port(\d+)\0")
 # A process that begins or ends removes dozens of files within some ms: one look sees many of them.
-_REST_S = 0.02
-_REMOVED = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+) \(deleted\)")
+_REST_S = 0.05
+_STALE_S = 1.0  # so long after a look this process may have opened other ports
+_OPEN = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+)( \(deleted\))?")
 # A port begins, in Fast DDS 2.14 and 3.2, with: its number, how many read it, two limits in ms (one
 # a third of the other), how many messages it holds, how many wait; flags, the lowest "not broken".
 _PORT, _HEAD_BYTES = struct.Struct("=7I"), 1024
@@ -169,12 +170,13 @@ class PortWatch:
         self._thread.start()
 
     def _run(self) -> None:
-        reopen_ports()
+        looked_at, (ports, _) = time.monotonic(), reopen_ports()
         while self._id >= 0 and not self._closed:
-            removed = _PORT_EVENT.findall(os.read(self._watch, _EVENTS_BYTES))
-            domains = {spdp.domain_of(int(port)) for port in removed}
-            if self._domain_id in domains or min(domains, default=0) < 0:
-                reopen_ports()
+            removed = set(map(int, _PORT_EVENT.findall(os.read(self._watch, _EVENTS_BYTES))))
+            domains = {spdp.domain_of(port) for port in removed}
+            stale = min(domains, default=0) < 0 and time.monotonic() - looked_at > _STALE_S
+            if removed & ports or self._domain_id in domains or stale:
+                looked_at, (ports, _) = time.monotonic(), reopen_ports()
             time.sleep(_REST_S)
         if self._id >= 0:
             os.close(self._watch)
@@ -187,16 +189,21 @@ class PortWatch:
         self._thread.join()
 
 
-def reopen_ports() -> int:
-    """Mark ports that this process has open and that were removed as broken; return how many."""
-    broken = 0
+def reopen_ports() -> tuple[set[int], int]:
+    """Mark ports that this process has open and that were removed as broken.
+
+    Returns the ports that it has open, and how many it has marked.
+    """
+    ports, broken = set[int](), 0
     with contextlib.suppress(OSError), open("/proc/self/mem", "r+b", buffering=0) as memory:
         for line in Path("/proc/self/maps").read_bytes().splitlines():
-            found = line.endswith(b")") and _REMOVED.fullmatch(line)
+            found = b"_port" in line and _OPEN.fullmatch(line)
             if found:
-                with contextlib.suppress(OSError):  # closed meanwhile
-                    broken += _mark_broken(memory.fileno(), int(found[1], 16), int(found[2]))
-    return broken
+                ports.add(int(found[2]))
+                if found[3]:
+                    with contextlib.suppress(OSError):  # closed meanwhile
+                        broken += _mark_broken(memory.fileno(), int(found[1], 16), int(found[2]))
+    return ports, broken
 
 
 def _mark_broken(memory: int, start: int, number: int) -> bool:

@@ -279,8 +279,13 @@ def test_ports_are_looked_at_when_one_goes_and_not_for_the_files_beside_it(
 ) -> None:
     """Those beside it, and other domains' ports, go with each ROS process of the machine."""
     looks: SimpleQueue[None] = SimpleQueue()
-    monkeypatch.setattr(shared_memory, "reopen_ports", lambda: looks.put(None))
-    names = ("port7661", "port7411_el", "port7411_sl", "port7411")
+
+    def look() -> tuple[set[int], int]:
+        looks.put(None)
+        return set(), 0
+
+    monkeypatch.setattr(shared_memory, "reopen_ports", look)
+    names = ("port7661", "port7399", "port7411_el", "port7411_sl", "port7411")
     left = [leave(f"fastdds_{name}") for name in names]
     watch = shared_memory.PortWatch(0)
     looks.get(timeout=LIMIT_S)
@@ -366,7 +371,7 @@ client = node.create_client(SetBool, "/left")
 client.wait_for_service()
 rclpy.spin_until_future_complete(node, client.call_async(SetBool.Request(data=True)))
 for _ in sys.stdin:
-    print(shared_memory.reopen_ports(), flush=True)
+    print(shared_memory.reopen_ports()[1], flush=True)
 """
 
 
