@@ -144,6 +144,7 @@ class Reason:
     because: tuple[Reason, ...] = ()  # what led to it, the main reason first
 
 
+NOTICES = (Cause.NOTICE, Cause.NOTICE_BY_REPLICA)
 MOVES = frozenset(
     {Cause.BETTER_SPREAD, Cause.BETTER_SCORE, Cause.SPOT_AGAIN, Cause.ON_DEMAND_AGAIN}
 )

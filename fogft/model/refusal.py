@@ -3,10 +3,9 @@
 A new kind of refusal is a row here, the code that raises it, and a test. The comment above a row
 is published: `scripts/docs` writes it into docs/reference/diagnostics.md. Requests are refused
 in `proxy/replica/responder` (services), `.goals_once`, `.topics`, `.ordered_responder` with
-`ordering/replica` (services with `state`), `proxy/gateway/gateway`, `link/zenoh/replica/listener`
-(who may not ask) and `.reply_queue` (answers that are lost), and on the robot in
-`link/zenoh/robot/attempts` and `link/uplinks` (what is lost). A robot of an earlier version reads a
-new kind as UNKNOWN, without effect: it counts towards its three attempts (`requests/pending`).
+`ordering/replica` (services with `state`), `proxy/gateway/gateway`, `link/zenoh/replica` (who may
+not ask; `.reply_queue`: lost answers), and on the robot in `link/zenoh/robot/attempts` and
+`link/uplinks`. An older robot reads a new kind as UNKNOWN, without effect: one of three attempts.
 """
 
 from __future__ import annotations

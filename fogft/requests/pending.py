@@ -5,9 +5,8 @@ is to be done. Called under its owner's lock. The first success takes the reques
 so that whatever comes later is LATE by construction. A replica that declined a request, failed it
 or came after it may be asked even while others work on it: they may be frozen.
 
-Owns: who may be asked for a request (`_next_for`).
-Not here: what an answer means (`decide`), whom of those (`choose`), when the fallback is
-(`fallback`), sending, delivering, counting (`fogft.proxy.robot.dispatcher`).
+Owns: who may be asked (`_next_for`). Not here: whom of those (`choose`), what an answer means
+(`decide`), when the fallback is (`fallback`), sending and counting (`proxy.robot.dispatcher`).
 """
 
 from collections.abc import Callable, Iterable, Sequence

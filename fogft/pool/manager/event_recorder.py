@@ -6,7 +6,7 @@ Not here: what events mean (`planning.observed.history`), and those of the clock
 import logging
 from collections.abc import Callable
 
-from fogft.model.reason import Cause, Reason
+from fogft.model.reason import NOTICES, Cause, Reason, because
 from fogft.model.replica import Observed, ReplicaId
 from fogft.planning.observed.health import Health, Verdict
 from fogft.planning.observed.history import Event, EventKind, History
@@ -26,7 +26,7 @@ class EventRecorder:
     def __init__(self, store: PoolStore, clock: Callable[[], float]) -> None:
         self._store = store
         self._clock = clock
-        self._lost_for: dict[ReplicaId, Reason] = {}  # if they went now
+        self._faults: dict[ReplicaId, Reason] = {}  # when they were judged last
 
     def add(
         self,
@@ -54,18 +54,15 @@ class EventRecorder:
                 id = ReplicaId(uid, record.slot, record.generation)
                 kind = EventKind.ENDED if record.ending else EventKind.GONE
                 log.info("replica_%s replica=%s zone=%s", kind.value, id.short, record.location)
-                gone = self._lost_for.get(id, Reason(Cause.NOT_LISTED))
+                fault = self._faults.get(id)
+                gone = Reason(Cause.NOT_LISTED, because=because(fault))
+                if fault is not None and fault.cause in NOTICES:
+                    gone = fault
                 self.add(kind, id, reason=record.ends_for if record.ending else gone)
 
     def health(self, health: Health, history: History) -> None:
         """Record replicas that became ready, became unready or failed."""
-        self._lost_for = {
-            judged.id: judged.fault
-            if judged.verdict is Verdict.LEAVING
-            else Reason(Cause.NOT_LISTED, because=(judged.fault,))
-            for judged in health.replicas
-            if judged.fault
-        }
+        self._faults = {judged.id: judged.fault for judged in health.replicas if judged.fault}
         for judged in health.replicas:
             machine, record = judged.machine, judged.record
             id = machine.id

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from fogft.metrics.proxies import by_event
 from fogft.metrics.scrape import counter, gauge, histogram
-from fogft.model.reason import Cause
+from fogft.model.reason import NOTICES, Cause
 from fogft.model.replica import Phase
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.manager.status import PoolStatus, ReplicaStatus
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 # Upper bounds of buckets, seconds: from the local cloud to a VM with a long `setup`.
 BUCKETS_S = (1.0, 5.0, 15.0, 30.0, 60.0, 120.0, 300.0, 600.0, 1200.0, 3600.0)
-_NOTICES = (Cause.NOTICE, Cause.NOTICE_BY_REPLICA)
 _PHASES = ("provisioning", "starting", "total")
 
 
@@ -49,7 +48,7 @@ class Tally:
             self._launches["on_demand" if event.on_demand else "spot"] += 1
             self._ordered[replica] = event.at, not event.on_demand
             why = event.reason
-            if why is not None and any(one.cause in _NOTICES for one in why.because):
+            if why is not None and any(one.cause in NOTICES for one in why.because):
                 self._preempt(why.replica)
         elif event.kind is EventKind.REFUSED:
             self._refused[_cause(event)] += 1

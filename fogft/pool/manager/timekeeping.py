@@ -1,7 +1,6 @@
 """Take one time for a whole tick, and write into the history where the clock jumped.
 
-Where it was set, or the machine slept, all that is remembered moves along.
-Not here: what a jump is (`planning.observed.clock_jumps`), and what moves (`history`, `updating`).
+Not here: what a jump is (`planning.observed.clock_jumps`), what moves then (`history`, `updating`).
 """
 
 import logging

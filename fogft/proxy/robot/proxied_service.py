@@ -3,7 +3,6 @@
 `wait_for_service` in the robot's code is true exactly while it is. A service that is withdrawn
 loses what is sent to it meanwhile, so it is not withdrawn for a moment's silence, nor under a
 request that may still be answered.
-
 Owns: which links may be asked.
 """
 

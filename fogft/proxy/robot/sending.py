@@ -1,7 +1,6 @@
 """Offer one service's requests to links, and cancel requests at links.
 
-This is the one place where a request leaves for a replica.
-Not here: which links may be asked (`proxied_service`), and whom of them (`requests.pending`).
+The one place where a request leaves for a replica. Which links may be asked: `proxied_service`.
 """
 
 import threading
