@@ -85,7 +85,7 @@ TAKES_S = {
     "link/zenoh/robot/test_thin_downlink.py": 12,
     "link/zenoh/robot/test_thin_links.py": 15,
     "link/zenoh/test_hostile.py": 4,
-    "proxy/test_broken_machine.py": 12,
+    "proxy/test_broken_machine.py": 18,
     "proxy/test_connectivity.py": 10,
     "proxy/test_processes.py": 30,
     "proxy/test_sharing_processes.py": 10,

@@ -98,7 +98,8 @@ class Pool:
         """Run a command; return its standard output."""
         done = run(words, self.environ, self.folder, limit_s)
         if ok:
-            assert done.returncode == 0, f"fogft {' '.join(words)}\n{done.stdout}\n{done.stderr}"
+            told = f"exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
+            assert done.returncode == 0, f"fogft {' '.join(words)}: {told}"
         return done.stdout if ok else done.stdout + done.stderr
 
     def paths(self) -> PoolPaths:
