@@ -68,7 +68,6 @@ def test_own_types_are_built_found_and_held_equal(pool: Pool, tmp_path: Path):
 
     # The robot's own copy says something else; the replica goes on with what it built.
     pool.kill_robot_side()
-    pool.paths().proxy_status.unlink()  # `up` could believe the last report of who is dead
     other = other_definition(workspace, tmp_path / "other")
     libraries = workspace / "install" / "word_interfaces" / "lib"
     pool.environ = dict(bare)

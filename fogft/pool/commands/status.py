@@ -74,15 +74,19 @@ def current(
     manager_alive: bool,
     proxy_alive: bool,
     now: float,
+    proxy_pid: int | None = None,
     heard_since: float | None = None,
 ) -> Seen:
     """Return the status now.
 
     Args:
+        proxy_pid: Of the client proxy that runs; None for unknown. Another's report counts as old.
         heard_since: Only a link whose replica has answered a probe since then counts as up;
             None for what the report says.
     """
     fresh = report if proxy_alive and report is not None and report.fresh(now) else None
+    if fresh is not None and proxy_pid not in (None, fresh.pid):
+        fresh = None
     links = fresh.links if fresh is not None else None
     if fresh is not None and heard_since is not None:
         links = tuple(_heard(k, fresh.written_at, heard_since) for k in fresh.links)
@@ -119,6 +123,7 @@ def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> S
         proxy_report.read(paths.proxy_status, seen.uid),
         manager_alive=disk.is_locked(paths.manager_lock),
         proxy_alive=disk.is_locked(paths.proxy_lock),
+        proxy_pid=disk.holder(paths.proxy_lock),
         now=now,
         heard_since=heard_since,
     )

@@ -76,6 +76,16 @@ def test_of_a_client_proxy_that_hangs_nothing_is_claimed(status, links, age_s):
 
 
 @given(statuses, made_links)
+def test_the_last_report_of_a_proxy_that_was_killed_says_nothing_of_the_next(status, links):
+    report = ProxyReport(1, NOW - 0.5, links=links)
+    alive = {"manager_alive": True, "proxy_alive": True, "now": NOW}
+    found = current(status, report, proxy_pid=2, **alive)
+    assert (found.answers, found.unanswered, found.links_known) == (None, (), False)
+    assert found.status.ready == 0
+    assert current(status, report, proxy_pid=1, **alive).links_known
+
+
+@given(statuses, made_links)
 def test_a_service_is_answered_where_a_link_that_is_up_offers_it(status, links):
     """And a pool answers where each of its services is."""
     found = seen(status, links)
