@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from fogft.requests.concurrency import ConcurrencyLimit
+from fogft.requests.concurrency import IN_HAND_S, ConcurrencyLimit
 
 
 def saturated(limit: ConcurrencyLimit, workers: int, median_s: float, sigma: float, answers: int):
@@ -71,3 +71,31 @@ def test_the_wait_is_what_is_ahead_at_the_pace_so_far():
     limit.finished(2, 0.4, 0.0)
     assert limit.wait_s(4, 2) == pytest.approx(1.0)
     assert limit.wait_s(0, 0) == 0.0
+
+
+def test_a_limit_is_known_once_it_was_given_or_tried():
+    assert ConcurrencyLimit(10, given=3).known == 3
+    limit = ConcurrencyLimit(10)
+    assert (limit.known, limit.in_hand) == (0, 10)
+    saturated(limit, 2, 0.05, 0.0, 3000)
+    assert limit.known == limit.limit == 2
+
+
+@pytest.mark.parametrize(("took_s", "more"), [(IN_HAND_S / 2, 1), (2 * IN_HAND_S, 0)])
+def test_one_more_is_in_hand_where_requests_are_short_and_the_limit_is_learned(took_s, more):
+    """It fills the moment between two: of long ones nobody would notice it."""
+    learned, given = ConcurrencyLimit(10), ConcurrencyLimit(10, given=2)
+    for limit in (learned, given):
+        saturated(limit, 2, took_s, 0.0, 3000)
+    assert (learned.limit, learned.in_hand) == (2, 2 + more)
+    assert given.in_hand == 2
+
+
+def test_what_it_takes_follows_the_answers_and_counts_those_at_work_beside_it():
+    limit = ConcurrencyLimit(10, given=4)
+    limit.finished(4, 0.4, 0.0)
+    assert (limit.takes_s, limit.service_s) == pytest.approx((0.4, 0.1))
+    limit.finished(2, 0.8, 0.0)
+    assert (limit.takes_s, limit.service_s) == pytest.approx((0.44, 0.13))
+    limit.finished(0, 0.44, 0.0)
+    assert limit.takes_s == pytest.approx(0.44), "none at its start counts as one"

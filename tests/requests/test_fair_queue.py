@@ -127,3 +127,46 @@ def test_the_stalest_gives_way_to_a_newer_one_of_its_own_robot():
     assert queue.evict("a", 9.0) == "old"
     assert queue.ahead("a", 8.0) == 0
     assert queue.ahead("a", 5.0) == 1
+
+
+def test_an_empty_queue_gives_nothing_and_nothing_has_to_give_way():
+    queue = filled()
+    assert (queue.take(), queue.remove(b"x"), queue.evict("a", 1.0)) == (None, None, None)
+    assert (len(queue), queue.ahead("a", 1.0)) == (0, 0)
+
+
+def test_who_was_given_least_is_next_and_among_equals_the_earliest_deadline():
+    assert drained(filled(("a", 5.0), ("b", 3.0), ("b", 9.0), ("a", 7.0))) == [
+        "b1",
+        "a0",
+        "a3",
+        "b2",
+    ]
+    assert drained(filled(("a", 1.0), ("a", 1.0))) == ["a0", "a1"], "of equals the first"
+
+
+def test_what_is_ahead_is_ones_own_and_as_much_of_each_other():
+    queue = filled(("a", 1.0), ("a", 5.0), ("b", 9.0), ("c", 9.0), ("c", 9.0), ("c", 9.0))
+    assert queue.ahead("a", 0.5) == 0 + 1 + 1
+    assert queue.ahead("a", 1.0) == 1 + 1 + 2
+    assert queue.ahead("a", 9.0) == 2 + 1 + 3
+    assert queue.ahead("d", 9.0) == 0 + 1 + 1 + 1
+    queue.remove(bytes([1]))
+    assert queue.ahead("a", 9.0) == 1 + 1 + 2
+
+
+def test_what_was_removed_never_comes_out_however_much_it_is():
+    queue = filled(*[("a", float(n)) for n in range(60)])
+    for n in range(57):
+        assert queue.remove(bytes([n])) == f"a{n}"
+    assert queue.remove(bytes([0])) is None
+    assert queue.evict("b", 0.0) == "a59"
+    assert drained(queue) == ["a57", "a58"]
+
+
+def test_a_robot_with_one_more_than_another_keeps_it():
+    """Else two robots would take each other's places in turns."""
+    queue = filled(("a", 1.0), ("a", 1.0), ("b", 1.0))
+    assert queue.evict("b", 9.0) is None
+    queue.put(b"x", "a", 2.0, "x")
+    assert queue.evict("b", 9.0) == "x"

@@ -5,7 +5,7 @@ Every step keeps the table, the policy and the decision together.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import pytest
@@ -14,13 +14,15 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from fogft.model.choices import FallbackSpec
-from fogft.model.refusal import Refusal
+from fogft.model.refusal import Effect, Refusal
 from fogft.requests.alarms import ALARM_S, FALSE_ALARMS, LATELY_S
 from fogft.requests.choose import All
 from fogft.requests.decide import Decide, Means
 from fogft.requests.fallback import FallbackTimer
+from fogft.requests.load import Load
 from fogft.requests.pending import (
     ATTEMPTS,
+    CAUTIOUS_S,
     RETRY_FIRST_S,
     RETRY_LIMIT_S,
     PendingRequests,
@@ -295,6 +297,117 @@ def test_nobody_is_asked_for_a_request_that_has_ended():
     requests.use(All())
     assert asked(requests, 1, 2, 3) == []
     assert requests.idle() == []
+
+
+class Told(All):
+    """Notes what it is told of how attempts end."""
+
+    def __init__(self) -> None:
+        self.told: list[tuple[Any, ...]] = []
+
+    def declined(self, request: bytes, replica: int, *, full: bool) -> None:
+        self.told.append(("declined", request, replica, full))
+
+    def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
+        self.told.append(("heard", request, replica, load))
+
+    def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
+        self.told.append(("failed", request, replica, fault))
+
+    def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
+        self.told.append(("late", request, replica, answered))
+
+    def stopped(
+        self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
+    ) -> None:
+        self.told.append(("stopped", request, sorted(open), expired))
+
+    def forget(self, replica: int) -> None:
+        self.told.append(("forget", replica))
+
+
+def told(*steps: Callable[[PendingRequests], object]) -> list[tuple[Any, ...]]:
+    """Return what a policy was told while these happened to a request at replicas 1 and 2."""
+    policy = Told()
+    requests = PendingRequests(policy, Spy())
+    requests.begin(A, b"question", (1, 2), deadline=10.0, now=0.0)
+    for step in steps:
+        step(requests)
+    return policy.told
+
+
+@pytest.mark.parametrize("refusal", list(Refusal))
+def test_a_policy_is_told_whose_fault_a_refusal_is(refusal):
+    fault = Effect.FAULT in refusal.effect
+    assert told(lambda r: r.refused(A, 1, refusal, 1.0)) == [("failed", A, 1, fault)]
+    late = told(lambda r: won(r, A, 2, 1.0), lambda r: r.refused(A, 1, refusal, 2.0))
+    assert late == [("late", A, 1, False)]
+
+
+def test_a_policy_is_told_how_each_attempt_ends():
+    load = Load(1, 2, 3, 0.1, 0.2)
+    rejected = ("failed", A, 1, False)  # the service works, and says no
+    assert told(lambda r: answer(r, 1, NO)) == [rejected]
+    assert told(lambda r: answer(r, 1, NO), lambda r: answer(r, 1, NO)) == [
+        rejected,
+        ("late", A, 1, True),
+    ]
+    assert told(lambda r: won(r, A, 1, 10.0)) == [("late", A, 1, True)], "at the deadline"
+    assert told(lambda r: r.answered(A, A, 1, OK, True, load, 1.0)) == [("heard", A, 1, load)]
+    assert told(lambda r: r.declined(A, 1)) == [("declined", A, 1, True)]
+    assert told(lambda r: r.attempt(A, 1, 1.0)) == [("declined", A, 1, False)], "it has it"
+    assert told(lambda r: r.stop(A, 1.0)) == [("stopped", A, [1, 2], False)]
+    assert told(lambda r: r.give_up(A, 1.0)) == [("stopped", A, [1, 2], False)]
+    assert told(lambda r: r.expire(10.0)) == [("stopped", A, [1, 2], True)]
+    assert told(lambda r: r.left([1]), lambda r: r.came([2])) == [("forget", 1), ("forget", 2)]
+
+
+def test_after_a_death_one_replica_is_left_out_of_each_request_for_a_while():
+    """One more that kills would otherwise end all of them at once."""
+    policy = Told()
+    requests = PendingRequests(policy, Spy(), counts_deaths=True)
+    requests.begin(A, b"x", (1, 2, 3), deadline=999.0, now=0.0)
+    requests.refused(A, 1, Refusal.CRASHED, 0.0)
+    assert list(requests.begin(B, b"x", (1, 2, 3), deadline=999.0, now=1.0)) == [1, 2]
+    assert policy.told[-1] == ("declined", B, 3, False)
+    spared = [(id, replica) for id, replica in requests.more((1, 2, 3), 1.5, newest_first=False)]
+    assert (B, 3) not in spared
+    later = requests.more((1, 2, 3), 2.0, newest_first=False)
+    assert (B, 3) in later, "those that have it have lived on"
+    begun = requests.begin(b"c" * 16, b"x", (1, 2, 3), deadline=999.0, now=CAUTIOUS_S)
+    assert list(begun) == [1, 2, 3]
+    assert list(requests.begin(b"d" * 16, b"x", (1,), deadline=999.0, now=1.0)) == [1], "the only"
+
+
+def test_a_restarted_subject_voids_what_was_said_of_its_requests_only():
+    requests, _ = made((1,))
+    requests.begin(B, b"other", (1,), deadline=10.0, now=0.0)
+    for request in (A, B):
+        requests.refused(request, 1, Refusal.MALFORMED, 0.0)
+    requests.welcome(1, lambda payload: payload == b"other")
+    assert requests.more((1,), 5.0, newest_first=False) == [(B, 1)]
+
+
+def test_a_fallback_that_fails_leaves_the_request_to_the_replicas_until_its_deadline():
+    requests, spy = made()
+    requests.fallback = FallbackTimer(FallbackSpec("/f", after_s=1.0))
+    requests.fallback.submitted(A, 0.0)
+    assert requests.fallback.due(1.0, able=True) == [A]
+    assert requests.fallback_answered(A, 2.0, ok=False) == (None, True)
+    assert (A in requests, spy.ended) == (True, [])
+    assert requests.fallback_answered(A, 10.0, ok=True) == (None, False), "at the deadline"
+    ((id, pending),) = requests.expire(10.0)
+    assert requests.fallback.expired(id, pending, 10.0), "it is asked again: it had answered"
+    assert requests.fallback_answered(A, 11.0, ok=False) == (pending, True)
+
+
+@pytest.mark.parametrize("newest_first", [False, True])
+def test_requests_are_looked_at_in_the_order_that_is_wanted(newest_first):
+    requests = PendingRequests(All(), Spy())
+    for id in (A, B):
+        requests.begin(id, b"", (), deadline=10.0, now=0.0)
+    steps = [id for id, _ in requests.more((1,), 0.0, newest_first=newest_first)]
+    assert steps == ([B, A] if newest_first else [A, B])
 
 
 class OneFirst(All):

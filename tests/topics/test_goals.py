@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -50,16 +52,44 @@ def test_a_goal_is_known_by_the_id_that_its_client_gave_it():
         (Part.CANCEL, b"\0\1\0\0\0\0\0\0\0\0\0\0", False),
         (Part.CANCEL, b"\0\1\0\0\1\0\0\0\1\0\0\0", False),
         (Part.CANCEL, b"", False),
+        (Part.CANCEL, b"\0\0\0\0\0\0\0\0\0\0\0\1", True),
+        (Part.GOAL, b"", False),
+        (Part.RESULT, b"", False),
     ],
 )
 def test_what_a_success_is(part, response, success):
     assert goals.is_success(part, response) is success
     assert not goals.is_unknown(b"\0\1\0\0\4")
+    assert goals.is_unknown(b"\0\1\0\0\0")
+
+
+@pytest.mark.parametrize(
+    ("goal_id", "stamp", "one"),
+    [
+        (b"i" * 16, bytes(8), True),
+        (b"i" * 16, b"\0" * 7 + b"\1", False),  # it, and all before a moment
+        (bytes(16), bytes(8), False),  # all
+        (bytes(16), b"\1" * 8, False),  # all before a moment
+    ],
+)
+def test_which_cancellations_mean_one_goal(goal_id, stamp, one):
+    assert goals.names_one(HEADER + goal_id + stamp) is one
+    assert goals.names_one(goals.cancel_request(b"i" * 16))
 
 
 def test_a_goals_status_is_the_furthest_that_a_replica_gives_it():
     said = {0: {b"a": 6, b"b": 2, b"c": 5}, 1: {b"a": 2, b"b": 4}, 2: {b"c": 6}}
     assert goals.merged(said) == {b"a": 2, b"b": 4, b"c": 5}
+
+
+def test_of_two_statuses_the_one_counts_that_says_more():
+    """Done well before all; then the furthest under way; ends count only where nothing else is."""
+    in_order = [0, 6, 5, 1, 2, 3, 4]
+    for low, high in pairwise(in_order):
+        for said in ({0: {b"g": low}, 1: {b"g": high}}, {0: {b"g": high}, 1: {b"g": low}}):
+            assert goals.merged(said) == {b"g": high}
+    assert goals.merged({0: {b"g": 77}, 1: {b"g": 6}}) == {b"g": 6}, "no status that ROS knows"
+    assert goals.merged({}) == {}
 
 
 def test_a_goal_is_under_way_from_its_first_acceptance_to_its_end():
@@ -113,11 +143,26 @@ def test_who_did_not_look_at_it_is_given_it_again_in_a_moment():
     assert made.lacking(2, 3.0) == [request(1)]
 
 
+def test_who_never_looks_at_it_is_left_alone_for_longer_each_time():
+    made, now, waits = under_way(1, 2), 2.0, []
+    for _ in range(8):
+        made.failed(b"id", 2, now)
+        wait_s = next(n / 8 for n in range(1000) if made.lacking(2, now + n / 8))
+        waits.append(wait_s)
+        now += wait_s
+        made.gave(goal(1), b"id", 2, until=now + 5.0)
+    assert waits == [0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 8.0, 8.0]
+    made.left(2)
+    made.failed(b"id", 2, now)
+    assert made.lacking(2, now + 0.25) == [request(1)], "another one, of which nothing is known"
+
+
 @pytest.mark.parametrize(
     ("said", "asked_at", "lacked"),
     [
         ([], 9.0, Refusal.NOT_READY),
         ([True], 9.0, None),
+        ([True], 2.0, None),
         ([True], 1.0, Refusal.NOT_READY),  # it was asked for the result before it took the goal
         ([False], 1.0, Refusal.FORGOTTEN),
         ([True, False], 9.0, None),  # it has it already: action servers refuse a second one
@@ -260,3 +305,33 @@ def test_who_takes_a_goal_that_is_over_does_so_in_vain():
     made.ended(goal(1))
     assert made.took(b"id", 2, 2.0, accepts=False)[0] is None
     assert made.took(b"id", 2, 2.0, accepts=True) == (goal(1), True)
+
+
+def test_of_goals_that_are_over_the_oldest_are_forgotten(monkeypatch):
+    monkeypatch.setattr(goals, "GOALS_KEPT", 2)
+    made = Goals()
+    for number in (1, 2, 3):
+        made.made(request(number), bytes([number]), (1,), until=5.0)
+        made.ended(goal(number))
+    known = [made.took(bytes([number]), 1, 1.0, accepts=True)[0] for number in (1, 2, 3)]
+    assert known == [None, goal(2), goal(3)]
+
+
+def test_as_many_goals_and_bytes_as_may_be_are_kept(monkeypatch):
+    monkeypatch.setattr(goals, "GOALS_KEPT", 3)
+    monkeypatch.setattr(goals, "BYTES_KEPT", 3 * len(request(0)))
+    made = Goals()
+    for number in (1, 2, 3):
+        made.made(request(number), bytes([number]), (1,), until=5.0)
+    assert made.kept == 3
+    made.made(request(3), b"again", (2,), until=5.0)
+    assert made.kept == 3, "a goal that is made again is no other one"
+    made.made(request(4, 1), bytes([4]), (1,), until=5.0)
+    assert made.kept == 2
+
+
+def test_all_goals_are_forgotten_at_once():
+    made = under_way(1, 2)
+    made.clear()
+    assert (made.kept, made.lacking(2, 9.0), made.unwanted()) == (0, [], [])
+    assert made.took(b"id", 2, 9.0, accepts=True) == (goal(1), True), "it takes it in vain"

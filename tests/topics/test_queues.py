@@ -1,0 +1,191 @@
+"""Topics' queues: what is kept, and in what order it goes."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from fogft.topics.queues import Outbox, Ring, Seen
+
+
+@given(
+    depth=st.integers(1, 8), latched=st.booleans(),
+    steps=st.lists(st.one_of(st.just("put"), st.just("pull")), max_size=60),
+)  # fmt: skip
+def test_who_pulls_often_enough_hears_all_in_order_and_nothing_twice(depth, latched, steps):
+    """And who does not loses the oldest only. What was kept before counts where it is latched."""
+    ring = Ring(depth, latched=latched)
+    for number in range(3):
+        ring.put(b"%d" % number)
+    has, heard = ring.begin(), []
+    unheard = 0
+    for step in steps:
+        if step == "put":
+            ring.put(b"%d" % ring.last)
+            unheard += 1
+            continue
+        got = ring.after(has, 1 << 20)
+        heard += [int(message) for _, message in got]
+        has = got[-1][0] if got else has
+        unheard = 0
+    assert heard == sorted(set(heard))
+    if not latched:
+        assert all(number >= 3 for number in heard)
+    elif "pull" in steps and "put" not in steps:
+        assert heard == list(range(max(0, 3 - depth), 3))
+    if unheard <= depth and steps and steps[-1] == "pull":
+        assert not heard or heard[-1] == ring.last - 1
+
+
+def test_a_batch_has_at_least_one_message_and_then_at_most_so_many_bytes():
+    ring = Ring(10, latched=False)
+    for size in (50, 10, 10, 100):
+        ring.put(b"x" * size)
+    assert [len(m) for _, m in ring.after(0, 20)] == [50]
+    assert [len(m) for _, m in ring.after(1, 20)] == [10, 10]
+
+
+def test_what_is_kept_is_bounded_in_bytes_but_the_newest_stays():
+    ring = Ring(10, latched=True)
+    ring.kept_bytes = 100
+    assert [ring.put(b"x" * size) for size in (60, 60, 300)] == [0, 1, 1]
+    assert [len(m) for _, m in ring.after(ring.begin(), 1 << 20)] == [300]
+
+
+@given(
+    depth=st.integers(1, 6), window=st.integers(1, 4),
+    steps=st.lists(st.sampled_from(["put", "send", "confirm", "break", "lose"]), max_size=80),
+)  # fmt: skip
+def test_a_replica_gets_each_message_once_and_in_order(depth, window, steps):
+    """Whatever is lost and sent again; only the oldest of too many that wait are left out."""
+    outbox, seen = Outbox(depth), Seen()
+    outbox.window = window
+    under_way: list[int] = []
+    got: list[int] = []
+    put = gone = 0
+    for step in steps:
+        if step == "put":
+            put += 1
+            gone += outbox.put(put, b"%d" % put)
+        elif step == "send" and (one := outbox.next()) is not None:
+            under_way.append(one[0])
+            if seen.is_new(b"robot", one[0]):
+                got.append(one[0])
+            assert len(under_way) <= window
+        elif step == "confirm" and under_way:
+            outbox.confirmed(under_way.pop(0))
+        elif step == "lose" and under_way:
+            outbox.returned([under_way.pop(0)])
+        elif step == "break":
+            for number in under_way:  # one by one, as it is told
+                outbox.returned([number])
+            under_way = []
+    assert got == sorted(set(got))
+    outbox.returned(under_way)
+    while (one := outbox.next()) is not None:
+        if seen.is_new(b"robot", one[0]):
+            got.append(one[0])
+        outbox.confirmed(one[0])
+    assert got == sorted(set(got))
+    assert len(got) == put - gone or gone
+
+
+def test_what_waits_for_a_replica_is_bounded_in_bytes_but_the_newest_stays():
+    outbox = Outbox(10)
+    outbox.kept_bytes = 100
+    assert [outbox.put(n, b"x" * size) for n, size in enumerate((60, 60, 300), 1)] == [0, 1, 1]
+    assert outbox.next()[0] == 3
+
+
+def test_a_robot_that_starts_anew_is_another_publisher():
+    seen = Seen()
+    seen.robots = 2
+    assert [seen.is_new(b"a", 5), seen.is_new(b"a", 5), seen.is_new(b"a", 4)] == [
+        True,
+        False,
+        False,
+    ]
+    assert seen.is_new(b"b", 1)
+
+
+@pytest.mark.parametrize("latched", [False, True])
+def test_where_a_new_robot_begins(latched):
+    """Before all that is kept, where it is latched; else after it."""
+    ring = Ring(2, latched=latched)
+    assert ring.begin() == 0
+    for expected in ((0, 1), (0, 2), (1, 3)):
+        ring.put(b"x")
+        assert ring.begin() == expected[not latched]
+
+
+def test_a_batch_is_as_large_as_its_limit_and_no_larger():
+    ring = Ring(10, latched=False)
+    for size in (10, 10, 1):
+        ring.put(b"x" * size)
+    assert [number for number, _ in ring.after(0, 20)] == [1, 2]
+    assert [number for number, _ in ring.after(0, 19)] == [1]
+    assert [number for number, _ in ring.after(1, 20)] == [2, 3]
+    assert ring.after(3, 20) == []
+
+
+@given(st.lists(st.integers(0, 60), max_size=40), st.integers(1, 5))
+def test_what_is_kept_is_the_newest_that_has_room(sizes, depth):
+    """By number and by bytes; and every message was either kept or told as dropped."""
+    ring = Ring(depth, latched=True)
+    ring.kept_bytes = 100
+    gone = sum(ring.put(b"x" * size) for size in sizes)
+    kept = [(number, len(message)) for number, message in ring.after(0, 1 << 20)]
+    assert kept == list(enumerate(sizes, 1))[gone:]
+    assert len(kept) <= depth
+    assert sum(size for _, size in kept) <= 100
+    fitting = sizes[-len(kept) - 1 :]
+    assert not gone or len(fitting) > depth or sum(fitting) > 100, "nothing is dropped in vain"
+
+
+def test_as_much_as_may_wait_waits_and_no_more():
+    outbox = Outbox(2)
+    outbox.kept_bytes = 100
+    assert [outbox.put(number, b"x" * 50) for number in (1, 2, 3)] == [0, 0, 1]
+    assert len(outbox) == 2
+    assert outbox.put(4, b"x" * 51) == 2, "with what there is it would be too much"
+    assert outbox.put(5, b"x" * 49) == 0
+    assert (outbox.next(), outbox.next()) == ((4, b"x" * 51), (5, b"x" * 49))
+    assert (outbox.waiting, len(outbox)) == (False, 2)
+
+
+def test_no_more_than_a_window_is_under_way_and_what_was_lost_goes_before_what_is_later():
+    outbox = Outbox(10)
+    outbox.window = 2
+    for number in (1, 2, 3, 4):
+        outbox.put(number, b"")
+    assert [one and one[0] for one in (outbox.next(), outbox.next(), outbox.next())] == [1, 2, None]
+    outbox.returned([1])
+    assert outbox.next() is None, "2 may be lost as well, or have overtaken 1"
+    outbox.confirmed(2)
+    outbox.confirmed(99)
+    assert [one[0] for one in (outbox.next(), outbox.next())] == [1, 3]
+    outbox.confirmed(1)
+    assert outbox.next()[0] == 4
+
+
+def test_an_earlier_one_that_is_under_way_holds_nothing_up():
+    outbox = Outbox(10)
+    for number in (1, 2, 3):
+        outbox.put(number, b"")
+    outbox.next()
+    outbox.next()
+    outbox.returned([2, 7])
+    assert outbox.next()[0] == 2
+    assert outbox.next()[0] == 3
+
+
+def test_the_robots_that_spoke_last_are_remembered():
+    """One that is forgotten may begin anew: that is better than to remember all for ever."""
+    seen = Seen()
+    seen.robots = 2
+    for robot, number in ((b"a", 9), (b"b", 9), (b"a", 10), (b"c", 9)):
+        assert seen.is_new(robot, number)
+    assert not seen.is_new(b"a", 10)
+    assert not seen.is_new(b"c", 9)
+    assert seen.is_new(b"b", 9), "it was silent for longest"
