@@ -14,6 +14,7 @@ import pytest
 
 PRODUCT = Path(__file__).parent.parent / "fogft"
 MOST_MODULES = 22
+DECIDES = ("ordering", "planning", "poolfile", "requests", "topics")
 PURE = ("model", "ordering", "planning", "poolfile", "requests", "topics")
 OPENS_FILES = {"poolfile/config_file.py", "poolfile/file.py"}
 LOADED_BY_NAME = {"sky": "cloud/sky", "boto3": "cloud/sky", "botocore": "cloud/sky"}
@@ -75,6 +76,15 @@ def test_no_room_holds_more_modules_than_one_can_look_through() -> None:
     modules = [*files(), *(PRODUCT.parent / "tests").rglob("*.py")]
     rooms = Counter(path.parent for path in modules if path.name != "__init__.py")
     assert {room: count for room, count in rooms.items() if count > MOST_MODULES} == {}
+
+
+@pytest.mark.parametrize("room", DECIDES)
+def test_the_tests_of_what_decides_are_as_long_as_its_code(room: str) -> None:
+    code, tests = (
+        sum(len(path.read_text().splitlines()) for path in (root / room).rglob("*.py"))
+        for root in (PRODUCT, PRODUCT.parent / "tests")
+    )
+    assert tests >= code
 
 
 def test_every_class_variable_says_its_type() -> None:

@@ -139,7 +139,8 @@ def test_what_is_at_work_counts_for_what_is_left_of_it():
 
 
 @pytest.mark.parametrize(
-    ("service_s", "taken_for"), [(0.1, 0.2), (0.79, 0.2), (0.81, 0.81), (0.051, 0.2), (0.049, 0.049)]
+    ("service_s", "taken_for"),
+    [(0.1, 0.2), (0.79, 0.2), (0.81, 0.81), (0.051, 0.2), (0.049, 0.049)],
 )
 def test_one_that_is_not_four_times_as_slow_or_quick_as_most_is_their_like(service_s, taken_for):
     assert known(service_s, service_s=service_s).expected_s(20.0, 0.2) == pytest.approx(taken_for)
@@ -168,7 +169,9 @@ def test_what_is_sent_within_the_last_round_trip_it_cannot_have_seen():
 
 
 @given(
-    st.lists(st.tuples(st.sampled_from([A, B, C]), st.integers(0, 3), st.integers(0, 5)), max_size=40)
+    st.lists(
+        st.tuples(st.sampled_from([A, B, C]), st.integers(0, 3), st.integers(0, 5)), max_size=40
+    )
 )
 def test_there_is_never_less_than_nothing_and_no_wait_without_somebody_ahead(steps):
     found, now = ReplicaLoad(), 0.0
@@ -275,7 +278,7 @@ def test_no_latency_is_too_short_or_too_long_to_be_counted():
         found.add(took_s, 0.0)
     assert found.samples == 3
     assert found.quantile_s(0.3) == pytest.approx(1e-4, rel=0.11)
-    assert 86400 < found.quantile_s(0.99)
+    assert found.quantile_s(0.99) > 86400
 
 
 def test_a_clock_that_stands_or_goes_back_makes_no_sample_heavier():
