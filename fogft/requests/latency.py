@@ -25,7 +25,6 @@ class Latencies:
         self._weights: dict[int, float] = {}  # by bucket, of those that have had a sample
         self._weight = 1.0  # of the next sample: grows, instead of all others shrinking
         self._total = 0.0
-        self._sum = 0.0
         self._newest: float | None = None
         self.samples = 0
 
@@ -40,39 +39,32 @@ class Latencies:
         bucket = _bucket(took_s)
         self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight
         self._total += self._weight
-        self._sum += self._weight * took_s
         self.samples += 1
 
     def _rescale(self) -> None:
         scale = 1.0 / self._weight
         self._weights = {bucket: weight * scale for bucket, weight in self._weights.items()}
         self._total *= scale
-        self._sum *= scale
         self._weight = 1.0
 
     def quantile_s(self, share: float) -> float | None:
         """Return the time within which this share of answers came; None before the first."""
-        return self._scan(share)[0] if self.samples else None
+        above = (1.0 - share) * self._total
+        for bucket in sorted(self._weights, reverse=True):  # interesting ones are high
+            weight = self._weights[bucket]
+            if weight > above:  # as if its samples lay evenly in the bucket
+                return _FIRST_S * math.pow(_GROWTH, bucket - above / weight)
+            above -= weight
+        return _FIRST_S if self.samples else None
 
     def mean_below_s(self, share: float) -> float | None:
         """Return the mean of this share of answers, the fastest; None before the first."""
-        return self._scan(share)[1] if self.samples else None
-
-    def _scan(self, share: float) -> tuple[float, float]:
-        """Return a quantile and the mean below it. From the top: interesting ones are high."""
-        above = (1.0 - share) * self._total
-        sum_below, quantile_s = self._sum, _FIRST_S
-        for bucket in sorted(self._weights, reverse=True):
-            weight = self._weights[bucket]
-            upper_s = _FIRST_S * _GROWTH**bucket
-            if weight > above:
-                inside = above / weight  # as if its samples lay evenly in the bucket
-                quantile_s = upper_s * _GROWTH**-inside
-                sum_below -= above * upper_s
-                break
-            above -= weight
-            sum_below -= weight * upper_s * _MIDDLE
-        return quantile_s, max(_FIRST_S, sum_below / (share * self._total))
+        left, sum_below = share * self._total, 0.0
+        for bucket in sorted(self._weights):
+            weight = min(self._weights[bucket], left)
+            sum_below += weight * _FIRST_S * _GROWTH**bucket * _MIDDLE
+            left -= weight
+        return max(_FIRST_S, sum_below / (share * self._total)) if self.samples else None
 
 
 def _bucket(took_s: float) -> int:
