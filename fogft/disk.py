@@ -235,7 +235,7 @@ def is_locked(path: Path) -> bool:
         return False
     lock = Lock(path)
     try:
-        if not lock.take(fcntl.LOCK_EX | fcntl.LOCK_NB):
+        if not lock.take(fcntl.LOCK_SH | fcntl.LOCK_NB):
             return True
     except FileNotFoundError:  # its folder has just gone
         return False
@@ -267,7 +267,8 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
     wanted = f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
     for line in lines:
         fields = line.split()
-        if len(fields) >= 6 and fields[1] == "FLOCK" and fields[5] == wanted:
+        # READ is one that only looks whether it is locked.
+        if len(fields) >= 6 and fields[1:4:2] == ["FLOCK", "WRITE"] and fields[5] == wanted:
             pid = int(fields[4])
             return pid if pid > 0 else None
     try:

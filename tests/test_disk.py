@@ -160,6 +160,25 @@ def test_a_glance_at_a_lock_refuses_nobody(tmp_path):
         watcher.join()
 
 
+def test_who_only_glances_is_not_taken_for_a_holder(tmp_path):
+    """Holders are ended: by `fogft down`, and by a manager that replaces an older version's."""
+    path = tmp_path / "lock"
+    path.touch()
+    glances: list[bool] = []
+
+    def glance() -> None:
+        glances.extend(disk.is_locked(path) for _ in range(500))
+
+    watchers = [threading.Thread(target=glance) for _ in range(3)]
+    for watcher in watchers:
+        watcher.start()
+    seen = set[int | None]()
+    while any(watcher.is_alive() for watcher in watchers):
+        seen.add(disk.holder(path, said=False))
+    assert seen <= {None}
+    assert not any(glances)
+
+
 def test_nothing_is_locked_where_there_is_no_file(tmp_path):
     assert not disk.is_locked(tmp_path / "none")
     assert list(tmp_path.iterdir()) == []
