@@ -25,8 +25,9 @@ from typing import Any
 from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.machine import cpu_s, family
 from tests.bench.nodes.service import FLAG
-from tests.bench.rig import Rig, free_ports
+from tests.bench.rig import Rig
 from tests.estimates import percentile
+from tests.ports import free_ports
 
 REPLICAS = 3
 MEDIAN_S, TIMEOUT_S = 0.02, 2.0

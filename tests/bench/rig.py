@@ -12,7 +12,6 @@ import json
 import os
 import secrets
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -33,20 +32,12 @@ from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
 from tests.bench.nodes.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
 from tests.hostile.orders import HOSTILE
+from tests.ports import free_ports
 from tests.records import certificate_names
 
 ROOT = Path(__file__).resolve().parents[2]
 _READY_LIMIT_S = 60.0
 _LIBC = ctypes.CDLL(None)
-
-
-def free_ports(count: int) -> list[int]:
-    """Return TCP ports on loopback that are free now."""
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for listening in sockets:
-            listening.bind(("127.0.0.1", 0))
-        return [listening.getsockname()[1] for listening in sockets]
 
 
 def free_domains(count: int) -> list[int]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import socket
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,6 +19,7 @@ from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
 from fogft.ros import environment
 from tests.needs import needs
+from tests.ports import free_port
 from tests.proxy.by_hand import UID, Caller, Parts, Replica, Robot, wait_for
 from tests.records import certificate_names
 
@@ -31,9 +31,7 @@ SERVICES = "[{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 45.0, advertis
 
 
 def free_endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{free.getsockname()[1]}"
+    return f"127.0.0.1:{free_port()}"
 
 
 class Pool(Parts):

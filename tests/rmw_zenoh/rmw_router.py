@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from fogft.rmw_zenoh.node import OVERRIDE
+from tests.ports import free_port
 
 _PROGRAM = """
 import sys, zenoh
@@ -59,9 +59,7 @@ class Router:
 @contextlib.contextmanager
 def running() -> Iterator[Router]:
     """A router that runs, on a port that was free."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        router = Router(f"tcp/127.0.0.1:{free.getsockname()[1]}")
+    router = Router(f"tcp/127.0.0.1:{free_port()}")
     router.start()
     yield router
     router.kill()

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import socket
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +11,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from fogft.ros import environment
+from tests.ports import free_ports
 from tests.proxy.by_hand import Caller, Parts, Replica, Robot, wait_for
 from tests.ros.nodes.person import Person
 
@@ -25,14 +24,6 @@ def parts(tmp_path: Path, ros_domains: Callable[[], int]) -> Iterator[Parts]:
     made = Parts(tmp_path, ros_domains)
     yield made
     made.close()
-
-
-def free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for free in sockets:
-            free.bind(("127.0.0.1", 0))
-        return [free.getsockname()[1] for free in sockets]
 
 
 def metrics(port: int) -> str:
