@@ -11,12 +11,12 @@ import stat
 import subprocess
 import sys
 import threading
-import time
 
 import pytest
 
 from fogft import disk
 from fogft.errors import StateError
+from tests.fakes.waiting import wait_for
 from tests.needs import needs
 
 
@@ -93,9 +93,9 @@ def test_a_lock_is_exclusive_until_it_is_given_back(tmp_path):
 
 def test_a_lock_ends_with_its_process_whatever_ends_it(tmp_path):
     program = (
-        "import sys, time, pathlib; from fogft import disk\n"
+        "import sys, signal, pathlib; from fogft import disk\n"
         "disk_lock = disk.Lock(pathlib.Path(sys.argv[1])); disk_lock.acquire(wait=True)\n"
-        "print('held', flush=True); time.sleep(60)\n"
+        "print('held', flush=True); signal.pause()\n"
     )
     path = tmp_path / "lock"
     with subprocess.Popen(
@@ -129,8 +129,7 @@ def test_who_waits_for_a_lock_gets_it_when_its_killed_holder_has_ended_completel
     path, ended = tmp_path / "lock", tmp_path / "ended"
     holder = subprocess.Popen([sys.executable, "-c", dying, str(path), str(ended)])
     try:
-        while not disk.is_locked(path):
-            time.sleep(0.01)
+        wait_for(lambda: disk.is_locked(path))
         assert disk.Lock(path).acquire(wait=True)
         assert ended.exists()
     finally:

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import gc
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from fogft.process import Hanging, begin_start, end_start, load_numpy
+from tests.fakes.waiting import paced, wait_for
 from tests.needs import needs
 
 LIMIT_S = 10.0
@@ -29,11 +30,10 @@ class Looks:
 
     def found_after(self, pid: int | None, limit: int = 20, step_s: float = 1.0) -> int | None:
         """Return how many looks it took to see it hang; None where it was never seen."""
-        for count in range(limit):
+        for count in itertools.islice(paced(0.03), limit):
             if self.hanging.look(pid):
                 return count
             self.now += step_s
-            time.sleep(0.03)
         return None
 
 
@@ -79,10 +79,7 @@ def test_one_that_comes_round_does_not_hang_and_a_stopped_one_does(start):
     os.kill(pid, signal.SIGSTOP)
     assert looks.found_after(pid) is not None
     os.kill(pid, signal.SIGCONT)
-    end = time.monotonic() + 60
-    while looks.hanging.look(pid):  # until it has had a turn
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    wait_for(lambda: not looks.hanging.look(pid), 60.0, "a turn of its")
     assert looks.found_after(pid, limit=5) is None
 
 

@@ -18,7 +18,6 @@ import itertools
 import signal
 import sys
 import threading
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -33,6 +32,7 @@ from fogft.proxy import middleware
 from fogft.ros import memory_tuning
 from tests.bench.floor import configuration
 from tests.bench.nodes.service import FLAG, MAP
+from tests.fakes.waiting import wait_for
 
 KEYS = {FLAG: "bare/flag", MAP: "bare/map"}
 _ANSWERS = "bare/answers"
@@ -80,8 +80,8 @@ def ask(folder: Path, domain: int, ports: Sequence[int]) -> None:
         key: [one.declare_publisher(key, congestion_control=_BLOCK) for one in sessions]
         for key in KEYS.values()
     }
-    while not all(one.matching_status.matching for many in publishers.values() for one in many):
-        time.sleep(0.01)
+    every = [one for many in publishers.values() for one in many]
+    wait_for(lambda: all(one.matching_status.matching for one in every), 60.0)
     for session in sessions:
         session.get(
             _ANSWERS,

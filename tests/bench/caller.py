@@ -14,6 +14,7 @@ from typing import Any
 from fogft.model.choices import Speaks
 from fogft.proxy import middleware
 from tests.bench.nodes.service import FLAG, MAP
+from tests.fakes.waiting import wait_for
 
 LARGE_BYTES = 640 * 480 * 3
 CALL_LIMIT_S = 10.0
@@ -78,11 +79,10 @@ class Caller:
 
     def wait(self) -> None:
         """Wait until discovery has found the services."""
-        limit = time.monotonic() + _DISCOVERY_LIMIT_S
-        while not all(client.available() for client in self._clients.values()):
-            if time.monotonic() > limit:
-                raise TimeoutError("the services did not appear")
-            time.sleep(0.02)
+        there = self._clients.values()
+        wait_for(
+            lambda: all(client.available() for client in there), _DISCOVERY_LIMIT_S, "the services"
+        )
 
     def ask(self, service: str, payload: bytes, answered: Callable[[], None]) -> None:
         """Send a request, and wait for nothing."""

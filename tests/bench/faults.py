@@ -14,6 +14,7 @@ from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.nodes.service import FLAG, MAP
 from tests.bench.rig import Replica, Rig
 from tests.estimates import estimate, estimate_of_rounds, longest_gap, median, percentile
+from tests.fakes.waiting import paced
 
 SLEEP_S = 0.02
 _PAUSE_S = 0.01
@@ -64,10 +65,8 @@ def stalls(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
 
 def _block(caller: Caller, payload: bytes, seconds: float) -> list[float]:
     took = []
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
+    for _ in paced(_PAUSE_S, seconds=seconds):
         took.append(caller.call(MAP[0], payload))
-        time.sleep(_PAUSE_S)
     return took
 
 

@@ -24,6 +24,7 @@ from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.nodes.service import FLAG
 from tests.bench.rig import Rig, free_domains
 from tests.estimates import estimate_of_rounds, median
+from tests.fakes.waiting import wait_for
 
 SERVICES, TYPE = ("/bench_one", "/bench_two"), "std_srvs/srv/SetBool"
 _LIMIT_S, _OPEN = 10.0, 20
@@ -96,8 +97,7 @@ def _timed(client: Any) -> Callable[[], float]:
     from std_srvs.srv import SetBool
 
     request = bytes(serialize_message(SetBool.Request()))
-    while not client.available():
-        time.sleep(0.01)
+    wait_for(client.available, 60.0)
 
     def call() -> float:
         answered = threading.Event()
@@ -187,8 +187,7 @@ def _call(role: str, domain: int) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=executor.spin, daemon=True).start()
-    while not all(client.service_is_ready() for client in clients):
-        time.sleep(0.002)
+    wait_for(lambda: all(client.service_is_ready() for client in clients), 60.0, pause_s=0.002)
     ready = time.monotonic()
     if role == "die":
         clients[0].call_async(SetBool.Request())

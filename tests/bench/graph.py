@@ -20,6 +20,7 @@ from tests.bench.floor import Floor
 from tests.bench.nodes.service import ACTION_SERVICES, FLAG, TOPICS
 from tests.bench.rig import ROOT, Rig
 from tests.estimates import estimate_of_rounds, median, overhead_ratio, percentile
+from tests.fakes.waiting import wait_for
 
 _WARM_UP = 30
 _LARGE = 640 * 480 * 3
@@ -75,13 +76,14 @@ class Graph:
 
     def wait(self) -> None:
         """Wait until discovery has found everything."""
-        limit = time.monotonic() + _READY_S
-        while not self._publisher.subscribers() or not all(
-            client.available() for client in self._clients.values()
-        ):
-            if time.monotonic() > limit:
-                raise TimeoutError("the topics and the action did not appear")
-            time.sleep(0.02)
+        wait_for(
+            lambda: (
+                self._publisher.subscribers()
+                and all(client.available() for client in self._clients.values())
+            ),
+            _READY_S,
+            "the topics and the action",
+        )
 
     def close(self) -> None:
         """Leave ROS."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from tests.bench.caller import Caller, milliseconds, payloads
 from tests.bench.nodes.service import FLAG
 from tests.bench.rig import Rig
 from tests.estimates import percentile
+from tests.fakes.waiting import paced
 
 SLEEP_S = 0.02
 LIES = ("junk 11", "crashed", "swallowed", "boasting")
@@ -51,10 +53,9 @@ def hostile(folder: Path, *, quick: bool, lie: str) -> list[dict[str, Any]]:
 def _calls(caller: Caller, count: int) -> list[float]:
     """Return how long each call took that was answered."""
     took = []
-    for _ in range(count):
+    for _ in itertools.islice(paced(_PAUSE_S), count):
         with contextlib.suppress(TimeoutError):
             took.append(caller.call(FLAG[0], payloads()[FLAG[0]]))
-        time.sleep(_PAUSE_S)
     return took
 
 

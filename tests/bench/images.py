@@ -21,6 +21,7 @@ from fogft.model.topic import Origin, TopicSpec
 from tests.bench import machine
 from tests.bench.rig import Rig
 from tests.estimates import median, percentile
+from tests.fakes.waiting import wait_for
 
 IMAGE = "sensor_msgs/msg/Image"
 NAME = "/bench_image"
@@ -92,8 +93,7 @@ def _say(node: Any) -> None:
     from sensor_msgs.msg import Image
 
     publisher = node.create_publisher(Image, NAME, 10)
-    while not publisher.get_subscription_count():
-        time.sleep(0.01)
+    wait_for(publisher.get_subscription_count, 60.0)
     size = _WIDTH * _HEIGHT * _CHANNELS
     message = Image(width=_WIDTH, height=_HEIGHT, encoding="rgb8", step=_WIDTH * _CHANNELS)
     message.data = os.urandom(size)

@@ -31,6 +31,7 @@ from fogft.pool.credentials import authority
 from fogft.ros import shared_memory
 from fogft.ros.environment import child_environment
 from tests.bench.nodes.service import ACTION_SERVICES, FLAG, GRAPH, MAP, SPEAKS, STATEFUL, TOPICS
+from tests.fakes.waiting import wait_for
 from tests.hostile.orders import HOSTILE
 from tests.ports import free_ports
 from tests.records import certificate_names
@@ -194,14 +195,15 @@ class Rig:
         self._wait(ready, f"replicas {list(slots)} to be ready")
 
     def _wait(self, condition: Callable[[], bool], what: str) -> None:
-        limit = time.monotonic() + _READY_LIMIT_S
-        while not condition():
-            dead = [p.args for p in self._processes if p.poll() is not None]
-            if dead or time.monotonic() > limit:
-                raise RuntimeError(
-                    f"waited in vain for {what}; ended: {dead}; logs: {self._folder}\n{self._log()}"
-                )
-            time.sleep(0.05)
+        def dead() -> list[Any]:
+            return [p.args for p in self._processes if p.poll() is not None]
+
+        def told() -> str:
+            return f"; ended: {dead()}; logs: {self._folder}\n{self._log()}"
+
+        wait_for(lambda: condition() or dead(), _READY_LIMIT_S, what, told=told, pause_s=0.05)
+        if not condition():
+            raise RuntimeError(f"waited in vain for {what}{told()}")
 
     def _log(self) -> str:
         lines = []

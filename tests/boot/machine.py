@@ -13,12 +13,12 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from fogft.child import tied
+from tests.fakes.waiting import wait_for
 
 ROOT = Path(__file__).parents[2]
 SYSTEMD = Path("/usr/lib/systemd/systemd")
@@ -125,11 +125,7 @@ def _removed(cgroup: Path) -> bool:
 
 def wait(condition: Callable[[], Any], told: Callable[[], object], limit_s: float = 120) -> Any:
     """Wait until a condition holds; return what it gave."""
-    end = time.monotonic() + limit_s
-    while not (value := condition()):
-        assert time.monotonic() < end, f"waited {limit_s} s: {told()}"
-        time.sleep(0.2)
-    return value
+    return wait_for(condition, limit_s, told=told, pause_s=0.2)
 
 
 def _cgroups() -> Path | None:

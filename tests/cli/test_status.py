@@ -13,7 +13,6 @@ import subprocess
 import sys
 import termios
 import threading
-import time
 from dataclasses import fields, replace
 
 import pytest
@@ -173,16 +172,18 @@ def test_a_check_asks_each_link_anew(home, capsys, monkeypatch):
     assert "not answering" in capsys.readouterr().out
 
     def proxy() -> None:
-        for _ in range(20):
+        while not checked.wait(0.05):
             report(paths, age_s=-0.3)
-            time.sleep(0.05)
 
     monkeypatch.setattr(status, "CHECK_LIMIT_S", 5.0)
-    thread = threading.Thread(target=proxy)
+    checked, thread = threading.Event(), threading.Thread(target=proxy)
     with alive(paths):
         thread.start()
-        assert main.run(["status", "--check"]) == 0
-        thread.join()
+        try:
+            assert main.run(["status", "--check"]) == 0
+        finally:
+            checked.set()
+            thread.join()
     assert "planner  answering" in capsys.readouterr().out
 
 

@@ -14,7 +14,8 @@ from fogft.cloud.local.chaos import Chaos
 from fogft.cloud.local.cloud import LocalCloud
 from fogft.cloud.port import Launch
 from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
-from tests.cloud.waiting import STAND_IN, wait_for
+from tests.cloud.waiting import STAND_IN
+from tests.fakes.waiting import wait_for
 
 REGIONS = """
 boot_s: 0.01

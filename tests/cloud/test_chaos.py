@@ -14,7 +14,7 @@ import pytest
 from fogft.cloud.local import faults, processes
 from fogft.errors import CloudError, NoCapacity
 from fogft.model.replica import MachinePhase, ReplicaId
-from tests.cloud.waiting import wait_for
+from tests.fakes.waiting import wait_for
 
 CHECKOUT = Path(__file__).parents[2]
 

@@ -18,7 +18,7 @@ import pytest
 from fogft.cloud.local import folder as folders
 from fogft.cloud.local import processes
 from fogft.model.replica import MachinePhase, ReplicaId
-from tests.cloud.waiting import wait_for
+from tests.fakes.waiting import wait_for
 
 CHECKOUT = Path(__file__).parents[2]
 
@@ -250,8 +250,8 @@ def test_the_list_does_not_wait_for_a_launcher_that_hangs(local):
     holder = subprocess.Popen(
         [
             *(sys.executable, "-c"),
-            "import sys, time; from pathlib import Path; from fogft.cloud.local import ending\n"
-            "with ending.cloud_lock(Path(sys.argv[1])): print('held', flush=True); time.sleep(600)",
+            "import signal, sys; from pathlib import Path; from fogft.cloud.local import ending\n"
+            "with ending.cloud_lock(Path(sys.argv[1])): print('held', flush=True); signal.pause()",
             str(local.root),
         ],
         cwd=CHECKOUT,

@@ -17,7 +17,7 @@ from fogft.cloud.local import folder as folders
 from fogft.errors import CloudError, NoCapacity
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, ReplicaId
-from tests.cloud.waiting import wait_for
+from tests.fakes.waiting import wait_for
 
 HELLO = b"\x16\x03hello"  # as TLS begins, or it is not passed on
 

@@ -11,7 +11,7 @@ import pytest
 
 from fogft.cloud.local import processes
 from fogft.errors import CloudUnreachable
-from tests.cloud.waiting import wait_for
+from tests.fakes.waiting import wait_for
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ import pytest
 
 from fogft.cloud.local.faults import LinkFaults
 from fogft.cloud.local.relay import Relay
-from tests.cloud.waiting import wait_for
+from tests.fakes.waiting import wait_for
 
 SOME = 20 * 1024 * 1024
 

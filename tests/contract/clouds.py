@@ -20,8 +20,9 @@ from fogft.cloud.port import Cloud, Launch
 from fogft.cloud.sky.naming import cluster_name
 from fogft.errors import CloudUnreachable
 from fogft.model.replica import Placement, ReplicaId
-from tests.cloud.waiting import STAND_IN, wait_for
+from tests.cloud.waiting import STAND_IN
 from tests.fakes.cloud import MockCloud, zones
+from tests.fakes.waiting import wait_for
 from tests.sky.scene import Scene as SkyScene
 
 # Not the same in every run: on the local cloud the uid marks real processes of this computer.

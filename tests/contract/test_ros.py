@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +13,7 @@ import pytest
 from fogft.errors import RosError
 from fogft.ros import environment
 from tests.fakes.ros import MemoryDomain
+from tests.fakes.waiting import wait_for
 from tests.rmw_zenoh.rmw_router import Router
 
 SET_BOOL = "std_srvs/srv/SetBool"
@@ -26,7 +26,8 @@ class World:
     """A domain under test: how nodes are made in it, and how time passes in it."""
 
     new_node: Callable[[], Any]
-    pump: Callable[[], Any]
+    pump: Callable[[], Any] = lambda: None  # where time passes by itself
+    pause_s: float = 0.005
     loads_types: bool = True
     nodes: list[Any] = field(default_factory=list)
 
@@ -35,11 +36,11 @@ class World:
         return self.nodes[-1]
 
     def wait_for(self, condition: Callable[[], Any], what: str) -> None:
-        deadline = time.monotonic() + LIMIT_S
-        while not condition():
-            if time.monotonic() > deadline:
-                pytest.fail(f"waited in vain: {what}")
+        def holds() -> Any:
             self.pump()
+            return condition()
+
+        wait_for(holds, LIMIT_S, what, pause_s=self.pause_s)
 
     def pair(self, respond: Callable[[bytes], bytes | None], name: str = "/flag") -> Any:
         """Serve on one node and return a client on another that has found it."""
@@ -59,14 +60,14 @@ class World:
 
 def _memory() -> World:
     domain = MemoryDomain(types=[SET_BOOL])
-    return World(domain.node, domain.pump)
+    return World(domain.node, domain.pump, 0.0)
 
 
 def _rclpy(domain: int) -> World:
     environment.prepare(os.environ)
     from fogft.ros.node import SerialisedNode
 
-    return World(lambda: SerialisedNode("contract", domain), lambda: time.sleep(0.005))
+    return World(lambda: SerialisedNode("contract", domain))
 
 
 def _zenoh(router: Router) -> World:
@@ -77,7 +78,6 @@ def _zenoh(router: Router) -> World:
         lambda: RmwZenohNode(
             "contract", 7, hashes_of=lambda t: hashes.get(t, []), environ=router.environ
         ),
-        lambda: time.sleep(0.005),
         loads_types=False,
     )
 

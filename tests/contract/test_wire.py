@@ -20,6 +20,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId, doubted_after_s
 from fogft.model.type_definition import Definition
 from tests.fakes.link import MemoryWire
+from tests.fakes.waiting import wait_for
 from tests.link.wire_pool import (
     LIMIT_S,
     POOL_UID,
@@ -87,10 +88,7 @@ class ZenohWorld:
         return dialer
 
     def wait_for(self, condition: Callable[[], object]) -> None:
-        end = time.monotonic() + LIMIT_S
-        while not condition():
-            assert time.monotonic() < end, "the awaited condition never came"
-            time.sleep(0.002)
+        wait_for(condition, LIMIT_S)
 
     def settle(self) -> None:
         """Give what must not happen a moment in which it could."""

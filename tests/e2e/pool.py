@@ -20,6 +20,7 @@ from fogft.disk import holder
 from fogft.pool.commands import status as seen
 from fogft.pool.folder.paths import PoolPaths
 from fogft.ros import shared_memory
+from tests.fakes.waiting import wait_for
 from tests.link import forked
 
 NODES = Path(__file__).parent / "nodes"
@@ -119,13 +120,7 @@ class Pool:
 
     def wait(self, condition: Callable[[], Any], limit_s: float = 90) -> Any:
         """Wait until a condition holds; return what it gave."""
-        end = time.monotonic() + limit_s
-        while True:
-            value = condition()
-            if value:
-                return value
-            assert time.monotonic() < end, f"waited {limit_s} s; status: {self.status()}"
-            time.sleep(0.2)
+        return wait_for(condition, limit_s, told=self.status, pause_s=0.2)
 
     def up(self, *words: str) -> None:
         """Start or change the pool and wait until it is whole."""

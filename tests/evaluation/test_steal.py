@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.evaluation.steal import steal
+from tests.fakes.waiting import wait_for
 
 
 @pytest.fixture
@@ -33,8 +34,7 @@ def test_what_is_stolen_is_not_used(busy):
     """A stopped process uses nothing: it gets at most what was left of the time."""
     before, began = used_s(busy.pid), time.perf_counter()
     with steal([busy.pid], 20.0) as stolen:
-        while stolen.stops < 20:
-            time.sleep(0.01)
+        wait_for(lambda: stolen.stops >= 20, 60.0)
     left_s = time.perf_counter() - began - stolen.seconds
     assert stolen.seconds > 0
     # A stop takes effect when the process next enters the kernel: a tick each, at most.
@@ -45,10 +45,7 @@ def test_it_runs_on_afterwards(busy):
     with steal([busy.pid], 5.0):
         pass
     before = used_s(busy.pid)
-    limit = time.monotonic() + 60
-    while used_s(busy.pid) == before:
-        assert time.monotonic() < limit
-        time.sleep(0.01)
+    wait_for(lambda: used_s(busy.pid) != before, 60.0)
     assert state(busy.pid) != "T"
 
 

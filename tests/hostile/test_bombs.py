@@ -17,6 +17,7 @@ from fogft.link import frame
 from fogft.link.compression import unpack
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.model.credentials import CredentialPaths
+from tests.fakes.waiting import paced, wait_for
 from tests.hostile.robot import greets, session_at, target
 from tests.link.wire_pool import (
     SERVICE,
@@ -25,7 +26,6 @@ from tests.link.wire_pool import (
     ReplicaProcess,
     keys,
     request_id,
-    wait_for,
 )
 from tests.nightly import by_day
 
@@ -54,14 +54,12 @@ def hostile_replica(files: CredentialPaths, slot: int) -> Iterator[str]:
 def round_trip_s(link: ZenohLink, owner: Owner, first: int, count: int = 200) -> float:
     """Return the median of so many calls, one after another; each is answered rightly."""
     took_s = []
-    for number in range(first, first + count):
+    for number, _ in zip(range(first, first + count), paced(0.005), strict=False):
         began = time.perf_counter()
         assert link.offer(SERVICE, request_id(number), b"x%d" % number, 20.0)
-        while not (answers := owner.of(number)):
-            time.sleep(0.0002)
+        answers = wait_for(lambda n=number: owner.of(n), pause_s=0.0002)
         took_s.append(time.perf_counter() - began)
         assert [one.payload for one in answers] == [b"x%d" % number]
-        time.sleep(0.005)
     return statistics.median(took_s)
 
 
@@ -101,10 +99,11 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
     def round_trips_s(first: int, before: Callable[[], None] = lambda: None) -> float:
         """Return the median of some calls, with a pause after each."""
         took_s = []
-        for number in range(first, first + by_day(10, at_night=50)):
+        for number, _ in zip(
+            range(first, first + by_day(10, at_night=50)), paced(0.05), strict=False
+        ):
             before()
             took_s.append(round_trip_s(good, owner, number, 1))
-            time.sleep(0.05)
         return statistics.median(took_s)
 
     def unpack_elsewhere() -> None:

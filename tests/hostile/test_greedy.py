@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import threading
-import time
 from collections.abc import Callable
 
 import zenoh
@@ -16,6 +15,7 @@ from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths
 from fogft.records.signing import Signer
+from tests.fakes.waiting import paced
 from tests.hostile.robot import PROBE, Target, greeting, greets, session_at, target
 from tests.link.wire_pool import SERVICE, Authority, Owner, ReplicaProcess, request_id, wait_for
 from tests.nightly import by_day
@@ -90,11 +90,8 @@ def test_a_robot_that_does_nothing_but_greet_holds_up_no_other(
     with session_at(at, eve) as session:
         greets(session, eve, at)
         threading.Thread(target=flood, args=(session, at, eve, done), daemon=True).start()
-        end, sent = time.monotonic() + by_day(3.0, at_night=60.0), 0
-        while time.monotonic() < end:
+        for sent in paced(0.02, seconds=by_day(3.0, at_night=60.0)):
             assert good.offer(SERVICE, request_id(sent), b"x", 30.0)
-            sent += 1
-            time.sleep(0.02)
         late = dial(replica.endpoint, robot="late", owner=Owner())
         wait_for(lambda: late.usable)
         done.set()

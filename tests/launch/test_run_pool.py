@@ -20,11 +20,11 @@ with open(os.environ["TRACE"], "a") as trace:
     trace.write(" ".join(sys.argv[1:]) + "\\n")
 if sys.argv[1] == "up":
     if os.environ["FAKE_UP"] == "slow":
-        time.sleep(60)
+        signal.pause()
     sys.exit(int(os.environ["FAKE_UP"]))
 if sys.argv[1] == "logs":
     print("0.1 a line", flush=True)
-    time.sleep(60)
+    signal.pause()
 """
 
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from pathlib import Path
+
+from tests.fakes.waiting import wait_for
 
 
 def freeze(pid: int) -> None:
     """Stop a process, and return once all its threads have: on another processor, they go on."""
     os.kill(pid, signal.SIGSTOP)
-    while not all(_stopped(task) for task in Path(f"/proc/{pid}/task").iterdir()):
-        time.sleep(0.0005)
+    wait_for(lambda: all(_stopped(task) for task in Path(f"/proc/{pid}/task").iterdir()))
 
 
 def _stopped(task: Path) -> bool:

@@ -6,8 +6,7 @@ import json
 import resource
 import signal
 import threading
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -21,6 +20,7 @@ from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.authority import Role
+from tests.fakes.waiting import wait_for
 from tests.link import forked
 from tests.link.freezing import freeze
 from tests.records import certificate_names
@@ -28,14 +28,6 @@ from tests.records import certificate_names
 POOL_UID = "0123456789abcdef"
 SERVICE, TYPE = "/echo", "plain_msgs/srv/Echo"  # not installed: its bytes are anything
 LIMIT_S = 30.0  # generous: a test that passes never waits for it
-
-
-def wait_for(condition: Callable[[], object], limit_s: float = LIMIT_S) -> None:
-    """Wait until a condition holds; fail where it never does."""
-    end = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < end, "the awaited condition never came"
-        time.sleep(0.005)
 
 
 class Authority:

@@ -17,6 +17,7 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, PoolStore, write_identity
 from fogft.pool.manager import shutdown
 from fogft.poolfile import file as pool_file
+from tests.fakes.waiting import wait_for
 from tests.link import forked
 from tests.pool.folder_cloud import FolderCloud
 
@@ -91,13 +92,9 @@ class Scene:
 
     def wait(self, condition: Callable[[], Any], limit_s: float = 30.0) -> Any:
         """Wait until a condition holds; return what it gave."""
-        end = time.monotonic() + limit_s
-        while True:
-            value = condition()
-            if value:
-                return value
-            assert time.monotonic() < end, (self.status(), self.output())
-            time.sleep(0.02)
+        return wait_for(
+            condition, limit_s, told=lambda: (self.status(), self.output()), pause_s=0.02
+        )
 
     def whole(self, count: int) -> bool:
         """Whether the manager sees so many ready replicas and no others."""

@@ -24,6 +24,7 @@ from typing import Any
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.records.record import RecordKind
 from fogft.records.roster import admission_content
+from tests.fakes.waiting import paced
 from tests.link.namespaces import Namespaces, inside
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import POOL_UID, Authority, wait_for
@@ -159,11 +160,11 @@ def _slots(robot: Robot) -> set[int]:
 
 def _load_until(robot: Robot, condition: Callable[[], object]) -> None:
     """Ask all the time until a condition holds; each answer is checked at the end."""
-    end = time.monotonic() + LIMIT_S + 600
-    while not condition():
-        assert time.monotonic() < end, "what was awaited under load never came"
+    for _ in paced(0.02, seconds=LIMIT_S + 600):
+        if condition():
+            return
         robot.ask(2)
-        time.sleep(0.02)
+    raise AssertionError("what was awaited under load never came")
 
 
 def main() -> None:

@@ -15,6 +15,7 @@ from fogft.model import membership
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.topology import Topology
 from fogft.pool.credentials import authority
+from tests.fakes import waiting
 from tests.link import forked
 from tests.ports import free_port
 from tests.records import certificate_names
@@ -30,11 +31,7 @@ SERVICES = "[{name: /plan, type: nav_msgs/srv/GetPlan, timeout_s: 45.0}]"
 
 def wait_for(condition: Callable[[], Any], what: str, limit_s: float = LIMIT_S) -> Any:
     """Return what a condition gave once it holds."""
-    end = time.monotonic() + limit_s
-    while not (found := condition()):
-        assert time.monotonic() < end, f"waited {limit_s:.0f} s in vain: {what}"
-        time.sleep(0.02)
-    return found
+    return waiting.wait_for(condition, limit_s, what)
 
 
 class Parts:

@@ -23,6 +23,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.model.type_definition import REQUEST, RESPONSE
 from fogft.rmw_zenoh.naming import CLIENT, NO_HASH, SERVER, Token, request_attachment, service_key
 from fogft.rmw_zenoh.node import RmwZenohNode, settings_from
+from tests.fakes import waiting
 from tests.needs import needs
 from tests.rmw_zenoh.rmw_router import Router
 
@@ -35,11 +36,7 @@ LIMIT_S = 60.0
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    end = time.monotonic() + LIMIT_S
-    while not (found := condition()):
-        assert time.monotonic() < end, f"waited in vain: {what}"
-        time.sleep(0.01)
-    return found
+    return waiting.wait_for(condition, LIMIT_S, what)
 
 
 @pytest.fixture

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from fogft.ros import environment
+from tests.fakes import waiting
 
 environment.prepare(os.environ)
 
@@ -22,11 +22,7 @@ def wait_for(
     condition: Callable[[], Any], what: str = "condition", limit_s: float = LIMIT_S
 ) -> None:
     """Return when a condition holds; fail when it does not for too long."""
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        if time.monotonic() > deadline:
-            pytest.fail(f"waited {limit_s:.0f} s in vain: {what}")
-        time.sleep(0.005)
+    waiting.wait_for(condition, limit_s, what)
 
 
 def expect_line(process: subprocess.Popen[str], line: str) -> None:

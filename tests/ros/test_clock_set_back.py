@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.fakes.waiting import wait_for
 from tests.needs import needs
 from tests.soak.clocks import Clocks
 
@@ -30,6 +31,7 @@ PROFILE = f"""<?xml version="1.0" encoding="UTF-8" ?>
 STANDBY = """
 import sys, time
 from fogft.ros.joining import EarlyJoin
+from tests.fakes.waiting import wait_for
 early = EarlyJoin("_standby", int(sys.argv[1]))
 print("joined", flush=True)
 while True:
@@ -62,10 +64,7 @@ def test_a_standby_whose_clock_is_set_back_stays_known(
     try:
         assert standby.stdout is not None
         assert standby.stdout.readline() == "joined\n"
-        end = time.monotonic() + 20
-        while "_standby" not in node.get_node_names():
-            assert time.monotonic() < end, "never seen"
-            time.sleep(0.05)
+        wait_for(lambda: "_standby" in node.get_node_names(), 20.0, pause_s=0.05)
         time.sleep(1.5)  # each announcement is by a timer now
         clocks.set([standby.pid], -3600)
         looks = []

@@ -12,7 +12,7 @@ from fogft.ros.reservations import (
     reserve_domain,
     reserve_port,
 )
-from tests.cloud.waiting import wait_for
+from tests.fakes.waiting import wait_for
 
 CHECKOUT = Path(__file__).parents[2]
 EVERY = set(DOMAINS)

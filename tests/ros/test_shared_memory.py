@@ -237,13 +237,13 @@ def test_sweeping_does_not_load_ros() -> None:
 
 
 NODE = """
-import sys, time
+import signal, sys
 from fogft.ros.node import SerialisedNode
 node = SerialisedNode("left", int(sys.argv[1]))
 server = node.serve("/left", "std_srvs/srv/SetBool", lambda _, h: server.respond(h, ANSWER))
 ANSWER = bytes([0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 0])
 print("up", flush=True)
-time.sleep(600)
+signal.pause()
 """
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 from fogft import template_files
 from fogft.cloud.sky import settings
 from fogft.cloud.sky.following import LAUNCH_LIMIT_S
 from fogft.model.names import SETUP_LIMIT_S
+from tests.fakes.waiting import wait_for
 
 LIMIT_S = 60.0
 
@@ -46,10 +46,7 @@ def minutes(folder: Path) -> int:
 
 
 def until_minutes(folder: Path, count: int) -> None:
-    end = time.monotonic() + LIMIT_S
-    while minutes(folder) < count:
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    wait_for(lambda: minutes(folder) >= count, LIMIT_S)
 
 
 def test_a_machine_without_a_replica_shuts_down_at_its_limit(tmp_path: Path):

@@ -13,7 +13,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import Any
 
 import pytest
 
+from tests.fakes import waiting
 from tests.needs import needs
 from tests.ports import free_port
 
@@ -30,11 +30,7 @@ pytestmark = [needs("skypilot", "moto", "skypilot-port"), pytest.mark.timeout(90
 
 
 def wait_for(condition: Callable[[], Any], what: str) -> Any:
-    end = time.monotonic() + WITHIN_S
-    while not (found := condition()):
-        assert time.monotonic() < end, f"waited in vain for {what}"
-        time.sleep(0.2)
-    return found
+    return waiting.wait_for(condition, WITHIN_S, what, pause_s=0.2)
 
 
 class World:

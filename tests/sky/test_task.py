@@ -23,8 +23,8 @@ from fogft.cloud.sky import naming, task
 from fogft.errors import SpecError
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.replica import Placement
-from tests.cloud.waiting import wait_for
 from tests.fakes.sky import EAST, WEST, replica
+from tests.fakes.waiting import wait_for
 from tests.needs import needs
 
 LIMIT_S = 240.0  # of a script that hangs: a machine that is busy with other tests takes long

@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from fogft.disk import holder as lock_holder
@@ -28,6 +29,7 @@ from fogft.pool.folder.paths import PoolPaths
 from tests.conftest import lock_domain
 from tests.e2e.pool import Client, Pool
 from tests.estimates import p99
+from tests.fakes.waiting import wait_for
 from tests.proxy import breaking
 from tests.soak.clocks import Clocks
 from tests.soak.schedule import LONGEST_S, Fault, faults
@@ -133,13 +135,8 @@ class World:
         return any(at is not None and when > asked for when, at, _ in ends)
 
     def wait(self, condition: Callable[[], object], what: str) -> object:
-        end = time.monotonic() + LIMIT_S
-        while not (found := condition()):
-            if time.monotonic() > end:
-                told = self.pool.fogft("status", ok=False)
-                raise AssertionError(f"not {what} within {LIMIT_S:.0f} s: {told}")
-            time.sleep(0.05)
-        return found
+        told = partial(self.pool.fogft, "status", ok=False)
+        return wait_for(condition, LIMIT_S, what, told=told, pause_s=0.05)
 
     def set_clock(self, ahead_s: int) -> None:
         """Set the clock of the robot, of which the local cloud's machines are a part."""

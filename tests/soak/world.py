@@ -17,13 +17,13 @@ import json
 import os
 import signal
 import subprocess
-import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from fogft.child import tied
 from fogft.model.replica import Member, ReplicaId
+from tests.fakes.waiting import wait_for
 from tests.link.namespaces import Namespaces, inside
 from tests.link.thin_relay import ThinRelay
 from tests.link.wire_pool import POOL_UID
@@ -164,12 +164,14 @@ class World(GatewayPool):
 
     def wait_whole(self, report_of: Callable[[str], Mapping[str, Any]]) -> None:
         """Wait until both robots are whole, by what a function returns of each."""
-        end = time.monotonic() + LIMIT_S
         for name in self.robots:
-            while not self.whole(name, report := report_of(name)):
-                if time.monotonic() > end:
-                    raise AssertionError(f"{name} is not whole again: {json.dumps(report)}")
-                time.sleep(0.02)
+            wait_for(
+                lambda name=name: self.whole(name, report_of(name)),
+                LIMIT_S,
+                f"{name} whole again",
+                told=lambda name=name: json.dumps(report_of(name)),
+                pause_s=0.02,
+            )
 
     def ran_twice(self) -> list[str]:
         """Return the requests that one server proxy ran more than once."""

@@ -220,12 +220,11 @@ def _watch(
     ended: threading.Event,
 ) -> None:
     """Note when the service stopped and what became visible when; a look each 5 ms."""
-    while not ended.is_set():
+    while not ended.wait(0.005 if "fault" in moments else 0.002):
         now = time.perf_counter()
         if "fault" not in moments:
             if _stopped(pid):
                 moments["fault"] = now
-            time.sleep(0.002)
             continue
         replicas = pools.status(POOL).get("replicas", ())
         old = [r for r in replicas if (r["slot"], r["generation"]) == (slot, before)]
@@ -239,7 +238,6 @@ def _watch(
             moments.setdefault("noticed", now)
             moments.setdefault("whole", now)
             ended.set()
-        time.sleep(0.005)
 
 
 def _stopped(pid: int) -> bool:

@@ -6,9 +6,9 @@ Argument: JSON, see `RobotProcess`.
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 
@@ -74,7 +74,7 @@ def main() -> None:
     for number in range(given["requests"]):
         link.offer(SERVICE, request_id(number), given["payload"].encode(), 600.0)
     print("offered", flush=True)
-    time.sleep(600)
+    signal.pause()
 
 
 if __name__ == "__main__":

@@ -102,8 +102,8 @@ def test_the_client_proxy_of_a_pool_whose_identity_was_lost_tells_nothing_of_the
     """It would go on with the replicas that it has, and the new pool be called ready for them."""
     first = scene.write()
     paths = scene.paths
-    held = "import sys,time; from fogft import disk; disk.Lock(disk.Path(sys.argv[1])).acquire("
-    program = held + "wait=False); print(flush=True); time.sleep(300)"
+    held = "import signal,sys; from fogft import disk; disk.Lock(disk.Path(sys.argv[1])).acquire("
+    program = held + "wait=False); print(flush=True); signal.pause()"
     with subprocess.Popen(
         [sys.executable, "-c", program, str(paths.proxy_lock)], stdout=subprocess.PIPE
     ) as old:

@@ -54,15 +54,19 @@ def beats(scene: Scene) -> int | None:
     return scene.paths.lease.stat().st_mtime_ns if disk.read_json(scene.paths.lease) else None
 
 
+def lives_through_rounds(scene: Scene, manager: subprocess.Popen[bytes]) -> None:
+    time.sleep(ROUNDS_S)
+    assert manager.poll() is None, scene.output()
+    assert scene.running() == ["0.1"]
+
+
 def test_a_full_disk_ends_nothing_and_is_waited_out(small: Scene) -> None:
     """The replica serves on, the manager says what is wrong, and scales when there is room."""
     small.write(replicas=1)
     manager = small.start_manager()
     small.wait(lambda: small.whole(1))
     filler = fill(small.home)
-    time.sleep(ROUNDS_S)
-    assert manager.poll() is None, small.output()
-    assert small.running() == ["0.1"]
+    lives_through_rounds(small, manager)
 
     def says_so() -> bool:
         seen = status.read(small.paths, time.time())
@@ -83,9 +87,7 @@ def test_a_disk_that_is_read_only_for_a_while_is_waited_out(small: Scene) -> Non
     done = subprocess.run(remount, capture_output=True, text=True, check=False)
     if done.returncode:  # files that are open for writing keep it from becoming so
         subprocess.run(["mount", "-o", "remount,size=1k", str(small.home)], check=False)
-    time.sleep(ROUNDS_S)
-    assert manager.poll() is None, small.output()
-    assert small.running() == ["0.1"]
+    lives_through_rounds(small, manager)
     subprocess.run(["mount", "-o", "remount,rw,size=3m", str(small.home)], check=True)
     before = beats(small)
     small.wait(lambda: beats(small) != before)

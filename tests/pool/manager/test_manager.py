@@ -225,7 +225,7 @@ def test_start_manager_starts_one_only_where_there_is_none(scene: Scene) -> None
 
 
 SLOW_TO_TELL = """\
-import os, pathlib, sys, time
+import os, pathlib, signal, sys, time
 from fogft import disk
 lock, status = map(pathlib.Path, sys.argv[1:3])
 held = disk.Lock(lock)
@@ -233,7 +233,7 @@ if not held.acquire(wait=False):
     sys.exit()
 time.sleep(float(sys.argv[4]))
 disk.write_json(status, {"manager_version": sys.argv[3], "manager_pid": os.getpid()})
-time.sleep(100)
+signal.pause()
 """
 
 

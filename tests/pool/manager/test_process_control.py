@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,6 +18,7 @@ from fogft.model.reason import Cause
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
 from fogft.pool.manager.proxy_supervisor import BACKOFF_LIMIT_S, STEADY_S, ProxySupervisor
+from tests.fakes.waiting import paced
 from tests.needs import needs
 
 HOLD = """
@@ -31,7 +32,8 @@ assert lock.acquire(wait=False)
 if "lingering" in sys.argv:
     signal.signal(signal.SIGTERM, lambda number, frame: lock.release())
 print("held", flush=True)
-time.sleep(60)
+while True:
+    signal.pause()
 """
 
 
@@ -225,10 +227,9 @@ def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
         works.stdout.readline()
         for number in (signal.SIGCONT, signal.SIGSTOP):
             os.kill(works.pid, number)
-            for _ in range(15):
+            for _ in itertools.islice(paced(0.05), 15):
                 proxy.supervisor.look()
                 proxy.now += 1.0
-                time.sleep(0.05)
             assert works.poll() == (-signal.SIGKILL if number == signal.SIGSTOP else None)
     finally:
         works.kill()

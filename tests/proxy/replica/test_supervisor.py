@@ -6,20 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
 from fogft.proxy.replica.supervisor import Supervisor
 from tests.fakes.proxy import Clock
-
-
-def wait_until(condition, limit_s: float = 20.0) -> None:
-    end = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.01)
+from tests.fakes.waiting import wait_for
 
 
 def alive(pid: int) -> bool:
@@ -47,7 +40,7 @@ def test_the_command_runs_in_its_folder_with_its_environment(supervise, tmp_path
     monkeypatch.setenv("FOGFT_TEST", "42")
     supervisor = supervise("pwd > where; echo $FOGFT_TEST > what; exec sleep 60")
     supervisor.poll()
-    wait_until(lambda: (tmp_path / "what").exists() and (tmp_path / "what").read_text())
+    wait_for(lambda: (tmp_path / "what").exists() and (tmp_path / "what").read_text())
     assert (tmp_path / "where").read_text().strip() == str(tmp_path)
     assert (tmp_path / "what").read_text().strip() == "42"
 
@@ -56,10 +49,10 @@ def test_a_dead_command_is_told_once_and_started_again_after_its_backoff(supervi
     clock = Clock()
     supervisor = supervise("exit 3", clock=clock)
     supervisor.poll()
-    wait_until(lambda: supervisor.poll())
+    wait_for(lambda: supervisor.poll())
     assert supervisor.last_exit == "exited with status 3"
     assert supervisor.restarts == 1  # at once
-    wait_until(lambda: supervisor.poll())
+    wait_for(lambda: supervisor.poll())
     assert not supervisor.alive
     assert not supervisor.poll()
     assert supervisor.restarts == 1
@@ -74,7 +67,7 @@ def test_a_command_that_dies_over_requests_is_started_again_at_once_each_time(su
     supervisor = supervise("exit 3", clock=clock)
     supervisor.poll()
     for _ in range(4):
-        wait_until(lambda: supervisor.poll(at_work=True))
+        wait_for(lambda: supervisor.poll(at_work=True))
     assert supervisor.restarts == 4
 
 
@@ -85,7 +78,7 @@ def test_the_wait_doubles_and_is_bounded(supervise):
     waits = []
     for _ in range(5):
         supervisor.poll()
-        wait_until(lambda: supervisor.poll())
+        wait_for(lambda: supervisor.poll())
         waits.append(max(0.0, supervisor.start_at - clock.now))
         clock.now = supervisor.start_at
     assert waits == [0.0, 1.0, 2.0, 4.0, 4.0]
@@ -94,7 +87,7 @@ def test_the_wait_doubles_and_is_bounded(supervise):
 def test_a_signal_is_named(supervise):
     supervisor = supervise("kill -SEGV $$")
     supervisor.poll()
-    wait_until(lambda: supervisor.poll())
+    wait_for(lambda: supervisor.poll())
     assert supervisor.last_exit == "was killed by SIGSEGV"
 
 
@@ -102,10 +95,10 @@ def test_stop_ends_what_ignores_signals_and_what_it_started(supervise, tmp_path)
     supervisor = supervise("trap '' INT TERM; sleep 61 & echo $! > child; wait; wait; sleep 62")
     supervisor.poll()
     child_file = tmp_path / "child"
-    wait_until(lambda: child_file.exists() and child_file.read_text().strip())
+    wait_for(lambda: child_file.exists() and child_file.read_text().strip())
     child = int(child_file.read_text())
     supervisor.stop(0.2)
-    wait_until(lambda: not alive(child))
+    wait_for(lambda: not alive(child))
     assert not supervisor.alive
 
 
@@ -118,10 +111,10 @@ def test_a_command_that_cannot_be_started_is_tried_again(supervise, tmp_path):
 def test_the_command_dies_with_a_supervisor_that_is_killed(tmp_path):
     """Whatever ends the server proxy, the user's command does not outlive it."""
     program = (
-        "import os, sys, time, pathlib\n"
+        "import os, signal, sys, pathlib\n"
         "from fogft.proxy.replica.supervisor import Supervisor\n"
         "s = Supervisor('echo $$; exec sleep 63', pathlib.Path(sys.argv[1]), os.environ)\n"
-        "s.poll(); time.sleep(60)\n"
+        "s.poll(); signal.pause()\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True
@@ -130,4 +123,4 @@ def test_the_command_dies_with_a_supervisor_that_is_killed(tmp_path):
         child = int(parent.stdout.readline())
         assert alive(child)
         parent.send_signal(signal.SIGKILL)
-    wait_until(lambda: not alive(child))
+    wait_for(lambda: not alive(child))

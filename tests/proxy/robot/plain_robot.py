@@ -24,6 +24,7 @@ from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.process import make_dialer, try_step
+from tests.fakes.waiting import wait_for
 
 
 class Callers:
@@ -62,9 +63,7 @@ class Callers:
         pass
 
     def ask(self, count: int, size: int, service: str) -> None:
-        deadline = time.monotonic() + 60  # it is offered once a replica is ready
-        while service not in self._ask and time.monotonic() < deadline:
-            time.sleep(0.01)
+        wait_for(lambda: service in self._ask, 60.0, "a replica to be ready: then it is offered")
         for _ in range(count):
             self.asked += 1
             number, self._next = self._next, self._next + 1

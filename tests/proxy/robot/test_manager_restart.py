@@ -68,7 +68,7 @@ def test_one_that_lives_or_a_pool_that_is_being_ended_is_let_be(scene, held):
 def test_one_that_has_not_begun_ends_with_its_proxy(scene):
     """Its proxy is ended when the pool is: then nobody would end a manager that comes later."""
     told = disk.read_json(scene.paths.manager_start)
-    told |= {"command": [sys.executable, "-c", "import time; time.sleep(60)"]}
+    told |= {"command": [sys.executable, "-c", "import signal; signal.pause()"]}
     disk.write_json(scene.paths.manager_start, told)
     assert scene.looks(2)
     with disk.locked(scene.paths.manager_lock):

@@ -34,7 +34,7 @@ def test_what_was_written_survives_sigkill(tmp_path):
         "from fogft.proxy.robot.order_mark import OrderMark\n"
         f"mark = OrderMark(Path(sys.argv[1]), '{UID}')\nepoch = mark.new_term(5)\n"
         "for i in range(1000): mark.write(Position(epoch, i))\n"
-        "print(epoch, flush=True)\nimport time; time.sleep(60)\n"
+        "print(epoch, flush=True)\nimport signal; signal.pause()\n"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", program, str(tmp_path / "m")], stdout=subprocess.PIPE, text=True

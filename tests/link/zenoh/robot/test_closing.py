@@ -34,11 +34,16 @@ def usable(dial: Dials, replica: ReplicaProcess, **options: Any) -> ZenohLink:
     return link
 
 
+def a_moment(number: int, most_s: float = 0.02) -> None:
+    """Let a moment pass, another one for each number."""
+    time.sleep(random.Random(number).random() * most_s)
+
+
 def sends_large(link: ZenohLink, number: int) -> None:
     """Return when it has begun, and a moment after."""
     assert link.offer(SERVICE, request_id(number), bytes(LARGE_BYTES), 600.0)
     wait_for(lambda: link.sending)
-    time.sleep(random.Random(number).random() * 0.02)
+    a_moment(number)
 
 
 def answered(owner: Owner, link: ZenohLink, number: int) -> None:
@@ -73,7 +78,7 @@ def test_by_the_robot_while_it_is_answered(
         link = usable(dial, replica)
         asked = f"noise:{LARGE_BYTES}".encode()
         assert link.offer(SERVICE, request_id(2 * number), asked, 600.0)
-        time.sleep(random.Random(number).random() * 0.05)
+        a_moment(number, 0.05)
         link.close()
         answered(owner, other, 2 * number + 1)
 
@@ -105,6 +110,6 @@ def test_by_a_robot_that_is_killed_while_it_is_answered(
         before = replica.count("replies")
         robot = RobotProcess(authority, replica, **asks)
         wait_for(lambda n=before: replica.count("replies") > n)
-        time.sleep(random.Random(number).random() * 0.02)
+        a_moment(number)
         robot.kill()
         answered(owner, link, number)
