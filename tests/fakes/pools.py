@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -105,7 +106,7 @@ def report(paths: PoolPaths, status: PoolStatus = STATUS, *, age_s: float = 0.2)
         for one in status.replicas if one.link
     ]  # fmt: skip
     written = {
-        "pid": 4712, "written_at": time.time() - age_s, "links": links,
+        "pid": os.getpid(), "written_at": time.time() - age_s, "links": links,
         "services": {service.name: service.counters for service in status.services},
         "uplink_suspected": status.uplink_suspected,
         "robot": status.topology.get("robot", ""),
