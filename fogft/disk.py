@@ -202,12 +202,14 @@ def _wait_for_end(descriptor: int) -> None:
 
     The kernel frees one lock after the other, and this one may come before those of DDS.
     """
-    with contextlib.suppress(OSError, ValueError):
+    # Some Pythons lack `pidfd_open`.
+    with contextlib.suppress(OSError, ValueError, AttributeError), contextlib.ExitStack() as stack:
         pid = int(os.pread(descriptor, _PID_BYTES, 0))
         if not any(map(int, Path(f"/proc/{pid}/statm").read_bytes().split())):  # no memory left
-            ended = os.pidfd_open(pid)
-            select.select([ended], [], [], _ENDING_S)
-            os.close(ended)
+            process, ended = os.pidfd_open(pid), select.poll()
+            stack.callback(os.close, process)
+            ended.register(process, select.POLLIN)
+            ended.poll(_ENDING_S * 1000)
 
 
 def standby_lock(path: Path) -> Path:
@@ -271,11 +273,14 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
         if len(fields) >= 6 and fields[1:4:2] == ["FLOCK", "WRITE"] and fields[5] == wanted:
             pid = int(fields[4])
             return pid if pid > 0 else None
-    try:
-        pid = int(lock.read_text()) if said else 0
-    except (OSError, ValueError):
-        return None
-    return pid if pid > 0 and is_locked(lock) else None
+    return said_holder(lock) if said and is_locked(lock) else None
+
+
+def said_holder(lock: Path) -> int | None:
+    """Return the process that wrote last that it holds a lock; None if none has."""
+    with contextlib.suppress(OSError, ValueError):
+        return max(0, int(lock.read_text())) or None
+    return None
 
 
 def unwritable(folder: Path) -> str:

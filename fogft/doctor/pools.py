@@ -18,6 +18,7 @@ from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
+from fogft.pool.manager.proxy_report import STALE_S
 
 _EXPIRY_WARNING = timedelta(days=3)
 _UP = "`fogft up FILE`"
@@ -73,8 +74,8 @@ def pool_file(situation: Situation) -> Iterator[Finding]:
         if problem:
             yield fail(
                 "pool file",
-                f"service `{service.name}`: {problem}",
-                "install the package of that type, or source its workspace",
+                f"service `{service.name}`: {problem.message}",
+                problem.hint or "install the package of that type, or source its workspace",
             )
         else:
             yield ok("pool file", f"service `{service.name}` of type `{service.type}`")
@@ -198,6 +199,13 @@ def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
         return
     if not seen.links_known:
         age_s, pid = seen.report_age_s, status.proxy_pid
+        if age_s is not None and age_s < STALE_S:
+            yield fail(
+                "links",
+                f"pool `{pool}`: its client proxy ended {age_s:.0f} s ago; the next one starts",
+                "run `fogft doctor` again in a second",
+            )
+            return
         said = "has written no readable report" if pid is None else f"last did {age_s:.0f} s ago"
         yield fail(
             "links",

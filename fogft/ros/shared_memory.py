@@ -174,7 +174,7 @@ class PortWatch:
         while self._id >= 0 and not self._closed:
             removed = set(map(int, _PORT_EVENT.findall(os.read(self._watch, _EVENTS_BYTES))))
             domains = {spdp.domain_of(port) for port in removed}
-            stale = min(domains, default=0) < 0 and time.monotonic() - looked_at > _STALE_S
+            stale = bool(removed) and time.monotonic() - looked_at > _STALE_S
             if removed & ports or self._domain_id in domains or stale:
                 looked_at, (ports, _) = time.monotonic(), reopen_ports()
             time.sleep(_REST_S)

@@ -326,6 +326,18 @@ def test_a_doctor_says_of_answers_what_status_says(tmp_path):
         assert of_check("answers", tmp_path).verdict is Verdict.WARN
 
 
+def test_a_client_proxy_that_was_killed_is_not_said_to_hang(tmp_path):
+    paths = lay_down(tmp_path, STATUS)
+    with alive(paths):
+        report(paths, STATUS)
+        written = disk.read_json(paths.proxy_status)
+        disk.write_json(paths.proxy_status, {**written, "pid": 1 << 30})
+        found = of_check("links", tmp_path)
+    assert found.verdict is Verdict.FAIL
+    assert "ended" in found.text
+    assert "kill" not in found.advice
+
+
 def test_a_full_disk_is_found_and_no_process_is_blamed_for_it(tmp_path, monkeypatch):
     paths = lay_down(tmp_path, STATUS)
     with alive(paths):

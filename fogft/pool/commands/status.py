@@ -12,6 +12,7 @@ import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from enum import Enum
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any
 
@@ -74,19 +75,18 @@ def current(
     manager_alive: bool,
     proxy_alive: bool,
     now: float,
-    proxy_pid: int | None = None,
+    succeeded: bool = False,
     heard_since: float | None = None,
 ) -> Seen:
     """Return the status now.
 
     Args:
-        proxy_pid: Of the client proxy that runs; None for unknown. Another's report counts as old.
+        succeeded: The proxy that wrote the report has ended, and another one runs.
         heard_since: Only a link whose replica has answered a probe since then counts as up;
             None for what the report says.
     """
-    fresh = report if proxy_alive and report is not None and report.fresh(now) else None
-    if fresh is not None and proxy_pid not in (None, fresh.pid):
-        fresh = None
+    is_fresh = report is not None and report.fresh(now) and proxy_alive and not succeeded
+    fresh = report if is_fresh else None
     links = fresh.links if fresh is not None else None
     if fresh is not None and heard_since is not None:
         links = tuple(_heard(k, fresh.written_at, heard_since) for k in fresh.links)
@@ -118,15 +118,25 @@ def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> S
     """Return the status of a pool now; `heard_since` as in `current`."""
     raw = disk.read_json(paths.status)
     seen = _unobserved(paths) if raw is None else status.from_json(raw, paths.status)
+    report = proxy_report.read(paths.proxy_status, seen.uid)
     return current(
         seen,
-        proxy_report.read(paths.proxy_status, seen.uid),
+        report,
         manager_alive=disk.is_locked(paths.manager_lock),
         proxy_alive=disk.is_locked(paths.proxy_lock),
-        proxy_pid=disk.holder(paths.proxy_lock),
+        succeeded=report is not None and _has_successor(report.pid, paths.proxy_lock),
         now=now,
         heard_since=heard_since,
     )
+
+
+def _has_successor(pid: int, lock: Path) -> bool:
+    """Whether a process has ended, and another one says that it has its lock.
+
+    One that hands over lives on for a while. In a container it has another number there.
+    """
+    said = disk.said_holder(lock)
+    return said not in (None, pid) and not Path("/proc", str(pid)).exists()
 
 
 def checked(paths: PoolPaths, limit_s: float) -> Seen:

@@ -88,7 +88,7 @@ def _opened(pid: int) -> Iterator[int | None]:
     """Yield what stays this process, even if its number is given to another; None if unknown."""
     try:
         descriptor = os.pidfd_open(pid)
-    except OSError:  # it has gone, or the kernel is older than 5.3
+    except (OSError, AttributeError):  # it has gone, or the kernel or Python cannot
         yield None
         return
     try:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import time
 from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft import disk
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
-from fogft.pool.commands.status import STALE_AFTER_S, Seen, current
+from fogft.pool.commands.status import STALE_AFTER_S, Seen, current, read
 from fogft.pool.manager.proxy_report import STALE_S, ProxyReport
-from tests.fakes.pools import REPLICA, STATUS, UID
+from tests.fakes.pools import REPLICA, STATUS, UID, alive, lay_down, report
 
 NOW = 1_000_000.0
 PLAN, DETECT = "/plan", "/detect"
@@ -78,11 +81,33 @@ def test_of_a_client_proxy_that_hangs_nothing_is_claimed(status, links, age_s):
 @given(statuses, made_links)
 def test_the_last_report_of_a_proxy_that_was_killed_says_nothing_of_the_next(status, links):
     report = ProxyReport(1, NOW - 0.5, links=links)
-    alive = {"manager_alive": True, "proxy_alive": True, "now": NOW}
-    found = current(status, report, proxy_pid=2, **alive)
+    found = current(status, report, manager_alive=True, proxy_alive=True, succeeded=True, now=NOW)
     assert (found.answers, found.unanswered, found.links_known) == (None, (), False)
     assert found.status.ready == 0
-    assert current(status, report, proxy_pid=1, **alive).links_known
+
+
+ENDED = 1 << 30  # no process has this number
+
+
+@pytest.mark.parametrize(
+    ("said", "pid", "known"),
+    [
+        (os.getpid(), os.getpid(), True),
+        (os.getpid(), os.getppid(), True),  # which hands over, and serves on for a while
+        (os.getpid(), ENDED, False),
+        (ENDED, ENDED, True),  # of a container, which counts processes by itself
+        ("", ENDED, True),  # it had no room to say anything
+    ],
+    ids=["its own", "handing over", "ended", "in a container", "no room"],
+)
+def test_whose_report_is_believed(tmp_path, said, pid, known):
+    paths = lay_down(tmp_path)
+    with alive(paths):
+        report(paths)
+        written = disk.read_json(paths.proxy_status)
+        disk.write_json(paths.proxy_status, {**written, "pid": pid})
+        paths.proxy_lock.write_text(str(said))
+        assert read(paths, time.time()).links_known is known
 
 
 @given(statuses, made_links)

@@ -280,10 +280,13 @@ class ZenohListener:
         if self._reaper is not None:
             self._reaper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)
+        self._count_handshakes()
         sockets.refuse(self._port)  # else those aborted are back before the session is closed
         sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
         self._work_queue.close()
         threads.close_aside(session, "fogft-close-listener").join(_CLOSE_WAIT_S / 2)
+        if self._handshakes:  # Zenoh took our refusal for some
+            self._handshakes.refusals()
 
 
 def _with_port(listen: str) -> str:

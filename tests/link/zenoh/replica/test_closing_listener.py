@@ -32,3 +32,22 @@ def test_takes_nobody_in_again(authority: Authority, monkeypatch: pytest.MonkeyP
     socket.create_connection((host, int(port))).close()
     listener.close()
     assert refused == [int(port)]
+
+
+def test_does_not_count_its_own_refusal(authority: Authority, monkeypatch) -> None:
+    """Zenoh tells of a port that takes nobody any more as of a handshake that failed."""
+    said = ["a stranger's"]
+
+    class Handshakes:
+        def refusals(self) -> list[str]:
+            told = said.copy()
+            said.clear()
+            return told
+
+    listener = ZenohListener(
+        "127.0.0.1:0", authority.replica(), ReplicaId(POOL_UID, 0, 1), handshakes=Handshakes()
+    )
+    monkeypatch.setattr(sockets, "refuse", lambda port: said.append("our own"))
+    listener.serve(keys(0), lambda incoming: None, lambda probe: None)
+    listener.close()
+    assert (said, listener.counters()["handshakes_refused"]) == ([], 1)
