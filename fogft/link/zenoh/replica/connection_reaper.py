@@ -93,14 +93,15 @@ class ConnectionReaper:
         self._thread.join(1.0)
 
     def _run(self) -> None:
+        self._await_look()
         while not self._stop.is_set():
-            self._await_look()
             try:
                 self.look(time.monotonic())
                 self._also()
             except Exception:
                 log.exception("doorkeeper_failed port=%d", self._port)
                 self._filter.drop(frozenset())
+            self._await_look()
         self._filter.close()
         self._release_reserve()
 
