@@ -205,11 +205,18 @@ def _wait_for_end(descriptor: int) -> None:
     # Some Pythons lack `pidfd_open`.
     with contextlib.suppress(OSError, ValueError, AttributeError), contextlib.ExitStack() as stack:
         pid = int(os.pread(descriptor, _PID_BYTES, 0))
-        if not any(map(int, Path(f"/proc/{pid}/statm").read_bytes().split())):  # no memory left
+        if not is_running(pid):
             process, ended = os.pidfd_open(pid), select.poll()
             stack.callback(os.close, process)
             ended.register(process, select.POLLIN)
             ended.poll(_ENDING_S * 1000)
+
+
+def is_running(pid: int) -> bool:
+    """Whether a process has not begun to end: then it has no memory any more."""
+    with contextlib.suppress(OSError):
+        return any(map(int, Path(f"/proc/{pid}/statm").read_bytes().split()))
+    return False
 
 
 def standby_lock(path: Path) -> Path:

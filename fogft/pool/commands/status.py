@@ -131,12 +131,12 @@ def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> S
 
 
 def _has_successor(pid: int, lock: Path) -> bool:
-    """Whether a process has ended, and another one says that it has its lock.
+    """Whether a process has ended, be it a zombie, and another one says that it has its lock.
 
     One that hands over lives on for a while. In a container it has another number there.
     """
     said = disk.said_holder(lock)
-    return said not in (None, pid) and not Path("/proc", str(pid)).exists()
+    return said not in (None, pid) and not disk.is_running(pid)
 
 
 def checked(paths: PoolPaths, limit_s: float) -> Seen:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import time
 from dataclasses import replace
 
@@ -166,3 +167,14 @@ def test_all_died_and_nothing_is_said_to_run(report):
     assert (found.answers, found.status.ready, found.status.proxy_alive) == (False, 0, False)
     assert not any(one.known for one in found.status.replicas)
     assert found.to_json()["unanswered"] == [PLAN]
+
+
+def test_the_report_of_a_proxy_that_nobody_has_waited_for_is_not_believed(tmp_path):
+    """It was killed, and is a zombie: its parent was killed before it."""
+    paths = lay_down(tmp_path)
+    with alive(paths), subprocess.Popen(["true"]) as zombie:
+        os.waitid(os.P_PID, zombie.pid, os.WEXITED | os.WNOWAIT)
+        report(paths)
+        written = disk.read_json(paths.proxy_status)
+        disk.write_json(paths.proxy_status, {**written, "pid": zombie.pid})
+        assert not read(paths, time.time()).links_known
