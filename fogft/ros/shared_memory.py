@@ -47,10 +47,11 @@ _OPEN = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+)( \(deleted\))?")
 # a third of the other), how many messages it holds, how many wait; flags, the lowest "not broken".
 _PORT, _HEAD_BYTES = struct.Struct("=7I"), 1024
 _ASIDE = "_aside"  # behind the name of a port, in that of its mutex
+_SET_ASIDE = re.compile(rf"(?:{_ASIDE})*_mutex$")  # again, where a sweep was killed
 _SEGMENT = re.compile(r"fast(?:dds|rtps)_[0-9a-f]{16}")
 _OURS = re.compile(
     r"(?:sem\.)?(?P<group>fast(?:dds|rtps)_(?:port\d+|[0-9a-f]+)|fast_datasharing_[^/]+?"
-    rf"|lttng-ust-wait-[\w-]+?)(?:_el|_sl|(?:{_ASIDE})?_mutex)?"
+    rf"|lttng-ust-wait-[\w-]+?)(?:_el|_sl|(?:{_ASIDE})*_mutex)?"
 )
 
 
@@ -256,7 +257,7 @@ def _remove(unused: set[str]) -> list[str]:
                 going += names
         removed = [name for name in going if not name.startswith("sem.") and unlink_name(name)]
         mutexes = [name for name in going if name.startswith("sem.")]
-        new_names = {name: name.replace("_mutex", f"{_ASIDE}_mutex") for name in mutexes}
+        new_names = {name: _SET_ASIDE.sub(f"{_ASIDE}_mutex", name) for name in mutexes}
         used = _set_aside(new_names)
     finally:
         for group in held:  # where ours went aside, somebody may have made another by now

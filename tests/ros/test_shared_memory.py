@@ -179,6 +179,13 @@ def test_a_mutex_that_somebody_waits_for_meanwhile_stays(
     assert mutex.read_bytes() == b"left"
 
 
+@pytest.mark.parametrize("left", ["_aside", "_aside_aside"])
+def test_a_mutex_that_a_killed_sweep_left_goes(leave: Callable[[str], Path], left: str) -> None:
+    mutex = leave(f"sem.fastdds_port7411{left}_mutex")
+    assert shared_memory.sweep() == [mutex.name]
+    assert os.listdir(mutex.parent) == []
+
+
 def test_a_mutex_that_somebody_makes_meanwhile_is_not_posted(
     leave: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
