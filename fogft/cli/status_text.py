@@ -127,11 +127,15 @@ def notes(status: PoolStatus) -> list[Text]:
             found.append(
                 f"`{row.name}`: load exceeds the capacity of its replicas; {needed} would suffice"
             )
-        poison = row.counters.get("poison")
-        if poison:
-            at = time.strftime("%F %T", time.localtime(row.counters["poisoned_at"]))
-            requests = "a request" if poison == 1 else f"{poison} requests"
-            found.append(f"`{row.name}`: crashed by {requests}, not retried; most recently at {at}")
+        poisoned_at = row.counters.get("poisoned_at")
+        if poisoned_at is not None:
+            poison = row.counters.get("poison", 0)  # none of those that the fallback has answered
+            requests = {0: "requests", 1: "a request"}.get(poison, f"{poison} requests")
+            at = time.strftime("%F %T", time.localtime(poisoned_at))
+            found.append(
+                f"`{row.name}` ({row.type}): crashed by {requests}, not retried; "
+                f"most recently at {at}"
+            )
     for one in status.replicas:
         if one.strangers >= _STRANGERS_SHOWN:
             found.append(

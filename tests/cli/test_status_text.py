@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import pytest
@@ -95,6 +96,18 @@ def test_a_pool_that_is_too_small_says_how_many_replicas_would_do():
     status = replace(STATUS, notes=(), excluded=(), services=(service,))
     assert [line.plain for line in notes(status)] == [
         f"note: `{service.name}`: load exceeds the capacity of its replicas; 6 would suffice"
+    ]
+
+
+@pytest.mark.parametrize(("count", "by"), [(0, "requests"), (1, "a request"), (7, "7 requests")])
+def test_requests_that_crashed_a_service_are_told_with_its_type_and_when(count, by):
+    """Those, too, that its fallback has answered, and that count as that."""
+    at = time.mktime((2026, 11, 26, 17, 30, 5, 0, 0, -1))
+    service = ServiceStatus("/s", SETBOOL, 1, counters={"poison": count, "poisoned_at": at})
+    status = replace(STATUS, notes=(), excluded=(), services=(service,))
+    assert [line.plain for line in notes(status)] == [
+        f"note: `/s` ({SETBOOL}): crashed by {by}, not retried; "
+        "most recently at 2026-11-26 17:30:05"
     ]
 
 

@@ -16,6 +16,8 @@ from tests.fakes.pools import STATUS
 
 SERVICE = {
     **dict.fromkeys(OUTCOMES_COUNTED, 3),
+    "type": "a/srv/B",
+    "poisoned_at": 1.7e9,
     "pending": 1,
     "refused": {"crashed": 2},
     "won": {"0.1": 4, "0.2": 5, "1.1": 6},

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import random
+from collections import Counter
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -164,6 +167,22 @@ def test_idle_replicas_all_get_a_request_at_once_and_one_copy_is_no_spare():
     assert policy.first(B, (1, 2, 3), 31.0) == [2, 1, 3]
     assert [policy.is_spare(B, replica) for replica in (2, 1, 3)] == [False, True, True]
     assert set(policy.answered(B, {1: 31.0, 2: 31.0, 3: 31.0}, 2, None, 31.1)) == {1, 3}
+
+
+def test_among_equals_any_is_the_first_and_who_was_quick_once_gets_no_more():
+    policy, source = learned(r1=0.125, r2=0.125, r3=0.125), random.Random(1)
+    policy.first(A, (1,), 30.5)
+    policy.answered(A, {1: 30.5}, 1, idle(0.125, 2**-10), 30.5 + 2**-10)
+    firsts = Counter[int]()
+    for second in range(31, 331):
+        request = source.randbytes(16)
+        open = dict.fromkeys(policy.first(request, (1, 2, 3), second), float(second))
+        first, *others = open
+        firsts[first] += 1
+        policy.answered(request, open, first, idle(0.125), second + 0.125)
+        for other in others:
+            policy.late(request, other, second + 0.125, answered=True)
+    assert min(firsts[replica] for replica in (1, 2, 3)) > 60
 
 
 def test_while_replicas_are_busy_a_request_goes_to_one():

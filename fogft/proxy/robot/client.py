@@ -283,7 +283,11 @@ class ClientProxy:
         with self._lock:
             links, gateways = self._link_reports()
             services: Mapping[str, Any] = {
-                name: {**service.dispatcher.report(), "trouble": service.trouble}
+                name: {
+                    **service.dispatcher.report(),
+                    "type": service.spec.type,
+                    "trouble": service.trouble,
+                }
                 for name, service in self._services.items()
             }
         return {

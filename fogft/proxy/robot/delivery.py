@@ -17,6 +17,7 @@ from fogft.proxy.robot.ledger import Ledger
 from fogft.requests.decide import Pending
 from fogft.requests.fallback import FallbackTimer
 from fogft.requests.load import NEVER
+from fogft.requests.pending import POISON_DEATHS
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -174,7 +175,8 @@ class Delivery:
     def _without_fallback(self, request: bytes, pending: Pending) -> None:
         """The fallback had nothing either: return the rejection if there is one."""
         response = pending.rejection
-        outcome = Outcome.SILENT if response is None else Outcome.ANSWERED
+        unanswered = Outcome.POISON if pending.deaths >= POISON_DEATHS else Outcome.SILENT
+        outcome = unanswered if response is None else Outcome.ANSWERED
         self._end(request, pending, outcome, response)
 
     def _warn(self, counter: str, event: str, reason: str) -> None:

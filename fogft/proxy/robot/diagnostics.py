@@ -6,6 +6,7 @@ Owns: levels, sentences, and the values below them; when they are told. Not here
 
 import logging
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -118,9 +119,11 @@ class Diagnosis:
         else:
             level = Level.OK if ready == len(links) else Level.WARN
             message = f"{ready} of {len(links)} replicas can answer"
-        values: dict[str, Any] = {"ready replicas": ready}
+        values: dict[str, Any] = {"type": report.get("type"), "ready replicas": ready}
         values |= {key: report[key] for key in _COUNTS if key in report}
         values |= {key[:-1] + "ms": _ms(report.get(key)) for key in ("p50_s", "p99_s")}
+        if (poisoned_at := report.get("poisoned_at")) is not None:
+            values["last poison"] = time.strftime("%FT%TZ", time.gmtime(poisoned_at))
         values |= {f"won by {replica}": n for replica, n in report.get("won", {}).items()}
         values |= {f"refused: {reason}": n for reason, n in report.get("refused", {}).items()}
         return self._status(level, f"service {name}", message, values, self._robot)

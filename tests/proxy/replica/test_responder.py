@@ -80,6 +80,8 @@ def test_a_spare_copy_is_dropped_where_it_would_have_to_wait_and_that_is_told():
     scene.answer(0)
     spare = FakeIncoming(B, handling=Handling.DROP_IF_BUSY)
     scene.responder.request(spare)
+    dropped = scene.ask(C, handling=Handling.DROP_IF_BUSY)
+    assert (dropped.outcome, dropped.load) == (["refused busy"], Load(0, 1, 0, 0.5, 0.0))
     scene.answer(1)
     assert spare.outcome == [b"r"]
 
@@ -568,7 +570,8 @@ def test_a_request_that_would_wait_past_its_deadline_is_refused_at_once():
     for n in range(3):
         scene.ask(bytes([n]) * 16)
     assert scene.ask(b"h" * 16, remaining_s=1.5).outcome == []  # the earliest deadline is next
-    assert scene.ask(b"i" * 16, remaining_s=1.6).outcome == ["refused overloaded"]
+    late = scene.ask(b"i" * 16, remaining_s=1.6)
+    assert (late.outcome, late.load) == (["refused overloaded"], Load(3, 1, 1, 1.0, 0.0))
     assert scene.ask(b"j" * 16, remaining_s=9.0).outcome == []
 
 

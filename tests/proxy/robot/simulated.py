@@ -19,6 +19,9 @@ from fogft.requests.load import Handling, Load
 UID = "0123456789abcdef"
 TICK_S = 0.02
 TELL_S = 0.01  # until a replica is told what is not wanted any more
+KILLS = b"kills"  # a request that ends whatever process works on it, so long after it began:
+KILLS_AFTER_S = 0.005
+RESTART_S = 1.0  # until a service that has died answers again
 
 ServiceTime = Callable[[random.Random], float]
 
@@ -54,20 +57,33 @@ class SimulatedService:
         self.serial = serial
         self.source = random.Random(seed)
         self.draws: Draws | None = None  # in place of the source
+        self.pace: Callable[[float], float] = lambda now: 1.0  # how many times as long it takes
         self.free_at = 0.0
         self.hangs_until = 0.0
         self.ran = 0
+        self.lives = 0
+        self.dies: Callable[[], None] = lambda: None
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         self.ran += 1
         now = max(self.world.now, self.hangs_until)
         source = self.source if self.draws is None else self.draws(payload)
-        end = (max(now, self.free_at) if self.serial else now) + self.service_time(source)
-        self.free_at = end
-        self.world.at(end, lambda: self._end(payload, on_response))
+        begun, life = max(now, self.free_at) if self.serial else now, self.lives
+        self.free_at = end = begun + self.service_time(source) * self.pace(begun)
+        if payload == KILLS:
+            self.world.at(begun + KILLS_AFTER_S, lambda: self._die(life))
+        else:
+            self.world.at(end, lambda: self._end(payload, life, on_response))
         return self.ran
 
-    def _end(self, payload: bytes, on_response: Callable[[bytes], None]) -> None:
+    def _die(self, life: int) -> None:
+        if life == self.lives:
+            self.lives, self.free_at = life + 1, self.world.now + RESTART_S
+            self.dies()
+
+    def _end(self, payload: bytes, life: int, on_response: Callable[[bytes], None]) -> None:
+        if life != self.lives:
+            return
         if self.world.now < self.hangs_until:  # it hung while it was at this
             self.world.at(self.hangs_until, lambda: on_response(payload))
         else:
@@ -200,10 +216,22 @@ class SimulatedReplica:
     ) -> None:
         self.world = world
         self.service = SimulatedService(world, service_time, seed, serial=serial)
-        self.responder = Responder(lambda name: True, clock=lambda: world.now)
+        self.service.dies = self._service_died
+        self.responder = Responder(lambda name: self.ready, clock=lambda: world.now)
         self.responder.use({"/s": self.service})
         self.frozen = False
+        self.deaths: list[float] = []  # of its service
         self._tick()
+
+    @property
+    def ready(self) -> bool:
+        return not self.deaths or self.world.now >= self.deaths[-1] + RESTART_S
+
+    def _service_died(self) -> None:
+        self.deaths.append(self.world.now)
+        self.responder.crashed()
+        for after_s in (TELL_S, RESTART_S):
+            self.world.at(self.world.now + after_s, self.world.route)
 
     def _tick(self) -> None:
         if not self.frozen:
@@ -283,7 +311,7 @@ class World:
         return link
 
     def route(self) -> None:
-        able: list[Link] = [link for link in self.links if link.usable]
+        able: list[Link] = [link for link in self.links if link.usable and link.replica.ready]
         self.dispatcher.route(able)
 
     def change(self, hedging: HedgingMode) -> None:
@@ -310,6 +338,10 @@ class World:
         id = self.time.ids.randbytes(16)  # which the policy takes its chances by
         self.dispatcher.forward(id, b"%d" % number, number, self.timeout_s)
         return number
+
+    def kill(self) -> None:
+        """Send a request that kills; nobody waits for its answer."""
+        self.dispatcher.forward(self.time.ids.randbytes(16), KILLS, -1, self.timeout_s)
 
     def run(self, seconds: float) -> None:
         """Let time pass."""

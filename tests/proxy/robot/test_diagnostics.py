@@ -65,13 +65,19 @@ def test_what_is_down_is_an_error_and_the_pool_is_as_bad_as_its_services(told, w
 
 
 @pytest.mark.parametrize(
-    "state", [{"draining": True}, {"disagrees": True}, {"ready": []}, {"state": "connecting"}]
+    "state",
+    [
+        *({"draining": True}, {"disagrees": True}, {"ready": []}, {"state": "connecting"}),
+        {"hanging": ["/plan"], "detail": "`/plan` has requests and has answered none for 2 s"},
+    ],
 )
 def test_a_replica_that_is_not_all_right_is_a_warning(state):
-    assert levels(report(link(0), link(1, **state)))["replica 1.1"] is Level.WARN
+    said = look(Diagnosis("arm", "r"), report(link(0), link(1, **state)))["replica 1.1"]
+    assert said.level is Level.WARN
+    assert said.message == state.get("detail", said.message)
 
 
-@pytest.mark.parametrize("outcome", ["silent", "empty", "turned_away", "fallback"])
+@pytest.mark.parametrize("outcome", ["silent", "empty", "turned_away", "fallback", "poison"])
 def test_a_request_without_a_replicas_answer_is_a_warning_for_a_while(outcome):
     diagnosis = Diagnosis("arm", "r")
     assert look(diagnosis, report(link(0)))["service /plan"].level is Level.OK
@@ -90,6 +96,14 @@ def test_a_topic_is_as_good_as_the_replicas_that_pass_it():
     assert levels(told)["topic /map"] is Level.ERROR
     broken = {**told, "topics": {"/map": {"trouble": "no such type"}}}
     assert look(Diagnosis("arm", "r"), broken)["topic /map"].message == "no such type"
+
+
+def test_a_request_that_crashed_a_service_is_told_with_its_type_and_when():
+    values = look(Diagnosis("arm", "r"), report(link(0), type="a/srv/B"))["service /plan"].values
+    assert (values["type"], "last poison" in values) == ("a/srv/B", False)
+    killed = report(link(0), type="a/srv/B", poison=2, poisoned_at=1.7e9)
+    values = look(Diagnosis("arm", "r"), killed)["service /plan"].values
+    assert (values["poison"], values["last poison"]) == ("2", "2023-11-14T22:13:20Z")
 
 
 def test_what_was_before_the_first_look_is_no_news():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import pytest
@@ -134,7 +135,7 @@ def test_when_all_refuse_the_request_is_tried_again():
     assert scene.responses == [("caller", b"late but good")]
 
 
-def test_a_request_over_which_two_services_died_is_sent_nowhere_any_more():
+def test_a_request_over_which_two_services_died_is_sent_nowhere_any_more(caplog):
     """The second time it runs alone, so that nothing beside it is blamed; then it has ended."""
     scene = Scene(3, hedging=HedgingMode.FAILOVER)
     scene.dispatcher.submit(b"poison", "caller")
@@ -146,7 +147,10 @@ def test_a_request_over_which_two_services_died_is_sent_nowhere_any_more():
     assert [link.handled[0] for link in scene.links[:2]] == [Handling.NORMAL, Handling.ALONE]
     report = scene.dispatcher.report()
     assert (report["poison"], report["silent"], report["pending"]) == (1, 0, 0)
-    assert report["poisoned_at"] is not None
+    assert report["poisoned_at"] == pytest.approx(time.time(), abs=60.0)
+    id = scene.links[0].offered[0][1].hex()
+    named = f"request_poison service=/s type=std_srvs/srv/SetBool deaths=2 request={id}"
+    assert named in caplog.text
 
 
 def test_after_a_death_no_request_is_at_all_replicas_at_once():

@@ -123,6 +123,17 @@ def test_a_request_that_kills_services_is_left_to_the_fallback_which_is_asked_on
     scene.local.calls[0][1](b"from here")
     assert scene.responses == [("caller", b"from here")]
     assert scene.count("fallback", "poison", "silent", "pending") == [1, 0, 0, 0]
+    assert scene.dispatcher.report()["poisoned_at"] is not None
+
+
+def test_what_killed_services_and_has_no_fallback_either_is_no_silence():
+    scene = Scene()
+    scene.local.there = False
+    scene.ask()
+    for _ in range(2):
+        scene.dispatcher.answered(scene.links[0], scene.links[0].refusal(Refusal.CRASHED))
+        scene.pass_time(0.1)
+    assert scene.count("fallback", "poison", "silent", "pending") == [0, 1, 0, 0]
 
 
 def test_at_once_while_no_replica_is_ready():
