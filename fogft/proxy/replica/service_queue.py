@@ -25,6 +25,9 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
+# While others wait, a request needs so many times what one usually takes, but no more than that
+# share of the longest time that one was given here: what takes longer than most comes too late.
+_TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
 HOLD_LIMIT_S = 2.0  # a cancel service that has not answered by then is given up
 _TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
 
@@ -73,6 +76,7 @@ class ServiceQueue:
         self._alone = False  # the job at work is to have no other beside it
         self._next: Job | None = None  # passed on though the service is at work on all that it can
         self._longest_s = 0.0  # that it lately took; 0 before its first answer
+        self._longest_given_s = 0.0  # to a request, lately
         self._quiet_since: float | None = None  # it has work, and has ended none since
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
         self._last_deadline = 0.0
@@ -87,6 +91,8 @@ class ServiceQueue:
         # A spare copy that waits for what is nearly over goes after all that is none.
         deadline = job.deadline + (LONGEST_S if job.spare else 0.0)
         self._waiting.put(job.id, job.robot, deadline, job)
+        given_s = job.deadline - job.arrived
+        self._longest_given_s = max(given_s, self._longest_given_s * _LONGEST_FADES)
 
     def _has_room(self, job: Job) -> bool:
         if self.at_work and (job.alone or self._alone):
@@ -138,8 +144,12 @@ class ServiceQueue:
         if job is not None and not self._has_room(job):
             self.put(job)  # when the service has nothing else
             return None
-        before = (1 if self._waiting else 0) + (self.at_work >= self.limit.limit)
-        if job is not None and job.deadline > now + before * self.limit.takes_s:
+        takes_s = self.limit.takes_s
+        needs_s = takes_s if self.at_work >= self.limit.limit else 0.0
+        if self._waiting:
+            most_s = _TAKES_SHARE * self._longest_given_s
+            needs_s += max(takes_s, min(_TAKES_TIMES * takes_s, most_s))
+        if job is not None and job.deadline > now + needs_s:
             self.begin(job, now)
         return job
 

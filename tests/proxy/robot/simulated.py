@@ -154,7 +154,7 @@ class SimulatedLink:
         self.offers += 1
         self.open.add(request_id)
         incoming = SimulatedIncoming(self, request_id, payload, handling)
-        incoming.remaining_s = remaining_s
+        incoming.remaining_s = remaining_s - min(self.rtt_s, remaining_s / 2)
         self.world.at(self.world.now + self.rtt_s / 2, lambda: self._arrives(incoming))
         lost = Answer(request_id, refusal=Refusal.LOST, service="/s")
         self.world.at(self.world.now + remaining_s, lambda: self._end(lost))

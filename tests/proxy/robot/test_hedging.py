@@ -55,11 +55,20 @@ SPELLS = {
 }
 
 
-def pool(service: str, *, robots: int = 1, seed: int = 3, mode: HedgingMode = AUTO, spells="none"):
+def pool(
+    service: str,
+    *,
+    robots: int = 1,
+    seed: int = 3,
+    mode: HedgingMode = AUTO,
+    spells: str = "none",
+    rtt_s: float = 2 * ONE_WAY_S,
+):
     """Return robots before three serial replicas."""
     worlds, draws = [World(mode, timeout_s=2.0)], Draws(seed)
     for slot in range(3):
-        made = worlds[0].replica(SERVICES[service], serial=True).replica.service
+        link = worlds[0].replica(SERVICES[service], serial=True, rtt_s=rtt_s)
+        made = link.replica.service
         made.draws, made.pace = draws, partial(SPELLS[spells], slot)
     return worlds + [World(mode, timeout_s=2.0, beside=worlds[0]) for _ in range(robots - 1)]
 
@@ -391,13 +400,20 @@ def test_five_robots_with_views_of_their_own_share_what_there_is(load, service):
     assert p99(worlds) <= 2.0 * shortest_queue(service, load) + 0.010
 
 
-def test_over_capacity_what_is_answered_is_answered_in_time_and_the_rest_costs_no_work():
-    """At 150 % nearly all that three can do is done, and the pool is known to be too small."""
-    [world] = pool("constant")
+@pytest.mark.parametrize(
+    ("service", "rtt_s"), [("constant", 0.002), ("constant", 0.05), ("stalling", 0.05)]
+)
+def test_over_capacity_what_is_answered_is_answered_in_time_and_the_rest_costs_no_work(
+    service, rtt_s
+):
+    """At 150 % nearly all that three can do is done, and the pool is known to be too small.
+
+    However far away they are: what replicas end just in time must still be here in time.
+    """
+    [world] = pool(service, rtt_s=rtt_s)
     offered([world], 1.5, 20.0)
     assert world.dispatcher.report()["needed_replicas"] in (5, 6)  # 4.5 would be full
-    world.run(2.5)
-    assert len(world.answers) >= 0.95 * 150 * 20
+    assert answered([world], 1000.0, 1020.0) >= 0.95 * 150 * 20
     world.poisson(75.0, 20.0, random.Random(3))
     assert world.dispatcher.report()["needed_replicas"] == 0
 

@@ -105,6 +105,7 @@ class Attempts:
         self._ended = ended
         self.window = LinkWindow(standing=len(self._services))
         self.watched = False  # something large was sent lately: the link's thread looks often
+        self.round_trip_s = 0.0  # the shortest seen
         self._large_since = float("-inf")
         self._sending_since: float | None = None
         self._held_by_zenoh = (0.0, 0)  # since when, so many bytes at most
@@ -186,8 +187,8 @@ class Attempts:
             payload = attempt.payload  # read once, as in `_send`
             if payload is not None and self.window.holds(attempt):
                 attempt.payload = None
-                remaining_s = max(attempt.deadline - now, 0.0)
-                parts.append((attempt.request_id, remaining_s, attempt.handling, payload))
+                left_s = self._left_there_s(max(attempt.deadline - now, 0.0))
+                parts.append((attempt.request_id, left_s, attempt.handling, payload))
                 self._unanswered.add(attempt)
             else:
                 self._skipped(attempt)
@@ -323,6 +324,10 @@ class Attempts:
         if time.monotonic() - began > _STUCK_S and not self._outlet.alive():
             self._outlet.lose("it stopped reading, and Zenoh closed the session")
 
+    def _left_there_s(self, remaining_s: float) -> float:
+        """Return how long the replica has: in an overload all that it ends it ends just in time."""
+        return remaining_s - min(self.round_trip_s, remaining_s / 2)
+
     def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
         compression, rate = self._compressions.get(attempt.service), self._progress.bytes_per_s
         packed = None
@@ -332,7 +337,7 @@ class Attempts:
         self._unanswered.add(attempt)
         header = frame.encode_request(
             attempt.request_id,
-            remaining_s,
+            self._left_there_s(remaining_s),
             self._origin,
             seen=self._seen,
             packed=packed is not None,

@@ -333,6 +333,8 @@ class ZenohLink:
     ) -> None:
         """A connection's replica has answered: from now on it is the live one."""
         news = self._live is not connection or answer != known
+        attempts, rtt_s = connection.attempts, self._probing.rtt_s or 0.0
+        attempts.round_trip_s = min(attempts.round_trip_s or rtt_s, rtt_s)
         self.ready = answer.ready
         if self._live is not connection:
             self._state = LinkState.UP

@@ -39,16 +39,18 @@ class Outlet:
         self.flow: Any = Flow()
         self.fails = False
         self.sent: list[bytes] = []
+        self.left_s: list[float] = []  # as the replica is told
         self.lost: list[str] = []
 
     def publish(self, service: str, content: bytes, header: bytes) -> None:
         if self.fails:
             raise OSError("no way out")
         if batch_frames.is_batch(header):
-            found = batch_frames.decode_requests(header, content)
-            self.sent += [one.request_id for one, _ in found]
+            headers = [one for one, _ in batch_frames.decode_requests(header, content)]
         else:
-            self.sent.append(frame.decode_request(header).request_id)
+            headers = [frame.decode_request(header)]
+        self.sent += [one.request_id for one in headers]
+        self.left_s += [one.remaining_s for one in headers]
 
     def cancel(self, ids: Sequence[bytes]) -> None:
         pass
@@ -237,4 +239,16 @@ def test_nothing_is_unpacked_that_was_not_asked_for(monkeypatch: pytest.MonkeyPa
     assert not scene.outlet.lost
     scene.attempts.heard(b"once", [Answer(request_id(3), bomb)], packed=True)
     assert scene.outlet.lost == ["it sends more answers than it received requests"]
+    scene.close()
+
+
+def test_a_replica_has_as_much_less_time_as_the_way_there_and_back_takes():
+    """What it ends just in time is here in time; of little time it has half."""
+    scene = Scene()
+    scene.attempts.round_trip_s = 0.1
+    for number, remaining_s in enumerate((10.0, 0.15)):
+        scene.attempts.offer(SERVICE, request_id(number), b"q", remaining_s)
+    for number in (2, 3):
+        scene.attempts.offer(SERVICE, request_id(number), b"q", 10.0, more=number == 2)
+    assert scene.outlet.left_s == pytest.approx([9.9, 0.075, 9.9, 9.9], abs=0.02)
     scene.close()
