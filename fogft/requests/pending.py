@@ -96,9 +96,10 @@ class PendingRequests:
         if not self._pending:
             self.choose.look_at = NEVER  # that was for those that have ended
         chosen = self.choose.first(request, able, now)
-        if len(chosen) == len(able) > 1 and now < self._cautious_until:
-            *chosen, spared = chosen
-            self.choose.declined(request, spared, full=False)
+        if now < self._cautious_until and len(chosen) > (most := self._most_at_once(able)):
+            for spared in chosen[most:]:
+                self.choose.declined(request, spared, full=False)
+            chosen = chosen[:most]
         started = dict.fromkeys(chosen, now)
         pending = self._pending[request] = Pending(deadline, payload, handle, now, started)
         self.soonest_deadline = min(self.soonest_deadline, deadline)
@@ -148,7 +149,7 @@ class PendingRequests:
             room = 1
         elif now < self._cautious_until and pending.open:
             waited = now >= max(pending.open.values()) + _SPREADS_AFTER_S
-            room -= len(pending.open) + (0 if waited else 1)
+            room = (room if waited else self._most_at_once(able)) - len(pending.open)
             candidates = candidates[: max(0, room)]
         elif not candidates:
             return (), min(rests_until.values(), default=NEVER)
@@ -156,6 +157,11 @@ class PendingRequests:
             return (), now
         chosen = self.choose.more(request, pending.open, candidates, now)[:room]
         return chosen, self.choose.look_at if self.choose.look_at < NEVER else now
+
+    @staticmethod
+    def _most_at_once(able: Sequence[int]) -> int:
+        """Return how many may have what could kill: one more has it alone then; one lives on."""
+        return max(1, len(able) - POISON_DEATHS)
 
     def attempt(self, request: bytes, replica: int, now: float) -> Pending | None:
         """Add a further attempt; None if it is no longer wanted."""

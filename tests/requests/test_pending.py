@@ -362,14 +362,14 @@ def test_a_policy_is_told_how_each_attempt_ends():
     assert told(lambda r: r.left([1]), lambda r: r.came([2])) == [("forget", 1), ("forget", 2)]
 
 
-def test_after_a_death_one_replica_is_left_out_of_each_request_for_a_while():
-    """One more that kills would otherwise end all of them at once."""
+def test_after_a_death_two_replicas_are_left_out_of_each_request_for_a_while():
+    """One more that kills is run alone on one of them, and the other lives on."""
     policy = Told()
     requests = PendingRequests(policy, Spy(), counts_deaths=True)
     requests.begin(A, b"x", (1, 2, 3), deadline=999.0, now=0.0)
     requests.refused(A, 1, Refusal.CRASHED, 0.0)
-    assert list(requests.begin(B, b"x", (1, 2, 3), deadline=999.0, now=1.0)) == [1, 2]
-    assert policy.told[-1] == ("declined", B, 3, False)
+    assert list(requests.begin(B, b"x", (1, 2, 3), deadline=999.0, now=1.0)) == [1]
+    assert policy.told[-2:] == [("declined", B, 2, False), ("declined", B, 3, False)]
     spared = [(id, replica) for id, replica in requests.more((1, 2, 3), 1.5, newest_first=False)]
     assert (B, 3) not in spared
     later = requests.more((1, 2, 3), 2.0, newest_first=False)

@@ -228,7 +228,7 @@ def test_for_a_minute_after_a_death_no_request_is_at_all_replicas_at_once():
     """Also of a service whose requests are at every idle one else."""
     world, _, at_all = killed("exponential", 0.05)
     assert at_all == []
-    assert sum(len(link.replica.deaths) for link in world.links) <= (3 + 1) + 2 * (2 + 1)
+    assert sum(len(link.replica.deaths) for link in world.links) <= (3 + 1) + 2 * (1 + 1)
 
 
 @pytest.mark.parametrize("pause_s", [0.001, 0.2])
