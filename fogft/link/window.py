@@ -52,7 +52,7 @@ class LinkWindow:
         self._lock = threading.Lock()
         self._open: dict[bytes, OpenAttempt] = {}
         self._closed = False
-        self._declined = False
+        self.declined = False  # an attempt, for lack of room
 
     def __len__(self) -> int:
         return len(self._open)
@@ -63,7 +63,7 @@ class LinkWindow:
             if self._closed or attempt.request_id in self._open:
                 return False
             if len(self._open) >= self.limit or not self.large.has_room(attempt.size):
-                self._declined = True
+                self.declined = True
                 return False
             self._open[attempt.request_id] = attempt
             self.large.add(attempt.size)
@@ -99,13 +99,11 @@ class LinkWindow:
 
     def regained_room(self) -> bool:
         """Whether an attempt was declined for lack of room that is there now. Asks once."""
-        if not self._declined:  # the usual case, without the lock
-            return False
         with self._lock:
             # A quarter free: a window that is full to the brim is not announced for each slot.
             roomy = len(self._open) <= self.limit * 3 // 4
-            if roomy and self.large.held <= self.large.limit * 3 // 4:
-                self._declined = False
+            if self.declined and roomy and self.large.held <= self.large.limit * 3 // 4:
+                self.declined = False
                 return True
             return False
 
@@ -177,22 +175,19 @@ class BatchBuffer:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._attempts: list[OpenAttempt] = []
+        self.attempts: list[OpenAttempt] = []
         self._bytes = 0
-
-    def __bool__(self) -> bool:
-        return bool(self._attempts)
 
     def add(self, attempt: OpenAttempt) -> list[OpenAttempt]:
         """Hold a small attempt; return those that leave now because it does not fit to them."""
         with self._lock:
             full = (
-                len(self._attempts) >= batch_frames.LIMIT
+                len(self.attempts) >= batch_frames.LIMIT
                 or self._bytes + attempt.size > batch_frames.BYTES_LIMIT
-                or (self._attempts and self._attempts[0].service != attempt.service)
+                or (self.attempts and self.attempts[0].service != attempt.service)
             )
             leaving = self._take() if full else []
-            self._attempts.append(attempt)
+            self.attempts.append(attempt)
             self._bytes += attempt.size
             return leaving
 
@@ -202,7 +197,7 @@ class BatchBuffer:
             return self._take()
 
     def _take(self) -> list[OpenAttempt]:
-        taken, self._attempts, self._bytes = self._attempts, [], 0
+        taken, self.attempts, self._bytes = self.attempts, [], 0
         return taken
 
 

@@ -33,7 +33,7 @@ class ReplicaId:
         """Slot and generation, as shown to people: ``2.1``."""
         return f"{self.slot}.{self.generation}"
 
-    @property
+    @cached_property
     def key(self) -> int:
         """Slot and generation in one number, by which one pool's requests know it."""
         return self.slot << 32 | self.generation

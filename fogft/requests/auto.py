@@ -7,7 +7,7 @@ Laws: a request always has a copy that is no spare; late hedges <= capacity + sh
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fogft.model.replica import short
@@ -90,13 +90,15 @@ class Auto(Learning):
         self._spares.request(known.service_s, now)
         if self._spares.open and not known.free(now):
             self._spares.made_wait(known.service_s / len(able))
+        known.asked(request, now)
+        if len(able) == 1:
+            return able  # there is nobody to hedge it at
         others = able if self._spares.chosen(request) else self._stale(able, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
         if self._spares.share < 1.0 and others is able:
             spares = spares[:-1]  # spares were in the way: from now on they leave a replica free
         elif len(spares) + 1 < len(others):
             self._wanting[request] = None
-        known.asked(request, now)
         if len(spares) + 1 < len(able):  # else there is nobody to hedge it at
             self._look(known.overdue_at(request, now))
         return [best, *self._spared(request, spares, now)]
@@ -186,16 +188,16 @@ class Auto(Learning):
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
-    ) -> Iterable[int]:
+    ) -> None:
         """Also learn whether a spare copy was first, and which replica is free now."""
         self._wanting.pop(request, None)
         if self._spares.open.pop((request, replica), None) is not None:
             for other in open:
                 if other != replica and not self.is_spare(request, other):
                     self._beaten[request, other] = now
-        losers = super().answered(request, open, replica, load, now)
-        self._released(replica, now)
-        return losers
+        super().answered(request, open, replica, load, now)
+        if self._wanting:
+            self._released(replica, now)
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Note that an attempt ended without an answer."""
@@ -215,12 +217,12 @@ class Auto(Learning):
             self._replicas[replica].answered(request, None, now)
         else:
             self._replicas[replica].dropped(request)
-        self._released(replica, now)
+        if self._wanting:
+            self._released(replica, now)
 
     def _released(self, replica: int, now: float) -> None:
         """Have a replica that has become free work on what waits for one."""
-        if self._wanting and self._replicas[replica].free(now):
-            self.news = True
+        self.news = self.news or self._replicas[replica].free(now)
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False

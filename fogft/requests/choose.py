@@ -8,7 +8,7 @@ which answer wins (`decide`).
 """
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fogft.requests.load import NEVER, Load, ReplicaLoad
@@ -47,9 +47,8 @@ class Choose:
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
-    ) -> Iterable[int]:
-        """Note that a replica has answered; return the replicas that should stop working on it."""
-        return [other for other in open if other != replica] if len(open) > 1 else ()
+    ) -> None:
+        """Note that a replica has answered: the others are to stop working on the request."""
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Note that an attempt ended without a valid answer, by the replica's fault or not."""
@@ -101,10 +100,9 @@ class Learning(Choose):
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
-    ) -> Iterable[int]:
+    ) -> None:
         """Learn from the first response; the others stop, and are learned from when they end."""
         self._replicas[replica].answered(request, load, now)
-        return super().answered(request, open, replica, load, now)
 
     def _doubts(self, replica: int, begun: float, now: float) -> bool:
         """Whether a replica is doubted, by an attempt that began then."""

@@ -50,11 +50,9 @@ class FairQueue(Generic[T]):
         self._sign = -1.0 if latest else 1.0
         self._robots: dict[str, _Robot[T]] = {}  # those that have something waiting
         self._entries: dict[bytes, _Entry[T]] = {}
+        self.size = self._entries.__len__
         self._order = count()
         self._turn = 0.0  # what the robot served last had been given
-
-    def __len__(self) -> int:
-        return len(self._entries)
 
     def put(self, id: bytes, robot: str, deadline: float, item: T) -> None:
         """Queue an item. Its id must not be queued already."""

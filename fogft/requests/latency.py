@@ -36,7 +36,9 @@ class Latencies:
         self._weight *= self.per_sample
         if self._weight > _RESCALE_AT:
             self._rescale()
-        bucket = _bucket(took_s)
+        bucket = 0  # whose upper end is the first that is not below it
+        if took_s > _FIRST_S:
+            bucket = min(_BUCKETS - 1, math.ceil(math.log(took_s / _FIRST_S) / _LOG_GROWTH))
         self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight
         self._total += self._weight
         self.samples += 1
@@ -65,10 +67,3 @@ class Latencies:
             sum_below += weight * _FIRST_S * _GROWTH**bucket * _MIDDLE
             left -= weight
         return max(_FIRST_S, sum_below / (share * self._total)) if self.samples else None
-
-
-def _bucket(took_s: float) -> int:
-    """Return the bucket whose upper end is the first that is not below a latency."""
-    if took_s <= _FIRST_S:
-        return 0
-    return min(_BUCKETS - 1, math.ceil(math.log(took_s / _FIRST_S) / _LOG_GROWTH))

@@ -26,7 +26,7 @@ _UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
 _AVOIDED_S = 0.1
 _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
-_DEMAND_OVER_S = 10.0
+_DEMAND_OVER_S, _DEMAND_STEP_S = 10.0, 0.1
 _TOO_FULL, _FULL = 0.95, 0.8  # a share of what replicas can do: from when on it is too much
 
 
@@ -57,7 +57,9 @@ class Demand:
 
     def asked(self, now: float) -> None:
         """Count a request."""
-        self._asked, self._at = 1.0 + self._lately(now), now
+        if now > self._at + _DEMAND_STEP_S:
+            self._asked, self._at = self._lately(now), now
+        self._asked += 1.0
 
     def _lately(self, now: float) -> float:
         return self._asked * math.exp((self._at - now) / _DEMAND_OVER_S)

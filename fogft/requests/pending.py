@@ -57,6 +57,7 @@ class PendingRequests:
         self.fallback: FallbackTimer | None = None
         self.soonest_deadline = NEVER  # of the requests, or sooner
         self._pending: dict[bytes, Pending] = {}
+        self.size = self._pending.__len__
         # Those that some replica may have to be asked for, as far as is known, and from when on.
         self._short: dict[bytes, float] = {}
         self._counts_deaths = counts_deaths
@@ -235,7 +236,9 @@ class PendingRequests:
                 return means, None, (), Verdict.LATE
             for other in pending.died_at - {replica}:
                 self._alarms.was_false(other, now)
-            losers = self.choose.answered(request, pending.open, replica, load, now)
+            open = pending.open
+            self.choose.answered(request, open, replica, load, now)
+            losers = [other for other in open if other != replica] if len(open) > 1 else ()
             self._close(request, pending)
             return means, pending, losers, Verdict.WON
         verdict = Verdict.LATE

@@ -164,7 +164,7 @@ def test_each_leaves_once_in_order_and_fits(steps: list[tuple[str, int] | None])
         assert sum(one.size for one in leaving) <= batch_frames.BYTES_LIMIT
         left += leaving
     assert left == came
-    assert not held
+    assert not held.attempts
 
 
 STREAMS: list[Any] = [object(), object()]

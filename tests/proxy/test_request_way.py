@@ -37,7 +37,7 @@ CARRY = {
 # Who keeps it, or judges it, and gives it to nobody.
 KEEP = {
     *("requests.pending", "requests.decide"),
-    *("link.window", "link.socket_progress", "link.compression"),
+    *("link.port", "link.window", "link.socket_progress", "link.compression"),
     *("proxy.replica.service_queue", "proxy.replica.known_requests"),
 }
 

@@ -15,11 +15,10 @@ from fogft.requests.load import NEVER, Load
 A = b"a" * 16
 
 
-def test_all_go_to_everybody_and_all_but_the_winner_stop():
+def test_all_go_to_everybody():
     policy = All()
     assert policy.first(A, (1, 2, 3), 0.0) == (1, 2, 3)
     assert policy.more(A, {1: 0.0}, (2, 3), 0.0) == (2, 3)
-    assert list(policy.answered(A, {1: 0.0, 2: 0.0, 3: 0.0}, 2, None, 1.0)) == [1, 3]
     assert policy.look_at == NEVER
 
 
@@ -115,9 +114,7 @@ def test_of_requests_that_have_ended_nothing_is_kept(policy, ends):
             choose.stopped(id, asked, now, expired=True)
             others.append(first)
         else:
-            assert set(
-                choose.answered(id, asked, first, Load(0, 0, 0, 0.01, 0.01), now + 0.01)
-            ) == set(others)
+            choose.answered(id, asked, first, Load(0, 0, 0, 0.01, 0.01), now + 0.01)
         for replica in others:
             choose.late(id, replica, now + 0.02, answered=worked)
         now += 1.0

@@ -44,7 +44,7 @@ def test_turns_cannot_be_saved_up():
 def test_when_full_the_robot_with_most_gives_way():
     queue = filled(("chatty", 1.0), ("chatty", 7.0), ("chatty", 5.0))
     assert queue.evict("quiet", 9.0) == "chatty1"
-    assert len(queue) == 2
+    assert queue.size() == 2
 
 
 def test_when_full_an_urgent_request_displaces_a_later_one_of_its_own_robot():
@@ -102,7 +102,7 @@ def test_each_comes_out_once_and_nobody_starves(operations):
         present = {who for who, _ in waiting.values()}
         since = {who: count for who, count in since.items() if who in present}
         assert all(count <= 3 for count in since.values())
-        assert len(queue) == len(waiting)
+        assert queue.size() == len(waiting)
     assert queue.ahead("a", 5.0) <= len(waiting)
 
 
@@ -132,7 +132,7 @@ def test_the_stalest_gives_way_to_a_newer_one_of_its_own_robot():
 def test_an_empty_queue_gives_nothing_and_nothing_has_to_give_way():
     queue = filled()
     assert (queue.take(), queue.remove(b"x"), queue.evict("a", 1.0)) == (None, None, None)
-    assert (len(queue), queue.ahead("a", 1.0)) == (0, 0)
+    assert (queue.size(), queue.ahead("a", 1.0)) == (0, 0)
 
 
 def test_who_was_given_least_is_next_and_among_equals_the_earliest_deadline():

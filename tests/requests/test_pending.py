@@ -62,11 +62,12 @@ def answer(requests: PendingRequests, replica: int, payload: bytes, now: float =
     return requests.answered(A, A, replica, payload, reading, None, now)
 
 
-def test_the_first_success_ends_a_request_and_names_who_stops():
-    requests, spy = made()
+@pytest.mark.parametrize(("able", "stop"), [((1, 2), [2]), ((2, 1, 3), [2, 3]), ((1,), [])])
+def test_the_first_success_ends_a_request_and_names_who_stops(able, stop):
+    requests, spy = made(able)
     assert requests.held_bytes == len(b"question")
     means, pending, losers, _ = answer(requests, 1, OK)
-    assert (means, list(losers)) == (Means.SUCCESS, [2])
+    assert (means, list(losers)) == (Means.SUCCESS, stop)
     assert pending is not None
     assert (len(requests), requests.held_bytes, spy.ended) == (0, 0, [A])
     assert answer(requests, 2, OK)[1] is None  # too late

@@ -283,7 +283,7 @@ class Responder:
                 if not waiting or job.unwanted:
                     self.wasted += 1
                     self.wasted_s += now - job.begun
-            if queue:
+            if queue.waiting():
                 self._pass_on(job.service)
             if self._answered is not None:
                 self._answered(job, now)

@@ -69,6 +69,7 @@ class ServiceQueue:
 
     def __init__(self, most: int, given: int | None = None, *, latest: bool = False) -> None:
         self._waiting: FairQueue[Job] = FairQueue(latest=latest)
+        self.waiting = self._waiting.size  # how many
         self.evict = self._waiting.evict  # what must go so that a newcomer fits in
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
@@ -82,9 +83,6 @@ class ServiceQueue:
         self._last_deadline = 0.0
         self.held_until = NEVER  # nothing is begun before, or before `release`
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
-
-    def __len__(self) -> int:
-        return len(self._waiting)
 
     def put(self, job: Job) -> None:
         """Queue a job."""
@@ -101,7 +99,7 @@ class ServiceQueue:
 
     def has_free_slot(self, now: float) -> bool:
         """Whether nothing waits, and the service can start one more (almost) at once."""
-        if len(self._waiting) or self._alone:
+        if self.waiting() or self._alone:
             return False
         nearly_over = now - self._begun_last >= NEARLY * self.limit.takes_s > 0.0
         return self.at_work < max(1, self.limit.known) or (self.at_work == 1 and nearly_over)
@@ -113,7 +111,7 @@ class ServiceQueue:
 
     def takes(self, job: Job) -> bool:
         """Whether a job that arrives now is passed on at once."""
-        return not len(self._waiting) and self._has_room(job)
+        return not self.waiting() and self._has_room(job)
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
         """Return the load when `ended` have just ended; None until the pace is known.
@@ -122,12 +120,12 @@ class ServiceQueue:
         """
         if not self.limit.service_s:
             return None
-        waiting, running = len(self._waiting), self.at_work - ended
+        waiting, running = self.waiting(), self.at_work - ended
         return Load(waiting, running, self.limit.known, self.limit.service_s, spent_s)
 
     def hopeless(self, robot: str, deadline: float, remaining_s: float) -> bool:
         """Whether a request is expected to wait past its deadline."""
-        waiting = len(self._waiting)
+        waiting = self.waiting()
         if not waiting or self.limit.wait_s(waiting, self.at_work) <= remaining_s:
             return False
         return self.limit.wait_s(self._waiting.ahead(robot, deadline), self.at_work) > remaining_s
@@ -146,7 +144,7 @@ class ServiceQueue:
             return None
         takes_s = self.limit.takes_s
         needs_s = takes_s if self.at_work >= self.limit.limit else 0.0
-        if self._waiting:
+        if self.waiting():
             most_s = _TAKES_SHARE * self._longest_given_s
             needs_s += max(takes_s, min(_TAKES_TIMES * takes_s, most_s))
         if job is not None and job.deadline > now + needs_s:

@@ -134,7 +134,7 @@ class Dispatcher:
         with self._lock:
             outcomes.received(len(payload))
             over = requests.held_bytes + len(payload) > self.max_pending_bytes
-            if over or len(requests) >= self.max_pending:
+            if over or requests.size() >= self.max_pending:
                 self._turn_away(request, len(payload))
                 return False
             links, able = self._sender.links, self._sender.able
@@ -148,7 +148,7 @@ class Dispatcher:
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 requests.fallback.submitted(request, now)
                 soon = min(soon, requests.fallback.look_at(able=bool(able)))
-            if len(requests) == 1:
+            if requests.size() == 1:
                 self._next_look, self._usual_s = soon, soon - now
             self._next_look, self._asked_at = min(self._next_look, soon), now
         self._sender.first(request, payload, links, chosen, timeout_s)
@@ -195,7 +195,8 @@ class Dispatcher:
 
     def answered(self, link: Link, answer: Answer) -> None:
         """Take the end of an attempt from a link's thread."""
-        payload, replica, id = answer.payload, key_of(link), link.peer.id
+        payload, id = answer.payload, link.peer.id
+        replica = id.key
         if payload is None:
             self._refused(replica, answer, answer.refusal or Refusal.LOST)
             return

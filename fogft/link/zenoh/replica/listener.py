@@ -173,7 +173,7 @@ class ZenohListener:
         """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
 
         def guarded(one: Any) -> None:
-            self._turns.came()
+            self._turns.last += 1
             threads.note()
             try:
                 heard(one)

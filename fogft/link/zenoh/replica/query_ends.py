@@ -21,11 +21,7 @@ class QueryTurns:
     """The query that Zenoh's thread is working on: the last one received."""
 
     def __init__(self) -> None:
-        self.last = 0
-
-    def came(self) -> None:
-        """Count a query. Called first by Zenoh's thread."""
-        self.last += 1
+        self.last = 0  # counted first by Zenoh's thread
 
 
 class QueryEnd:

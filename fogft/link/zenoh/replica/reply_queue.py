@@ -44,11 +44,6 @@ class Reply:
         """Whether it may be batched with others."""
         return len(self.payload) <= batch_frames.ENTRY_BYTES_LIMIT and not self.may_pack
 
-    @property
-    def small(self) -> bool:
-        """Whether it is small enough to be sent at once."""
-        return len(self.payload) <= SMALL_BYTES and not self.may_pack
-
     def send(self, stamp: bytes) -> None:
         """Send it. Blocks while the robot does not read and the connection is full."""
         query = self.stream.query
@@ -146,11 +141,17 @@ class ReplyQueues:
         Replies of one connection's `token` never wait for another's. With `more`, others will soon
         follow, to leave in one message with it.
         """
-        may_send = not more and reply.small and not threads.is_this()
-        if may_send and not self._closed and self._sent_at_once(reply):
-            self._count(reply)
-            return
         size = len(reply.payload)
+        small = size <= SMALL_BYTES and not reply.may_pack
+        if small and not more and not self._closed and not threads.is_this():
+            try:
+                sent = reply.stream.send_at_once(reply.send)
+            except Exception as error:
+                self._failed(error)
+                sent = True
+            if sent:
+                self._counters.add("refused" if reply.refusal else "replies")
+                return
         with self._lock:
             if self._closed:
                 return
@@ -161,10 +162,8 @@ class ReplyQueues:
             queue.waiting += 1
             queue.large.add(size)
             queue.replies.put(reply)
-        if dropped:
-            self._counters.add("reply_dropped")
-        else:
-            self._count(reply)
+        counted = "refused" if reply.refusal else "replies"
+        self._counters.add("reply_dropped" if dropped else counted)
 
     def end(self, token: bytes, robot: str, query: QueryEnd) -> None:
         """Queue a query to be ended. Never blocks."""
@@ -176,16 +175,6 @@ class ReplyQueues:
             queue.replies.put(query)
         if query.refusal:
             self._counters.add("refused")
-
-    def _sent_at_once(self, reply: Reply) -> bool:
-        try:
-            return reply.stream.send_at_once(reply.send)
-        except Exception as error:
-            self._failed(error)
-            return True
-
-    def _count(self, reply: Reply) -> None:
-        self._counters.add("refused" if reply.refusal else "replies")
 
     def _queue(self, token: bytes, robot: str) -> ReplyQueue:
         queue = self._queues.get(token)
@@ -296,10 +285,11 @@ class ZenohIncoming:
             return  # answered before
         self.payload = b""
         header = self._header
-        packs = header.may_pack or (header.reads_packed and stream.slow())
+        slow = stream.slow()
+        packs = header.may_pack or (header.reads_packed and slow)
         said = frame.encode_load(load)
         reply = Reply(stream, header.request_id, payload, refusal, said, may_pack=packs)
-        self._queues.put(header.token, header.robot, reply, more=more)
+        self._queues.put(header.token, header.robot, reply, more=more or slow)
 
     def __del__(self) -> None:
         """Refuse what its owner forgot, by a `SimpleQueue`: a lock of ours may be held now."""

@@ -44,12 +44,7 @@ class _Sent(NamedTuple):
 class ReplyCredit:
     """The replies that one robot has not acknowledged. Any thread."""
 
-    def __init__(
-        self,
-        slow: Callable[[], bool] = lambda: False,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self.slow = slow
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._gate = threading.Lock()  # held by who sends at once, which does not take long
         self._lock = threading.Lock()
@@ -80,12 +75,12 @@ class ReplyCredit:
 
     def send_at_once(self, connection: object, send: Send) -> bool:
         """Call `send` for at most 16 KiB if it cannot block; return whether it was called."""
-        if self.slow() or not self._gate.acquire(blocking=False):
+        if not self._gate.acquire(blocking=False):
             return False
         try:
             stamp = os.urandom(STAMP_BYTES)
             with self._lock:
-                if self._blockable or self._full(connection):
+                if self._blockable or (self._outstanding and self._full(connection)):
                     return False
                 self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=False)
             send(stamp)
@@ -95,8 +90,6 @@ class ReplyCredit:
 
     def _full(self, connection: object) -> bool:
         """Whether all that buffers surely hold may be on the way. Under the lock."""
-        if not self._outstanding:
-            return False
         self._forget_old(connection)
         full = len(self._outstanding) >= CREDIT_LIMIT
         return full or any(sent.may_block for sent in self._outstanding.values())
@@ -131,10 +124,12 @@ OF_ONE_LIMIT = 32  # of one holder: nobody's connections push out another's
 class Stream:
     """One connection's open query, with `ReplyCredit`'s methods for that connection. Any thread."""
 
-    def __init__(self, query: zenoh.Query, credit: ReplyCredit, holder: str) -> None:
+    def __init__(
+        self, query: zenoh.Query, credit: ReplyCredit, holder: str, slow: Callable[[str], bool]
+    ) -> None:
         self.query = query
         self.holder = holder
-        self.slow = credit.slow
+        self.slow = partial(slow, holder)  # whether it is known to read slowly
         name = object()  # of this connection: it must not keep the query, which ends with us
         self.seen = partial(credit.seen, name)
         self.send = partial(credit.send, name)
@@ -163,8 +158,8 @@ class Streams:
                 ended.append((token, self._streams.pop(token).query))
             credit = self._credit.get(holder)
             if credit is None:
-                credit = self._credit[holder] = ReplyCredit(partial(self._slow, holder))
-            self._streams[token] = Stream(query, credit, holder)
+                credit = self._credit[holder] = ReplyCredit()
+            self._streams[token] = Stream(query, credit, holder, self._slow)
             own = [other for other, one in self._streams.items() if one.holder == holder]
             if len(own) > OF_ONE_LIMIT or len(self._streams) > self.limit:
                 oldest = own[0] if len(own) > OF_ONE_LIMIT else next(iter(self._streams))

@@ -8,7 +8,7 @@ connection's own, so a peer that takes nothing costs nobody else. Not here: the 
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from fogft.link import batch_frames, frame
@@ -158,7 +158,7 @@ class Attempts:
             return True
         # It cannot block: the hop to another thread is saved.
         attempt.mark = mark
-        together = more or bool(self._batch)
+        together = more or self._batch.attempts
         if together and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
             self._send_together(self._batch.add(attempt))
         else:
@@ -173,7 +173,7 @@ class Attempts:
 
     def send(self) -> None:
         """Send attempts offered with `more`. Never blocks: they are small and have credit."""
-        if self._batch:
+        if self._batch.attempts:
             self._send_together(self._batch.take())
 
     def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
@@ -230,7 +230,7 @@ class Attempts:
             self.flush()
         attempt.payload = None
         attempt.elsewhere = sent and now < attempt.deadline
-        if self.window.regained_room():
+        if self.window.declined and self.window.regained_room():
             self._room()
 
     def flush(self) -> None:
@@ -247,9 +247,9 @@ class Attempts:
         if not self.window.remove(attempt):
             return False
         attempt.payload = None
-        id, payload, refusal, _, detail, load = answer
-        self._answered(Answer(id, payload, refusal, attempt.service, detail, load))
-        if self.window.regained_room():
+        answer.service = attempt.service
+        self._answered(answer)
+        if self.window.declined and self.window.regained_room():
             self._room()
         return True
 
@@ -371,7 +371,7 @@ class Attempts:
 
         def done(payload: bytes | None) -> None:
             refusal = Refusal.MALFORMED if payload is None else None
-            self._take_plain(attempt, answer._replace(payload=payload, refusal=refusal))
+            self._take_plain(attempt, replace(answer, payload=payload, refusal=refusal))
 
         packed = answer.payload or b""
         if not attempt.reads_packed or not self._unpacker.put("answers", packed, done):
@@ -381,7 +381,8 @@ class Attempts:
         if self._close(attempt, answer):
             return
         self._cancellations.answered(answer.request_id)  # it was forgotten, or has ended
-        self._late(answer._replace(service=attempt.service))
+        answer.service = attempt.service
+        self._late(answer)
 
     # -- the link's thread ----------------------------------------------------------------
 

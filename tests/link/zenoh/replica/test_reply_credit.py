@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import threading
+from typing import Any, cast
+
 import pytest
 import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.counters import Counters
 from fogft.link import frame
+from fogft.link.zenoh.replica.reply_queue import ReplyQueues, ZenohIncoming
 from fogft.link.zenoh.replica.reply_streams import CREDIT_LIMIT, ReplyCredit, Streams
 from tests.fakes.proxy import Clock
 
@@ -135,14 +140,24 @@ def test_connections_that_are_gone_leave_nothing_behind() -> None:
 
 
 def test_who_reads_slowly_is_sent_nothing_at_once() -> None:
-    slow: set[str] = {"a"}
-    streams, found = Streams(slow=lambda holder: holder in slow), []
-    for token, holder in ((b"1", "a"), (b"2", "b")):
-        streams.opened(token, None, holder)
+    """Their replies leave by threads that may block."""
+    senders: dict[bytes, threading.Thread] = {}
+
+    class Query:
+        key_expr = "a"
+
+        def reply(self, key: str, payload: bytes, *, attachment: bytes) -> None:
+            senders[payload] = threading.current_thread()
+
+    streams, queues = Streams(slow={"a"}.__contains__), ReplyQueues(Counters())
+    for token, holder in ((b"1" * 8, "a"), (b"2" * 8, "b")):
+        streams.opened(token, cast("Any", Query()), holder)
         stream = streams.of(token)
         assert stream is not None
-        found.append(stream.send_at_once(lambda _: None))
-    assert found == [False, True]
+        header = frame.RequestHeader(bytes(16), 1.0, token, holder)
+        ZenohIncoming("/s", header, b"", stream, queues).reply(holder.encode())
+    queues.close(5.0)
+    assert senders[b"a"] is not senders[b"b"] is threading.current_thread()
 
 
 def test_only_the_connections_of_one_robot_count_together() -> None:

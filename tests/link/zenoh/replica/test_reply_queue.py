@@ -26,7 +26,8 @@ class Stream:
 class Reply:
     """A small reply."""
 
-    small = joins = True
+    joins = True
+    may_pack = False
     refusal = payload = b""
 
     def __init__(self) -> None:

@@ -102,7 +102,7 @@ def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authorit
     )
     for _ in range(3000):
         asked = QueryEnd(Query(), turns)
-        turns.came()
+        turns.last += 1
         control.later(Greeting(bytes(8)), lambda: None, asked)
     dropped = counters.snapshot()["control_queries_dropped"]
     assert 0 < len(work) == 3000 - dropped <= LIMIT
