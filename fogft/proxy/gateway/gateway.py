@@ -7,7 +7,7 @@ Design: docs/design/gateways.md.
 import logging
 import threading
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 from typing import Any
@@ -23,6 +23,7 @@ log = logging.getLogger(__name__)
 # As long as a link takes to come back by itself, and no longer.
 UNREADY_S = 0.5
 _COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
+_POISON_KEPT = 256  # ids of requests that must not be sent again
 
 
 class Forwarder:
@@ -41,6 +42,7 @@ class Forwarder:
         self._unready_since: dict[str, float] = {}
         self._known = KnownRequests(self.kept_bytes, 4 * self.held_limit, self.held_bytes)
         self._by_robot: Counter[str] = Counter()
+        self._poison: deque[bytes] = deque(maxlen=_POISON_KEPT)
         self.queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
         self.joined = 0  # copies of requests that were known
@@ -91,6 +93,8 @@ class Forwarder:
     def _reason_to_refuse(self, incoming: Incoming) -> Refusal | None:
         if incoming.remaining_s <= 0:
             return Refusal.EXPIRED
+        if incoming.request_id in self._poison:
+            return Refusal.CRASHED
         if incoming.service not in self._ready:
             return Refusal.NOT_READY
         of_robot = self._by_robot[incoming.robot]
@@ -106,6 +110,14 @@ class Forwarder:
         """Cancel requests, here and at the replicas behind."""
         for id in ids:
             self._stop(id, Refusal.CANCELLED)
+
+    def poisoned(self, id: bytes) -> None:
+        """Refuse a request over which services died, now and whenever it comes again.
+
+        As one death: a robot that has another gateway asks that too, and believes nobody alone.
+        """
+        self._poison.append(id)
+        self._stop(id, Refusal.CRASHED)
 
     def _stop(self, id: bytes, reason: Refusal) -> None:
         with self._lock:

@@ -106,6 +106,7 @@ class _Gateway:
             fault_of=fault_of(spec.type, RESPONSE),
             ok_of=_ok_of(spec.type),
             wake=wake,
+            poisoned=self._forwarder.poisoned,
         )
         self._forwarder.use(spec.name, dispatcher)
         return dispatcher

@@ -55,6 +55,7 @@ class Dispatcher:
         empty_response: The serialised default response, for ``on_timeout: empty``.
         max_pending_bytes: Of requests kept at once; more are turned away and counted.
         id_of: Gives a caller's request its id, by service and handle.
+        poisoned: Takes the id of each request over which services died, as it is given up.
     """
 
     max_pending = 1 << 16  # requests kept at once; more are turned away, too
@@ -72,8 +73,9 @@ class Dispatcher:
         clock: Callable[[], float] = time.monotonic,
         max_pending_bytes: int = 256 << 20,
         id_of: Callable[[str, Any], bytes] = lambda service, handle: os.urandom(REQUEST_ID_BYTES),
+        poisoned: Callable[[bytes], None] = lambda request: None,
     ) -> None:
-        self._id_of = id_of
+        self._id_of, self._poisoned = id_of, poisoned
         self.takes_no_more = False  # another proxy gets callers' requests, too
         self.taken: list[bytes] | None = None  # those taken, once another proxy may get them too
         self._fault_of = fault_of
@@ -300,6 +302,7 @@ class Dispatcher:
             self.spec.name, self.spec.type, pending.deaths, request.hex(),
         )  # fmt: skip
         self._delivery.poisoned(request, pending)
+        self._poisoned(request)
         self._sender.forget(request, tuple(pending.open))
 
     def _after(self, request: bytes, verdict: Verdict) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from fogft.link.port import GatewayView, LinkStatus, ProbeAnswer
+from fogft.link.port import Answer, GatewayView, LinkStatus, ProbeAnswer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.model.spec import ServiceSpec
@@ -27,7 +27,10 @@ class Scene:
         self.clock = Clock()
         self.forwarder = type("Bounded", (Forwarder,), given)(clock=self.clock)
         self.dispatcher = Dispatcher(
-            ServiceSpec("/s", "std_srvs/srv/SetBool"), self.forwarder.respond, clock=self.clock
+            ServiceSpec("/s", "std_srvs/srv/SetBool"),
+            self.forwarder.respond,
+            clock=self.clock,
+            poisoned=self.forwarder.poisoned,
         )
         self.forwarder.use("/s", self.dispatcher)
         self.links = [FakeLink(0), FakeLink(1)]
@@ -50,6 +53,11 @@ class Scene:
     def answer(self, slot: int, payload: bytes) -> None:
         link = self.links[slot]
         self.dispatcher.answered(link, link.reply(payload))
+
+    def crash(self, slot: int, id: bytes) -> None:
+        self.dispatcher.answered(
+            self.links[slot], Answer(id, refusal=Refusal.CRASHED, service="/s")
+        )
 
 
 @pytest.fixture
@@ -99,6 +107,22 @@ def test_who_gives_up_stops_all_who_work_on_it(scene):
     assert scene.dispatcher.report()["pending"] == 0
     scene.answer(0, b"too late")
     assert incoming.outcome == [refused(Refusal.CANCELLED)]
+
+
+def test_what_services_died_over_is_refused_as_it_is_given_up_and_when_it_comes_again(scene):
+    """So the robot asks nobody else twice, and knows why."""
+    killer = scene.request()
+    for slot in (0, 1):
+        scene.crash(slot, killer.request_id)
+        scene.clock.now += 0.1
+        scene.dispatcher.tick()
+    scene.crash(0, killer.request_id)
+    assert killer.outcome == [refused(Refusal.CRASHED)]
+    asked = [len(link.offered) for link in scene.links]
+    assert scene.request().outcome == [refused(Refusal.CRASHED)]
+    assert scene.request(2).outcome == []
+    assert sum(len(link.offered) for link in scene.links) == sum(asked) + 1
+    assert scene.dispatcher.report()["poison"] == 1
 
 
 def test_a_deadline_ends_it(scene):
