@@ -47,6 +47,7 @@ PAGE = ROOT / "docs" / "measurements.md"
 HEADING = "## Beside other load balancers: `scripts/compare`"
 BALANCES = {"haproxy": "leastconn", "round robin": "roundrobin"}
 POISONED_S = 6.0
+LEARN_S = 3.0  # of the same load before each measurement: a changed policy begins to learn
 # So much of a processor an idle Ray Serve takes at most; after an overload it works on for long.
 CALM, CALM_LIMIT_S = 0.4, 60.0
 # So slow that the machine, which all processes share, is not what limits them.
@@ -156,6 +157,7 @@ def loads(folder: Path, shares: Sequence[float], seconds: float, rounds: int, ra
                     for name, measure in systems.items():
                         if name == "all" and share > 0.3:  # it has the capacity of one
                             continue
+                        measure(share, LEARN_S)
                         add(found[name], measure(share, seconds))
                 for name, result in found.items():
                     if result.asked:
@@ -204,13 +206,13 @@ def faults(folder: Path, rounds: int) -> Rows:
         with pool(folder / f"faults-{number}", "constant", FAULT_MEDIAN_S) as (rig, caller):
             measure = ours(rig, caller, "auto", FAULT_MEDIAN_S)
             for name, harm in FAULTS.items():
-                measure(FAULT_LOAD, 3.0)  # it knows its replicas
+                measure(FAULT_LOAD, LEARN_S)
                 rig.follow([1, 2])
                 rig.wait_ready([1, 2])
                 add(healthy, measure(FAULT_LOAD, FAULT_S))
                 rig.follow([0, 1, 2])
                 rig.wait_ready([0, 1, 2])
-                measure(FAULT_LOAD, 3.0)
+                measure(FAULT_LOAD, LEARN_S)
                 harm(rig.replicas[0])
                 asked, took = offer(asking(caller), FAULT_LOAD, FAULT_S, FAULT_MEDIAN_S)
                 add(at_fault[name], Result(asked, took))
@@ -275,8 +277,8 @@ def text(measured: Mapping[str, Rows], rounds: int, seconds: float) -> str:
 do not wait; a request has failed after 2 s. Load is a share of what three can do. `haproxy` is
 HAProxy with `leastconn`, `round robin` the same with `roundrobin`, before HTTP servers that sleep
 alike; `ray serve` is Ray Serve with three replicas. Systems in turns, {rounds} rounds of
-{seconds:.0f} s. Processor time is that of the proxies, or of the balancer, a request; of Ray Serve
-all its processes count.
+{seconds:.0f} s after {LEARN_S:.0f} s of the same load, as a changed policy learns. Processor time
+is that of the proxies, or of the balancer, a request; of Ray Serve all its processes count.
 
 {table(["service", "load", "system", *cost], measured["loads"])}
 
