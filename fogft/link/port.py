@@ -187,6 +187,10 @@ class Link(Protocol):
     def leaving(self) -> bool:
         """Whether the replica said that its machine will be taken. Cheap."""
 
+    @property
+    def thin(self) -> bool:
+        """Whether its path was seen to drain slowly. Cheap."""
+
     def offer(
         self,
         service: str,

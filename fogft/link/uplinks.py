@@ -99,6 +99,11 @@ class UplinksLink:
         """Whether the replica is leaving."""
         return any(link.leaving for link in self._links)
 
+    @property
+    def thin(self) -> bool:
+        """Whether all uplinks were seen to drain slowly."""
+        return all(link.thin for link in self._links)
+
     def offer(
         self,
         service: str,

@@ -93,7 +93,8 @@ class Auto(Learning):
         known.asked(request, now)
         if len(able) == 1:
             return able  # there is nobody to hedge it at
-        others = able if self._spares.chosen(request) else self._stale(able, now)
+        copied = self._spares.chosen(request) and not self.dear
+        others = able if copied else self._stale(able, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
         if self._spares.share < 1.0 and others is able:
             spares = spares[:-1]  # spares were in the way: from now on they leave a replica free

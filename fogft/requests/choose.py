@@ -23,6 +23,7 @@ class Choose:
 
     moves_on = True  # another replica is asked at once when nobody works on a request
     look_at = NEVER  # when `more` wants to be asked next, though nothing else has happened
+    dear = False  # each further copy of the next request costs an uplink much
     news = False  # it has learned something about requests that were not due yet
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:

@@ -34,7 +34,7 @@ class FakeLink:
     def __init__(self, slot: int, *, generation: int = 1, room: int = 1000) -> None:
         self.peer = Peer(ReplicaId(UID, slot, generation), f"h{slot}:1", f"replica.{slot}")
         self.ready: frozenset[str] = frozenset()
-        self.leaving = False
+        self.leaving = self.thin = False
         self.room = room
         self.offered: list[tuple[str, bytes, bytes, float]] = []
         self.handled: list[Handling] = []

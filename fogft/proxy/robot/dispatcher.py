@@ -15,6 +15,7 @@ from typing import Any
 
 from fogft.counters import worth_logging
 from fogft.errors import RosError
+from fogft.link.credit import LARGE_BYTES
 from fogft.link.port import Answer, Link
 from fogft.metrics.outcomes import Outcome
 from fogft.model.names import REQUEST_ID_BYTES
@@ -141,6 +142,8 @@ class Dispatcher:
                 return False
             links, able = self._sender.links, self._sender.able
             deadline = now + timeout_s
+            dear = len(payload) >= LARGE_BYTES and all(link.thin for link in links.values())
+            requests.choose.dear = dear
             chosen = requests.begin(
                 request, payload, able, deadline=deadline, now=now, handle=handle
             )

@@ -122,7 +122,7 @@ class SimulatedLink:
         self.replica = replica
         self.rtt_s = rtt_s
         self.ready = frozenset({"/s"})
-        self.usable, self.leaving = True, False
+        self.usable, self.leaving, self.thin = True, False, False
         self.open: set[bytes] = set()
         self.forgotten: set[bytes] = set()
         self.offers = 0

@@ -65,6 +65,30 @@ def test_every_replica_gets_the_request_under_one_id():
     assert all((name, payload) == ("/s", b"q") for name, _, payload, _ in offers)
 
 
+@pytest.mark.parametrize(
+    ("thin", "size", "hedging", "copies"),
+    [
+        ((True, True, True), 100_000, HedgingMode.AUTO, 1),
+        ((True, True, True), 1_000, HedgingMode.AUTO, 3),
+        ((True, False, True), 100_000, HedgingMode.AUTO, 3),  # one replica is far, not the uplink
+        ((True, True, True), 100_000, ALL, 3),
+    ],
+)
+def test_over_a_thin_uplink_what_is_large_is_copied_only_if_the_pool_file_says_so(
+    thin, size, hedging, copies
+):
+    scene = Scene(3, hedging=hedging)
+    scene.pass_time(60.0)
+    scene.dispatcher.submit(b"q", "first")  # all are tried
+    scene.answer(0, b"a")
+    for link in scene.links[1:]:
+        scene.dispatcher.late(link, link.reply(b"a"))
+    for link, drains_slowly in zip(scene.links, thin, strict=True):
+        link.thin = drains_slowly
+    scene.dispatcher.submit(bytes(size), "caller")
+    assert sum(len(link.offered) for link in scene.links) == 3 + copies
+
+
 def test_a_burst_waits_for_its_end_on_every_link_and_no_longer():
     scene = Scene(2)
     scene.dispatcher.burst(True)

@@ -101,6 +101,12 @@ class ZenohLink:
         return live is not None and live.attempts.sending
 
     @property
+    def thin(self) -> bool:
+        """Whether its path was seen to drain slowly."""
+        live = self._live
+        return live is not None and live.flow.thin
+
+    @property
     def leaving(self) -> bool:
         """Whether the replica is leaving."""
         answer = self._probing.answer

@@ -118,9 +118,11 @@ def test_a_large_request_through_a_slow_relay_leaves_links_alone(
     try:
         links = [dialer.dial(peer(r.endpoint, n), keys(n), owner) for n, r in enumerate(relays)]
         wait_for(lambda: all(link.usable for link in links))
+        assert not any(link.thin for link in links)
         for link in links:
             assert link.offer(SERVICE, request_id(1), MEGABYTE, LONG_S)
         wait_for(lambda: len(owner.of(1)) == 2, LONG_S)
+        assert all(link.thin for link in links)
         never_given_up(owner, links, 2)
     finally:
         dialer.close()
