@@ -232,7 +232,7 @@ class Auto(Learning):
         self._wanting.pop(request, None)
         for replica, begun in open.items():
             known = self._replicas[replica]
-            known.overtaken(begun, now)
+            known.overtaken(request, begun, now)
             if expired:
                 known.doubt(begun, now)
 

@@ -28,8 +28,8 @@ class Latencies:
         self._newest: float | None = None
         self.samples = 0
 
-    def add(self, took_s: float, now: float) -> None:
-        """Count a latency, in seconds."""
+    def add(self, took_s: float, now: float, share: float = 1.0) -> None:
+        """Count a latency, in seconds, for that share of one."""
         if self._newest is not None and now > self._newest:
             self._weight *= 2.0 ** min((now - self._newest) / self.half_life_s, 60.0)
         self._newest = now
@@ -39,8 +39,8 @@ class Latencies:
         bucket = 0  # whose upper end is the first that is not below it
         if took_s > _FIRST_S:
             bucket = min(_BUCKETS - 1, math.ceil(math.log(took_s / _FIRST_S) / _LOG_GROWTH))
-        self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight
-        self._total += self._weight
+        self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight * share
+        self._total += self._weight * share
         self.samples += 1
 
     def _rescale(self) -> None:

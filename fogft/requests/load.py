@@ -26,6 +26,7 @@ _UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
 _AVOIDED_S = 0.1
 _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
+_MANY = 16.0  # requests ahead: behind more, a time tells little of what is unusual
 _DEMAND_OVER_S, _DEMAND_STEP_S = 10.0, 0.1
 _TOO_FULL, _FULL = 0.95, 0.8  # a share of what replicas can do: from when on it is too much
 
@@ -79,8 +80,9 @@ class ReplicaLoad:
         self.doubted = False  # an attempt is overdue, and it has ended none since that one began
         self.ended_at = -NEVER  # when it last ended an attempt, with an answer or too late for one
         self.asked_at = -NEVER
-        # Our attempts that it has not ended, oldest first: when each began, and is overdue.
-        self._at_work: dict[bytes, tuple[float, float]] = {}
+        # Our attempts that it has not ended, oldest first: when each began, when it is overdue, and
+        # for how much its time counts.
+        self._at_work: dict[bytes, tuple[float, float, float]] = {}
         self._slots = 0
         self._rtt_s: float | None = None
         self._others = 0  # requests of other robots
@@ -117,7 +119,7 @@ class ReplicaLoad:
     @property
     def oldest_begun(self) -> float:
         """When the oldest of our open requests there began; infinity for none."""
-        for begun, _ in self._at_work.values():
+        for begun, _, _ in self._at_work.values():
             return begun
         return NEVER
 
@@ -152,7 +154,7 @@ class ReplicaLoad:
 
     def overdue_at(self, request: bytes, begun: float) -> float:
         """Return when an attempt is slower than nearly all others and than its expected wait."""
-        return self._at_work.get(request, (0.0, begun + self.delay_s))[1]
+        return self._at_work.get(request, (0.0, begun + self.delay_s, 1.0))[1]
 
     def doubtful_at(self, begun: float) -> float:
         """Return when an attempt that began then is long overdue.
@@ -168,15 +170,17 @@ class ReplicaLoad:
 
     def asked(self, request: bytes, now: float) -> None:
         """Note an attempt about to be sent."""
-        expected_s = (self._rtt_s or 0.0) + self.service_s * (1 + self.ahead(now))
-        self._at_work[request] = now, now + _LATE * max(self.delay_s, expected_s)
+        ahead = self.ahead(now)
+        overdue_s = _LATE * max(self.delay_s, (self._rtt_s or 0.0) + self.service_s * (1 + ahead))
+        share = min(1.0, (_MANY / (1 + ahead)) ** 2)
+        self._at_work[request] = now, now + overdue_s, share
         self.asked_at = now
 
     def heard(self, request: bytes, load: Load, now: float) -> None:
         """Take its reported load, plus what was sent within the last round trip."""
         since = now - (self._rtt_s or 0.0)
         seen = len(self._at_work) - (request in self._at_work)
-        for id, (begun, _) in reversed(self._at_work.items()):  # the newest first: they are few
+        for id, (begun, _, _) in reversed(self._at_work.items()):  # the newest first: few
             if begun <= since:
                 break
             seen -= id != request
@@ -196,7 +200,8 @@ class ReplicaLoad:
         self._avoided_s = 0.0
         if sent is None:
             return
-        took_s = now - sent[0]
+        begun, _, share = sent
+        took_s = now - begun
         if load is not None:
             rtt_s = max(0.0, took_s - load.spent_s)
             known = self._rtt_s
@@ -204,7 +209,7 @@ class ReplicaLoad:
                 self._rtt_s = rtt_s
             else:
                 self._rtt_s = known + _RTT_GAIN * (rtt_s - known)
-        self._took(took_s, now)
+        self._took(took_s, now, share)
 
     def dropped(self, request: bytes) -> None:
         """Note that an attempt has ended without the replica working on it."""
@@ -216,13 +221,13 @@ class ReplicaLoad:
         self._avoided_s = min(_AVOIDED_LIMIT_S, max(_AVOIDED_S, 2 * self._avoided_s))
         self._avoided_until = now + self._avoided_s
 
-    def overtaken(self, begun: float, now: float) -> None:
+    def overtaken(self, request: bytes, begun: float, now: float) -> None:
         """Learn from a stopped attempt, if it was already unusually slow."""
         if now - begun >= self.delay_s:
-            self._took(now - begun, now)
+            self._took(now - begun, now, self._at_work.get(request, (0.0, 0.0, 1.0))[2])
 
-    def _took(self, seconds: float, now: float) -> None:
-        self.latencies.add(seconds, now)
+    def _took(self, seconds: float, now: float, share: float) -> None:
+        self.latencies.add(seconds, now, share)
         samples = self.latencies.samples
         if samples >= self._delay_holds_until:  # of many, one more makes little difference
             self._delay_holds_until = samples + 1 + min(samples // 16, 15)

@@ -88,6 +88,8 @@ class MemoryLink:
         answer = self._status.probe_answer
         return answer.ready if answer is not None and self.usable else frozenset()
 
+    thin = False
+
     @property
     def leaving(self) -> bool:
         """Whether the replica is leaving."""
@@ -135,12 +137,12 @@ class MemoryLink:
     def _end(self, session: Session, attempt: _Attempt, answer: Answer) -> None:
         if session.window.remove(attempt):
             session.attempts.remove(attempt)
-            self._events.answered(self, answer._replace(service=attempt.service))
+            self._events.answered(self, replace(answer, service=attempt.service))
             if session.window.regained_room():
                 self._events.changed(self)
             return
         self._forgotten.pop(attempt.request_id, None)
-        self._events.late(self, answer._replace(service=attempt.service))
+        self._events.late(self, replace(answer, service=attempt.service))
 
     def send(self) -> None:
         """Do nothing: it was sent."""

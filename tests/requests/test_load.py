@@ -227,9 +227,9 @@ def test_one_of_which_little_is_known_is_doubted_after_seconds_only():
 def test_only_what_was_slow_already_is_learned_of_what_was_stopped():
     found = known()
     before = found.latencies.samples
-    found.overtaken(20.0, 20.0 + 0.9 * found.delay_s)
+    found.overtaken(A, 20.0, 20.0 + 0.9 * found.delay_s)
     assert found.latencies.samples == before
-    found.overtaken(20.0, 20.5)
+    found.overtaken(A, 20.0, 20.5)
     assert found.latencies.samples == before + 1
 
 
