@@ -116,7 +116,8 @@ class Forwarder:
 
         As one death: a robot that has another gateway asks that too, and believes nobody alone.
         """
-        self._poison.append(id)
+        with self._lock:
+            self._poison.append(id)
         self._stop(id, Refusal.CRASHED)
 
     def _stop(self, id: bytes, reason: Refusal) -> None:

@@ -178,11 +178,11 @@ class Responder:
             return Refusal.EXPIRED, None
         if not self._is_ready(service) or service not in self._clients:
             return Refusal.NOT_READY, None
-        queue = self._queues.get(service) or self._queue(service)
+        queue = self._queue(service)
         if incoming.handling is Handling.DROP_IF_BUSY and not queue.has_free_slot(now):
             return Refusal.BUSY, None
         deadline = now + remaining_s
-        hopeless = queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s)
+        hopeless = queue.hopeless(incoming.robot, deadline, remaining_s)
         if hopeless or not self.known.large.has_room(len(incoming.payload)):
             return Refusal.OVERLOADED, None
         if self.known.held < self.held_limit:

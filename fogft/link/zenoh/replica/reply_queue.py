@@ -141,7 +141,7 @@ class ReplyQueues:
         Replies of one connection's `token` never wait for another's. With `more`, others will soon
         follow, to leave in one message with it.
         """
-        size = len(reply.payload)
+        size, counted = len(reply.payload), "refused" if reply.refusal else "replies"
         small = size <= SMALL_BYTES and not reply.may_pack
         if small and not more and not self._closed and not threads.is_this():
             try:
@@ -150,7 +150,7 @@ class ReplyQueues:
                 self._failed(error)
                 sent = True
             if sent:
-                self._counters.add("refused" if reply.refusal else "replies")
+                self._counters.add(counted)
                 return
         with self._lock:
             if self._closed:
@@ -162,7 +162,6 @@ class ReplyQueues:
             queue.waiting += 1
             queue.large.add(size)
             queue.replies.put(reply)
-        counted = "refused" if reply.refusal else "replies"
         self._counters.add("reply_dropped" if dropped else counted)
 
     def end(self, token: bytes, robot: str, query: QueryEnd) -> None:
