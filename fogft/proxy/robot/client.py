@@ -6,13 +6,11 @@ Not here: which links there are (`links`), files and signals (`process`), reques
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 from fogft.errors import RosError
@@ -77,7 +75,10 @@ class ClientProxy:
         self._topics = TopicsOnRobot(self._wake, merge, clock)
         # Until when the thread of `run_once` sleeps; it is woken by who wants a look sooner.
         self._sleeps_until = NEVER
-        self._sooner: SimpleQueue[None] = SimpleQueue()
+        # Released to wake it. No queue: before Python 3.13 its `get` waits for ever where a signal
+        # is handled as its time ends.
+        self._sooner = threading.Lock()
+        self._sooner.acquire()
         self._look_now = self._changed = False
 
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
@@ -214,7 +215,10 @@ class ClientProxy:
             self._look_now = True
         if at < self._sleeps_until:
             self._sleeps_until = at  # once is enough
-            self._sooner.put(None)
+            try:  # noqa: SIM105 - on the way of requests, where a context manager costs thrice
+                self._sooner.release()
+            except RuntimeError:
+                pass  # another thread has woken it just now
 
     # -- the proxy's own thread -----------------------------------------------------------
 
@@ -255,8 +259,7 @@ class ClientProxy:
             if look_at <= now or self._look_now:
                 break
             self._sleeps_until = min([look_at, *[now + one.rest_s(now) for one in waiting]])
-            with contextlib.suppress(Empty):
-                self._sooner.get(timeout=max(0.0, self._sleeps_until - now))
+            self._sooner.acquire(timeout=max(0.0, self._sleeps_until - now))
             now = self._clock()
         self._look_now = False
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import signal
+import threading
+import time
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -30,8 +34,8 @@ def membership(*members: Member, version: int = 1, epoch: int = 1, uid: str = UI
 
 
 class Scene:
-    def __init__(self, *names: str) -> None:
-        self.clock = Clock()
+    def __init__(self, *names: str, clock: Any = None) -> None:
+        self.clock = clock or Clock()
         self.node = FakeNode()
         self.dialer = FakeDialer()
         self.proxy = ClientProxy(
@@ -271,6 +275,28 @@ def test_a_proxy_whose_take_loop_ended_says_so_and_does_not_go_on():
     scene.node.alive = False
     with pytest.raises(RosError):
         scene.proxy.run_once(0)
+
+
+def test_a_signal_that_is_handled_as_the_wait_ends_does_not_make_it_wait_for_ever():
+    """On a busy machine SIGTERM was handled so late that nothing ended the wait any more."""
+    scene, handled = Scene(clock=time.monotonic), threading.Event()
+
+    def handle(*_: object) -> None:
+        time.sleep(0.1)  # past the end of the wait
+        handled.set()
+
+    rescue = threading.Timer(10.0, scene.proxy.look_again)  # should it hang
+    old = signal.signal(signal.SIGALRM, handle)
+    try:
+        scene.proxy.run_once(0)
+        rescue.start()
+        signal.setitimer(signal.ITIMER_REAL, 0.02)
+        scene.proxy.run_once(0.05)
+        assert rescue.is_alive(), "only the rescue has ended the wait"
+    finally:
+        signal.signal(signal.SIGALRM, old)
+        rescue.cancel()
+    assert handled.is_set()
 
 
 def told(slot: int, kind: str) -> ProbeAnswer:
