@@ -4,7 +4,10 @@ SMALL_BYTES = 16 << 10
 
 
 class ByteLimit:
-    """The large messages held, in bytes: within a limit together, or one of any size."""
+    """The large messages held, in bytes: within a limit together, or one of any size.
+
+    Who has many small ones need not ask about these.
+    """
 
     def __init__(self, limit: int) -> None:
         self.limit = limit

@@ -19,18 +19,13 @@ LIMIT = 64  # entries
 ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload leaves alone: it does not wait, nor make wait
 BYTES_LIMIT = 16 << 10  # of all payloads together
 
-_FIRST = bytes((frame.VERSION | 0x10,))
-_STAMPED = len(_FIRST) + STAMP_BYTES
+BATCH = bytes((frame.VERSION | 0x10,))  # the first byte of a header that is one of several
+_STAMPED = len(BATCH) + STAMP_BYTES
 _REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdBI")  # id, remaining seconds, handling, length
 _ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s{frame.LOAD_BYTES}s?I")  # ..., refusal, length
 
 Requests = Sequence[tuple[bytes, float, int, bytes]]  # id, remaining seconds, handling, payload
 Answers = Sequence[tuple[bytes, bytes, bytes, str]]  # id, load, payload, refusal
-
-
-def is_batch(header: bytes) -> bool:
-    """Whether a message with this header carries several."""
-    return header[:1] == _FIRST
 
 
 def encode_requests(
@@ -41,19 +36,18 @@ def encode_requests(
     for id, remaining_s, handling, payload in requests:
         parts.append(_REQUEST.pack(id, remaining_s, handling, len(payload)))
         parts.append(payload)
-    return _FIRST + seen + origin, b"".join(parts)
+    return BATCH + seen + origin, b"".join(parts)
 
 
 def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
     """Return the requests of a batch, each with a header of its own. Raises FrameError."""
-    if not is_batch(header):
+    if header[:1] != BATCH:
         raise FrameError("no batch of requests")
     seen = header[1:_STAMPED]
     token, robot = frame.read_origin(header[_STAMPED:])
     found = []
     for (id, remaining_s, flags, _), part in _entries(_REQUEST, payload):
-        frame.check_remaining(remaining_s)
-        handling = frame.read_handling(flags)
+        handling = frame.read_handling(flags, remaining_s)
         found.append((RequestHeader(id, remaining_s, token, robot, seen, handling=handling), part))
     return found
 
@@ -65,12 +59,12 @@ def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
         said = reason.encode("ascii") if reason else payload
         parts.append(_ANSWER.pack(id, load, bool(reason), len(said)))
         parts.append(said)
-    return _FIRST + stamp, b"".join(parts)
+    return BATCH + stamp, b"".join(parts)
 
 
 def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
     """Return the stamp and the answers of a batch. Raises FrameError: it is not one."""
-    if not is_batch(header) or len(header) != _STAMPED:
+    if header[:1] != BATCH or len(header) != _STAMPED:
         raise FrameError("no batch of answers")
     found = []
     for (id, said, refused, _), part in _entries(_ANSWER, payload):

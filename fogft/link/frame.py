@@ -91,12 +91,6 @@ def read_origin(origin: bytes) -> tuple[bytes, str]:
     return token, robot
 
 
-def check_remaining(remaining_s: float) -> None:
-    """Refuse a remaining time that is negative, too long, or no number."""
-    if not 0 <= remaining_s <= LONGEST_S:  # false for NaN too
-        raise FrameError(f"a remaining time of {remaining_s} s")
-
-
 def encode_request(
     request_id: bytes,
     remaining_s: float,
@@ -121,27 +115,22 @@ def decode_request(frame: bytes) -> RequestHeader:
     version, flags, request_id, remaining_s, seen = _REQUEST.unpack_from(frame)
     if version != VERSION:
         check_version(version)
-    handling = read_handling(flags & ~_PACKING)
-    check_remaining(remaining_s)
-    token, robot = read_origin(frame[_ORIGIN_AT:])
-    return RequestHeader(
-        request_id,
-        remaining_s,
-        token,
-        robot,
-        seen,
-        flags & _PACKED != 0,
-        flags & _MAY_PACK != 0,
-        flags & _READS_PACKED != 0,
-        handling,
+    handling = read_handling(flags & ~_PACKING, remaining_s)
+    packing = flags & _PACKED != 0, flags & _MAY_PACK != 0, flags & _READS_PACKED != 0
+    # `RequestHeader(...)` would be one more call of Python.
+    return tuple.__new__(
+        RequestHeader,
+        (request_id, remaining_s, *read_origin(frame[_ORIGIN_AT:]), seen, *packing, handling),
     )
 
 
-def read_handling(flags: int) -> Handling:
-    """Read how a replica is asked to handle the request."""
+def read_handling(flags: int, remaining_s: float) -> Handling:
+    """Read how a replica is asked to handle a request; refuse a time that is negative or no time."""
     handling = _HANDLINGS.get(flags)
     if handling is None:
         raise FrameError(f"a request with flags {flags:#x}")
+    if not 0 <= remaining_s <= LONGEST_S:  # false for NaN too
+        raise FrameError(f"a remaining time of {remaining_s} s")
     return handling
 
 
@@ -159,7 +148,7 @@ def decode_load(frame: bytes) -> Load | None:
     """Decode a replica's load; None if it gives none. `frame` has `LOAD_BYTES`."""
     if frame == NO_LOAD:
         return None
-    load = Load(*_LOAD.unpack(frame))
+    load = tuple.__new__(Load, _LOAD.unpack(frame))
     if not (0 <= load.service_s <= LONGEST_S and 0 <= load.spent_s <= LONGEST_S):
         raise FrameError(f"a load of {load.service_s} s and {load.spent_s} s")
     return load

@@ -30,7 +30,7 @@ class Throughput:
 
     def __init__(self) -> None:
         self.steady_bytes_per_s: float | None = None
-        self._spans: tuple[tuple[float, float], ...] = ()  # replaced, never changed: any thread
+        self.spans: tuple[tuple[float, float], ...] = ()  # replaced, never changed: any thread
         self._before: float | None = None  # the rate of the span before this one
         self._open = False  # whether a span has begun
         self._moved = 0
@@ -62,14 +62,14 @@ class Throughput:
         rate = self._moved / self._lasted_s
         if self._before is not None:
             self.steady_bytes_per_s = max(self._before, rate)
-        self._spans = (*(span for span in self._spans if now - span[0] <= KEPT_S), (now, rate))
+        self.spans = (*(span for span in self.spans if now - span[0] <= KEPT_S), (now, rate))
         self._before, self._moved, self._lasted_s = rate, 0, 0.0
 
     def bytes_per_s(self, now: float) -> float | None:
         """Return the recent throughput; None if unknown."""
-        if not self._spans:  # the usual case
+        if not self.spans:  # the usual case
             return None
-        rates = [rate for at, rate in self._spans if now - at <= KEPT_S]
+        rates = [rate for at, rate in self.spans if now - at <= KEPT_S]
         return median_high(rates) if len(rates) >= ENOUGH else None
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from itertools import count
 from queue import SimpleQueue
 
-from fogft.byte_limit import ByteLimit
+from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.link import batch_frames
 from fogft.link.frame import CANCEL_LIMIT
 from fogft.requests.load import Handling
@@ -62,11 +62,13 @@ class LinkWindow:
         with self._lock:
             if self._closed or attempt.request_id in self._open:
                 return False
-            if len(self._open) >= self.limit or not self.large.has_room(attempt.size):
+            large = attempt.size > SMALL_BYTES
+            if len(self._open) >= self.limit or (large and not self.large.has_room(attempt.size)):
                 self.declined = True
                 return False
             self._open[attempt.request_id] = attempt
-            self.large.add(attempt.size)
+            if large:
+                self.large.add(attempt.size)
             return True
 
     def attempts(self) -> list[OpenAttempt]:
@@ -84,7 +86,8 @@ class LinkWindow:
             if self._open.get(attempt.request_id) is not attempt:
                 return False
             del self._open[attempt.request_id]
-            self.large.remove(attempt.size)
+            if attempt.size > SMALL_BYTES:
+                self.large.remove(attempt.size)
             return True
 
     def forget(self, request_id: bytes) -> OpenAttempt | None:

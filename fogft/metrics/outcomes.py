@@ -58,11 +58,6 @@ class Outcomes:
         # When services last died over a request that was then given up; wall clock.
         self.poisoned_at: float | None = None
 
-    def received(self, size_bytes: int) -> None:
-        """Count a received request."""
-        self.count["received"] += 1
-        self.count["request_bytes"] += size_bytes
-
     def won(self, replica: int, took_s: float, size_bytes: int) -> None:
         """Count a replica's first response, and its size."""
         self.count["answered"] += 1

@@ -196,7 +196,7 @@ class Auto(Learning):
             for other in open:
                 if other != replica and not self.is_spare(request, other):
                     self._beaten[request, other] = now
-        super().answered(request, open, replica, load, now)
+        self._replicas[replica].answered(request, load, now)
         if self._wanting:
             self._released(replica, now)
 

@@ -44,7 +44,10 @@ class Choose:
         """Note that a chosen replica was not asked: its window was full, or there was no need."""
 
     def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
-        """Take a replica's load, reported with the end of an attempt, which is reported next."""
+        """Take the load that a replica tells with the end of an attempt, which is noted next.
+
+        But for an answer that ends its request: `answered` takes that one's load.
+        """
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float

@@ -19,6 +19,7 @@ class ConcurrencyLimit:
         self._most = most
         self._given = given
         self.limit = most if given is None else given
+        self.known = given or 0  # the limit, if given or learned; else 0
         self.takes_s = 0.0  # recent service time of a request, in seconds; 0 before the first
         self.service_s = 0.0  # the same, divided by how many were at work
         # Of the limit in force, while as many as it allows were at work:
@@ -26,11 +27,6 @@ class ConcurrencyLimit:
         self._sum_s = 0.0
         self._kept: tuple[int, float] | None = None  # during a trial: the limit to compare with
         self._tried: dict[int, float] = {}  # when each limit was last found not to be better
-
-    @property
-    def known(self) -> int:
-        """The limit, if given or learned; else 0."""
-        return self.limit if self._given is not None or self._tried else 0
 
     @property
     def in_hand(self) -> int:
@@ -78,6 +74,7 @@ class ConcurrencyLimit:
 
     def _set(self, limit: int) -> None:
         self.limit = limit
+        self.known = limit if self._tried else 0
         self._samples = 0
         self._sum_s = 0.0
 

@@ -193,7 +193,9 @@ class ReplicaLoad:
                 del self._at_work[lost]
 
     def answered(self, request: bytes, load: Load | None, now: float) -> None:
-        """Note that it has ended an attempt."""
+        """Note that it has ended an attempt, with the load that it told."""
+        if load is not None:
+            self.heard(request, load, now)
         sent = self._at_work.pop(request, None)
         self.ended_at = now
         self.doubted = False

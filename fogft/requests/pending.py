@@ -224,23 +224,24 @@ class PendingRequests:
         Returns what it means; the request that it answers, None where it comes too late or is no
         success; who else is to stop working on that; what is to be done where it goes on.
         """
-        if load is not None and request is not None:
-            self.choose.heard(request, replica, load, now)
         pending = None if request is None else self._pending.get(request)
         means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
             return means, None, (), Verdict.LATE
-        if means is Means.SUCCESS:
-            if pending is None or now >= pending.deadline:
-                self.choose.late(request, replica, now, answered=True)
-                return means, None, (), Verdict.LATE
-            for other in pending.died_at - {replica}:
-                self._alarms.was_false(other, now)
+        if means is Means.SUCCESS and pending is not None and now < pending.deadline:
+            if pending.died_at:
+                for other in pending.died_at - {replica}:
+                    self._alarms.was_false(other, now)
             open = pending.open
             self.choose.answered(request, open, replica, load, now)
             losers = [other for other in open if other != replica] if len(open) > 1 else ()
-            self._close(request, pending)
+            self._take_out(request, pending)
             return means, pending, losers, Verdict.WON
+        if load is not None:
+            self.choose.heard(request, replica, load, now)
+        if means is Means.SUCCESS:
+            self.choose.late(request, replica, now, answered=True)
+            return means, None, (), Verdict.LATE
         verdict = Verdict.LATE
         if means is Means.UNDECIDED:
             self._failed(request, pending, replica, now, counts=False, bar=True)
@@ -318,7 +319,7 @@ class PendingRequests:
             return None
         if any(replica not in pending.barred for replica in able):
             return None
-        self._close(request, pending)
+        self._take_out(request, pending)
         return pending
 
     def stop(self, request: bytes, now: float) -> Pending | None:
@@ -326,7 +327,7 @@ class PendingRequests:
         pending = self._pending.get(request)
         if pending is not None:
             self.choose.stopped(request, pending.open, now)
-            self._close(request, pending)
+            self._take_out(request, pending)
         return pending
 
     def expire(self, now: float) -> list[tuple[bytes, Pending]]:
@@ -336,7 +337,7 @@ class PendingRequests:
         expired = [entry for entry in self._pending.items() if entry[1].deadline <= now]
         for request, pending in expired:
             self.choose.stopped(request, pending.open, now, expired=True)
-            self._take_out(request, pending)
+            self._take_out(request, pending, over=False)
         left = (pending.deadline for pending in self._pending.values())
         self.soonest_deadline = min(left, default=NEVER)
         return expired
@@ -347,7 +348,7 @@ class PendingRequests:
         if pending is not None:
             self._alarms.were_right(pending.died_at)
             self.choose.stopped(request, pending.open, now)
-            self._take_out(request, pending)
+            self._take_out(request, pending, over=False)
         return pending
 
     def fallback_answered(
@@ -363,13 +364,11 @@ class PendingRequests:
             return None, False
         return self.stop(request, now), False
 
-    def _close(self, request: bytes, pending: Pending) -> None:
-        self._take_out(request, pending)
-        if self.fallback is not None:
-            self.fallback.ended(request)
-
-    def _take_out(self, request: bytes, pending: Pending) -> None:
+    def _take_out(self, request: bytes, pending: Pending, *, over: bool = True) -> None:
+        """Remove a request; unless it is `over`, the fallback may still answer it."""
         del self._pending[request]
         self._short.pop(request, None)
         self.held_bytes -= len(pending.payload)
         self.decide.closed(request, pending)
+        if over and self.fallback is not None:
+            self.fallback.ended(request)

@@ -91,9 +91,9 @@ def test_a_batch_is_no_single_frame_and_the_other_way_round() -> None:
     """So that neither is ever taken for the other."""
     header, content = batch_frames.encode_requests([(bytes(16), 1.0, 0, b"x")], ORIGIN)
     single = frame.encode_request(bytes(16), 1.0, ORIGIN)
-    assert batch_frames.is_batch(header)
-    assert not batch_frames.is_batch(single)
-    assert not batch_frames.is_batch(frame.encode_answer(NO_STAMP, bytes(16), packed=True))
+    packed = frame.encode_answer(NO_STAMP, bytes(16), packed=True)
+    assert header[:1] == batch_frames.BATCH
+    assert batch_frames.BATCH not in (single[:1], packed[:1])
     with pytest.raises(FrameError):
         frame.decode_request(header)
     with pytest.raises(FrameError):

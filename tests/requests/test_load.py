@@ -236,7 +236,7 @@ def test_only_what_was_slow_already_is_learned_of_what_was_stopped():
 def test_an_answer_to_what_is_not_known_says_that_it_lives_and_no_more():
     found = known()
     found.doubted = True
-    found.answered(B, says(service_s=9.0, spent_s=0.0), 20.0)
+    found.answered(B, None, 20.0)
     assert (found.doubted, found.ended_at) == (False, 20.0)
     assert found.expected_s(20.0, 0.1) == pytest.approx(0.1)
 

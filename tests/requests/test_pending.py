@@ -312,6 +312,11 @@ class Told(All):
     def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
         self.told.append(("heard", request, replica, load))
 
+    def answered(
+        self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
+    ) -> None:
+        self.told.append(("answered", request, replica, load))
+
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         self.told.append(("failed", request, replica, fault))
 
@@ -342,7 +347,7 @@ def test_a_policy_is_told_whose_fault_a_refusal_is(refusal):
     fault = Effect.FAULT in refusal.effect
     assert told(lambda r: r.refused(A, 1, refusal, 1.0)) == [("failed", A, 1, fault)]
     late = told(lambda r: won(r, A, 2, 1.0), lambda r: r.refused(A, 1, refusal, 2.0))
-    assert late == [("late", A, 1, False)]
+    assert late == [("answered", A, 2, None), ("late", A, 1, False)]
 
 
 def test_a_policy_is_told_how_each_attempt_ends():
@@ -354,7 +359,9 @@ def test_a_policy_is_told_how_each_attempt_ends():
         ("late", A, 1, True),
     ]
     assert told(lambda r: won(r, A, 1, 10.0)) == [("late", A, 1, True)], "at the deadline"
-    assert told(lambda r: r.answered(A, A, 1, OK, True, load, 1.0)) == [("heard", A, 1, load)]
+    assert told(lambda r: r.answered(A, A, 1, OK, True, load, 1.0)) == [("answered", A, 1, load)]
+    late = told(lambda r: won(r, A, 1, 1.0), lambda r: r.answered(A, A, 2, OK, True, load, 2.0))
+    assert late == [("answered", A, 1, None), ("heard", A, 2, load), ("late", A, 2, True)]
     assert told(lambda r: r.declined(A, 1)) == [("declined", A, 1, True)]
     assert told(lambda r: r.attempt(A, 1, 1.0)) == [("declined", A, 1, False)], "it has it"
     assert told(lambda r: r.stop(A, 1.0)) == [("stopped", A, [1, 2], False)]

@@ -8,7 +8,7 @@ owner's lock.
 import heapq
 from collections import OrderedDict
 
-from fogft.byte_limit import ByteLimit
+from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.proxy.replica.service_queue import Job
 
 _DEADLINES_KEPT = 1024  # of jobs that were forgotten
@@ -56,12 +56,14 @@ class KnownRequests:
             self._deadlines = [due for due, job in live if job and job.deadline == due[0]]
             heapq.heapify(self._deadlines)
         self.held += 1
-        self.large.add(job.size)
+        if job.size > SMALL_BYTES:
+            self.large.add(job.size)
 
     def release(self, job: Job) -> None:
         """Note that a job is done."""
         self.held -= 1
-        self.large.remove(job.size)
+        if job.size > SMALL_BYTES:
+            self.large.remove(job.size)
 
     def forget(self, job: Job) -> None:
         """Forget a finished job, so that a copy is run again."""

@@ -14,11 +14,12 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 
+from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.known_requests import KnownRequests
-from fogft.proxy.replica.service_queue import HOLD_LIMIT_S, Job, ServiceQueue
+from fogft.proxy.replica.service_queue import HOLD_LIMIT_S, TOGETHER_S, Job, ServiceQueue
 from fogft.requests.load import Handling
 from fogft.ros.port import RosClient
 
@@ -178,12 +179,14 @@ class Responder:
             return Refusal.EXPIRED, None
         if not self._is_ready(service) or service not in self._clients:
             return Refusal.NOT_READY, None
-        queue = self._queue(service)
+        queue = self._queues.get(service) or self._queue(service)
         if incoming.handling is Handling.DROP_IF_BUSY and not queue.has_free_slot(now):
             return Refusal.BUSY, None
         deadline = now + remaining_s
-        hopeless = queue.hopeless(incoming.robot, deadline, remaining_s)
-        if hopeless or not self.known.large.has_room(len(incoming.payload)):
+        if queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s):
+            return Refusal.OVERLOADED, None
+        size = len(incoming.payload)
+        if size > SMALL_BYTES and not self.known.large.has_room(size):
             return Refusal.OVERLOADED, None
         if self.known.held < self.held_limit:
             return None, None
@@ -268,7 +271,7 @@ class Responder:
                     self.known.forget(job)
                 elif not job.unwanted:
                     self.known.keep(job, payload)
-            more = queue.answers_together
+            more = queue.at_work > 1 and queue.limit.service_s < TOGETHER_S
             load = queue.load(now - job.arrived, ended=1)
         try:
             for incoming in waiting:

@@ -29,7 +29,7 @@ _LONGEST_FADES = 0.999  # with each answer
 # share of the longest time that one was given here: what takes longer than most comes too late.
 _TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
 HOLD_LIMIT_S = 2.0  # a cancel service that has not answered by then is given up
-_TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
+TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
 
 
 class Job:
@@ -104,14 +104,9 @@ class ServiceQueue:
         nearly_over = now - self._begun_last >= NEARLY * self.limit.takes_s > 0.0
         return self.at_work < max(1, self.limit.known) or (self.at_work == 1 and nearly_over)
 
-    @property
-    def answers_together(self) -> bool:
-        """Whether another answer is expected right after this one."""
-        return self.at_work > 1 and self.limit.service_s < _TOGETHER_S
-
     def takes(self, job: Job) -> bool:
         """Whether a job that arrives now is passed on at once."""
-        return not self.waiting() and self._has_room(job)
+        return not self.waiting() and (not self.at_work or self._has_room(job))
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
         """Return the load when `ended` have just ended; None until the pace is known.
@@ -121,12 +116,13 @@ class ServiceQueue:
         if not self.limit.service_s:
             return None
         waiting, running = self.waiting(), self.at_work - ended
-        return Load(waiting, running, self.limit.known, self.limit.service_s, spent_s)
+        limit = self.limit
+        # `Load(...)` would be one more call of Python.
+        return tuple.__new__(Load, (waiting, running, limit.known, limit.service_s, spent_s))
 
     def hopeless(self, robot: str, deadline: float, remaining_s: float) -> bool:
-        """Whether a request is expected to wait past its deadline."""
-        waiting = self.waiting()
-        if not waiting or self.limit.wait_s(waiting, self.at_work) <= remaining_s:
+        """Whether a request is expected to wait past its deadline, where others wait."""
+        if self.limit.wait_s(self.waiting(), self.at_work) <= remaining_s:
             return False
         return self.limit.wait_s(self._waiting.ahead(robot, deadline), self.at_work) > remaining_s
 

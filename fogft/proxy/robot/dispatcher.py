@@ -135,7 +135,9 @@ class Dispatcher:
         """
         now, requests, outcomes = self._clock(), self._requests, self.outcomes
         with self._lock:
-            outcomes.received(len(payload))
+            count = outcomes.count
+            count["received"] += 1
+            count["request_bytes"] += len(payload)
             over = requests.held_bytes + len(payload) > self.max_pending_bytes
             if over or requests.size() >= self.max_pending:
                 self._turn_away(request, len(payload))
@@ -147,6 +149,7 @@ class Dispatcher:
             chosen = requests.begin(
                 request, payload, able, deadline=deadline, now=now, handle=handle
             )
+            count["sent"] += len(chosen)  # less those that decline
             if self._ledger.traced is not None and (pending := requests.get(request)) is not None:
                 pending.trace = Trace(dict.fromkeys(chosen, now), {})
             soon = min(requests.choose.look_at, deadline)

@@ -39,20 +39,18 @@ class Sender:
         self, request: bytes, payload: bytes, links: Mapping[int, Link], chosen: Sequence[int],
         timeout_s: float,
     ) -> None:  # fmt: skip
-        """Offer a new request to its chosen replicas."""
+        """Offer a new request to its chosen replicas, for all of which it was counted."""
         name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
-        taken = 0
+        several = len(chosen) > 1  # one alone is no spare
         for replica in chosen:
-            spare = is_spare(request, replica)
+            spare = several and is_spare(request, replica)
             handling = Handling.DROP_IF_BUSY if spare else Handling.NORMAL
-            if links[replica].offer(
+            if not links[replica].offer(
                 name, request, payload, timeout_s, more=self._in_burst, handling=handling
             ):
-                taken += 1
-            else:
                 self._declined(request, replica, is_copy=True)
-        self._count(taken)
-        if len(chosen) > 1 and request not in self._ledger.requests:
+                self._count(-1)
+        if several and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)
 

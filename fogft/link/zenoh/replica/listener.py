@@ -189,7 +189,7 @@ class ZenohListener:
         attachment = sample.attachment
         head = attachment.to_bytes() if attachment else b""
         try:
-            if batch_frames.is_batch(head):
+            if head[:1] == batch_frames.BATCH:
                 requests = batch_frames.decode_requests(head, sample.payload.to_bytes())
             else:
                 requests = [(frame.decode_request(head), sample.payload.to_bytes())]
@@ -222,10 +222,11 @@ class ZenohListener:
         if robot not in ("", requests[0][0].robot):  # it asks in its own name, whatever it says
             requests = [(header._replace(robot=robot), content) for header, content in requests]
         for header, payload in requests:
-            hand_over = partial(self._hand_over, on_request, service, header, stream)
             if not header.packed:
-                hand_over(payload)
-            elif not self._unpacker.put(self._sessions.holder(token), payload, hand_over):
+                self._hand_over(on_request, service, header, stream, payload)
+                continue
+            hand_over = partial(self._hand_over, on_request, service, header, stream)
+            if not self._unpacker.put(self._sessions.holder(token), payload, hand_over):
                 self._refuse(stream, Refusal.OVERLOADED, (header, payload))
         stream.seen(requests[0][0].seen)
 

@@ -146,7 +146,8 @@ class Attempts:
         attempt = OpenAttempt(
             service, request_id, payload, len(payload), now, now + remaining_s, handling
         )
-        if not self._deadline.may_arrive(attempt, remaining_s, now, self._before):
+        knows_rate = self._progress.throughput.spans  # seldom: what is queued has shown it
+        if knows_rate and not self._deadline.may_arrive(attempt, remaining_s, now, self._before):
             return False
         if not self.window.admit(attempt) and not self._displace(attempt):
             return False
@@ -363,24 +364,25 @@ class Attempts:
                 self._credit.heard(attempt.mark)  # requests of one connection arrive in order
             if packed and self.window.holds(attempt):
                 self._unpack(attempt, answer)
-            else:
-                self._take_plain(attempt, answer)
+            elif not self._close(attempt, answer):
+                self._came_late(attempt, answer)
 
     def _unpack(self, attempt: OpenAttempt, answer: Answer) -> None:
         """Decompress an answer that is still wanted, and was asked to be packed."""
 
         def done(payload: bytes | None) -> None:
             refusal = Refusal.MALFORMED if payload is None else None
-            self._take_plain(attempt, replace(answer, payload=payload, refusal=refusal))
+            unpacked = replace(answer, payload=payload, refusal=refusal)
+            if not self._close(attempt, unpacked):
+                self._came_late(attempt, unpacked)
 
         packed = answer.payload or b""
         if not attempt.reads_packed or not self._unpacker.put("answers", packed, done):
             done(None)
 
-    def _take_plain(self, attempt: OpenAttempt, answer: Answer) -> None:
-        if self._close(attempt, answer):
-            return
-        self._cancellations.answered(answer.request_id)  # it was forgotten, or has ended
+    def _came_late(self, attempt: OpenAttempt, answer: Answer) -> None:
+        """Take the answer to an attempt that was forgotten, or has ended."""
+        self._cancellations.answered(answer.request_id)
         answer.service = attempt.service
         self._late(answer)
 

@@ -271,7 +271,7 @@ def read_reply(reply: zenoh.Reply) -> tuple[bytes, Sequence[Answer], bool]:
     if attachment is None:
         raise FrameError("an answer without a header")
     header, payload = attachment.to_bytes(), ok.payload.to_bytes()
-    if batch_frames.is_batch(header):
+    if header[:1] == batch_frames.BATCH:
         return *batch_frames.decode_answers(header, payload), False
     stamp, id, load, packed = frame.decode_answer(header)
     return stamp, (Answer(id, payload, load=load),), packed

@@ -45,7 +45,7 @@ class Outlet:
     def publish(self, service: str, content: bytes, header: bytes) -> None:
         if self.fails:
             raise OSError("no way out")
-        if batch_frames.is_batch(header):
+        if header[:1] == batch_frames.BATCH:
             headers = [one for one, _ in batch_frames.decode_requests(header, content)]
         else:
             headers = [frame.decode_request(header)]
