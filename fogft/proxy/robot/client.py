@@ -80,6 +80,7 @@ class ClientProxy:
         self._sooner = threading.Lock()
         self._sooner.acquire()
         self._look_now = self._changed = False
+        self._advertise_at = -NEVER
 
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
         """Proxy exactly these services. Requests under way continue."""
@@ -240,7 +241,8 @@ class ClientProxy:
             for service in self._services.values():
                 service.dispatcher.tick()
             now = self._clock()
-            if self._node is not None:
+            if self._node is not None and (changed or now >= self._advertise_at):
+                self._advertise_at = now + _IDLE_TICK_S
                 for service in self._services.values():
                     service.advertise(self._node, now)
         return changed
@@ -254,11 +256,13 @@ class ClientProxy:
         until = now + (min(timeout_s, _TICK_S) if len(self._topics) else timeout_s)
         while not self._look_now:
             self._sleeps_until = NEVER  # before looking: what comes after that wakes us
-            waiting = [service.dispatcher for service in list(self._services.values())]
-            look_at = min([until, *[one.look_at for one in waiting]])
+            look_at = sleeps_until = until
+            for service in list(self._services.values()):
+                due_at, next_due_at = service.dispatcher.wants_tick(now)
+                look_at, sleeps_until = min(look_at, due_at), min(sleeps_until, next_due_at)
             if look_at <= now or self._look_now:
                 break
-            self._sleeps_until = min([look_at, *[now + one.rest_s(now) for one in waiting]])
+            self._sleeps_until = sleeps_until
             self._sooner.acquire(timeout=max(0.0, self._sleeps_until - now))
             now = self._clock()
         self._look_now = False

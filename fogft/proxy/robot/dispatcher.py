@@ -36,7 +36,10 @@ log = logging.getLogger(__name__)
 
 MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
 _SHORTEST_S = 0.002
-_TICK_S = 0.02  # until losers are told, at the latest
+_TICK_S = 0.02
+# Until losers are told that are not told at once: they were asked a moment ago, or another one was
+# told (`link.window`).
+_TELL_S = 0.1
 _PAUSE_S = 1.0  # without requests: the next one need not be expected
 
 
@@ -229,8 +232,8 @@ class Dispatcher:
             self._delivery.give(pending, payload)  # first: what is counted can wait
             if losers:
                 self._sender.forget(request, losers)
-                self._tell_at = min(self._tell_at, now + _TICK_S)
-                self._wake(now + _TICK_S)
+                self._tell_at = min(self._tell_at, now + _TELL_S)
+                self._wake(self._tell_at)
             with self._lock:
                 outcomes.won(replica, now - pending.arrived, len(payload))
                 if self._ledger.traced is not None:
@@ -357,6 +360,9 @@ class Dispatcher:
         now, self._next_look = self._clock(), NEVER
         if now >= self._tell_at:  # its owner has told the links
             self._tell_at = NEVER
+        if not self._waits:
+            self._requests.choose.news = False  # it concerns nobody
+            return NEVER
         with self._lock:
             expired = self._requests.expire(now)
         for request, pending in expired:
@@ -377,14 +383,15 @@ class Dispatcher:
         return look_at
 
     @property
-    def look_at(self) -> float:
-        """When `tick` is wanted at the latest."""
-        waits = self._requests or self._requests.fallback or self._decide.replicates
-        return min(self._tell_at, self._next_look if waits else NEVER)
+    def _waits(self) -> bool:
+        """Whether anything may become due."""
+        requests = self._requests
+        return bool(requests.size() or requests.fallback or self._decide.replicates)
 
-    def rest_s(self, now: float) -> float:
-        """Return how soon a request that begins now may want a `tick`; NEVER while none comes."""
-        return self._usual_s if now < self._asked_at + _PAUSE_S else NEVER
+    def wants_tick(self, now: float) -> tuple[float, float]:
+        """Return when `tick` is wanted, and when it may be for a request that comes next."""
+        at = min(self._tell_at, self._next_look) if self._waits else self._tell_at
+        return at, min(at, now + self._usual_s) if now < self._asked_at + _PAUSE_S else at
 
     def close(self) -> None:
         """Release external resources."""
