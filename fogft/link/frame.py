@@ -125,7 +125,7 @@ def decode_request(frame: bytes) -> RequestHeader:
 
 
 def read_handling(flags: int, remaining_s: float) -> Handling:
-    """Read how a replica is asked to handle a request; refuse a time that is negative or no time."""
+    """Read how a replica is to handle a request; refuse a time that is negative or too long."""
     handling = _HANDLINGS.get(flags)
     if handling is None:
         raise FrameError(f"a request with flags {flags:#x}")

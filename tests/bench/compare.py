@@ -35,6 +35,7 @@ from tests.bench.load import (
     Balanced,
     asking,
     haproxy,
+    mean_s,
     offer,
     ray_serve,
 )
@@ -73,9 +74,7 @@ class Result:
         return [f"{p50:.0f} / {p99:.0f}", f"{lost} of {self.asked}", *each]
 
 
-def ours(
-    rig: Rig, caller: Caller, policy: str, median_s: float = MEDIAN_S
-) -> Callable[[float, float], Result]:
+def ours(rig: Rig, caller: Caller, policy: str, takes_s: float) -> Callable[[float, float], Result]:
     """Return what measures fogft under a policy at a load, for so many seconds."""
     proxies = [rig.proxy.pid, *(replica.process.pid for replica in rig.replicas)]
 
@@ -83,7 +82,7 @@ def ours(
         rig.change(hedging=policy, timeout_s=TIMEOUT_S)
         before = rig.report(after=time.time())["services"][FLAG[0]]["sent"]
         used = sum(map(cpu_s, proxies))
-        asked, took = offer(asking(caller), share, seconds, median_s)
+        asked, took = offer(asking(caller), share, seconds, takes_s)
         used = sum(map(cpu_s, proxies)) - used
         sent = rig.report(after=time.time())["services"][FLAG[0]]["sent"] - before
         return Result(asked, took, sent, used)
@@ -102,12 +101,12 @@ def peers(ray: str) -> dict[str, Peer]:
     return starts
 
 
-def theirs(peer: Balanced) -> Callable[[float, float], Result]:
+def theirs(peer: Balanced, takes_s: float) -> Callable[[float, float], Result]:
     """Return the same for a load balancer. What it is behind with is no burden to the next."""
 
     def measured(share: float, seconds: float) -> Result:
         used = peer.used_s()
-        asked, took = offer(peer.ask, share, seconds)
+        asked, took = offer(peer.ask, share, seconds, takes_s)
         result = Result(asked, took, float(asked), peer.used_s() - used)
         limit = time.monotonic() + CALM_LIMIT_S
         while time.monotonic() < limit:
@@ -121,13 +120,14 @@ def theirs(peer: Balanced) -> Callable[[float, float], Result]:
 
 
 @contextlib.contextmanager
-def pool(folder: Path, service: str, median_s: float = MEDIAN_S) -> Iterator[tuple[Rig, Caller]]:
-    """Start three replicas and a caller."""
+def pool(
+    folder: Path, service: str, median_s: float = MEDIAN_S, relayed: Sequence[int] = ()
+) -> Iterator[tuple[Rig, Caller]]:
+    """Start three replicas and a caller; some are reached through a relay, which can be told."""
     folder.mkdir(parents=True)
     words = words_of(service, median_s)
-    rig = Rig(
-        folder, REPLICAS, services=[words] * REPLICAS, relayed=[0], policy={"timeout_s": TIMEOUT_S}
-    )
+    policy = {"timeout_s": TIMEOUT_S}
+    rig = Rig(folder, REPLICAS, services=[words] * REPLICAS, relayed=relayed, policy=policy)
     with rig, contextlib.ExitStack() as stack:
         caller = Caller(rig.robot_domain, "compare")
         stack.callback(caller.close)
@@ -146,11 +146,13 @@ def loads(folder: Path, shares: Sequence[float], seconds: float, rounds: int, ra
     for service in SERVICES:
         with contextlib.ExitStack() as stack:
             rig, caller = stack.enter_context(pool(folder / service, service))
-            systems = {policy: ours(rig, caller, policy) for policy in ("auto", "all")}
+            takes_s = mean_s(service)
+            systems = {policy: ours(rig, caller, policy, takes_s) for policy in ("auto", "all")}
             for name, starts in peers(ray).items():
                 below = folder / f"{service}-{name.replace(' ', '-')}"
                 below.mkdir()
-                systems[name] = theirs(stack.enter_context(starts(below, words_of(service))))
+                peer = stack.enter_context(starts(below, words_of(service)))
+                systems[name] = theirs(peer, takes_s)
             for share in shares:
                 found = {name: Result() for name in systems}
                 for _ in range(rounds):
@@ -203,7 +205,8 @@ def faults(folder: Path, rounds: int) -> Rows:
     rows = []
     healthy, at_fault = Result(), {name: Result() for name in FAULTS}
     for number in range(rounds):
-        with pool(folder / f"faults-{number}", "constant", FAULT_MEDIAN_S) as (rig, caller):
+        below = folder / f"faults-{number}"
+        with pool(below, "constant", FAULT_MEDIAN_S, relayed=[0]) as (rig, caller):
             measure = ours(rig, caller, "auto", FAULT_MEDIAN_S)
             for name, harm in FAULTS.items():
                 measure(FAULT_LOAD, LEARN_S)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http.client
+import math
 import os
 import random
 import shutil
@@ -63,9 +64,9 @@ def load(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
             for share in loads:
                 for system in ("auto", "failover", "all", "haproxy"):
                     if system != "haproxy":
-                        row = _of_rig(rig, caller, system, share, seconds)
+                        row = _of_rig(rig, caller, system, share, seconds, mean_s(name))
                     elif peer is not None:
-                        row = peer.row(share, seconds)
+                        row = peer.row(share, seconds, mean_s(name))
                     else:
                         continue
                     rows.append({"service": name, "load": share, "system": system, **row})
@@ -87,12 +88,14 @@ def idle(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
     return [{"replicas": REPLICAS, **row, "pool_ms_per_s": robot + sum(replicas)}]
 
 
-def _of_rig(rig: Rig, caller: Caller, policy: str, share: float, seconds: float) -> dict[str, Any]:
+def _of_rig(
+    rig: Rig, caller: Caller, policy: str, share: float, seconds: float, takes_s: float
+) -> dict[str, Any]:
     rig.change(hedging=policy, timeout_s=TIMEOUT_S)
     before = rig.report(after=time.time())["services"][FLAG[0]]
     proxies = [rig.proxy.pid, *(replica.process.pid for replica in rig.replicas)]
     used = sum(map(cpu_s, proxies))
-    row = _row(*offer(asking(caller), share, seconds))
+    row = _row(*offer(asking(caller), share, seconds, takes_s))
     row["cpu_ms_per_request"] = (sum(map(cpu_s, proxies)) - used) * 1000 / row["requests"]
     after = rig.report(after=time.time())["services"][FLAG[0]]
     row["copies"] = (after["sent"] - before["sent"]) / row["requests"]
@@ -105,15 +108,21 @@ def asking(caller: Caller) -> Ask:
     return lambda answered: caller.ask(FLAG[0], payload, answered)
 
 
+def mean_s(service: str, median_s: float = MEDIAN_S) -> float:
+    """Return how long a service takes for a request on average."""
+    sigma, stalled, stall_s = SERVICES[service]
+    return median_s * math.exp(sigma**2 / 2) + stalled * stall_s
+
+
 def offer(
-    ask: Ask, share: float, seconds: float, median_s: float = MEDIAN_S
+    ask: Ask, share: float, seconds: float, takes_s: float = MEDIAN_S
 ) -> tuple[int, list[float]]:
-    """Ask at random moments without waiting.
+    """Ask at random moments without waiting, so often as a share of what all replicas can do.
 
     Returns:
         How many requests there were, and how many seconds each took that was answered in time.
     """
-    per_s = share * REPLICAS / median_s
+    per_s = share * REPLICAS / takes_s
     source, took = random.Random(1), list[float]()
     count, at = int(per_s * seconds), time.perf_counter()
     for _ in range(count):
@@ -150,10 +159,10 @@ class Balanced:
         self._folder = folder
         self._idle: list[http.client.HTTPConnection] = []
 
-    def row(self, share: float, seconds: float) -> dict[str, Any]:
+    def row(self, share: float, seconds: float, takes_s: float) -> dict[str, Any]:
         """Return what became of requests at a load."""
         used = self.used_s()
-        row = _row(*offer(self.ask, share, seconds))
+        row = _row(*offer(self.ask, share, seconds, takes_s))
         row["cpu_ms_per_request"] = (self.used_s() - used) * 1000 / row["requests"]
         return {**row, "copies": 1.0}
 

@@ -183,10 +183,9 @@ class Responder:
         if incoming.handling is Handling.DROP_IF_BUSY and not queue.has_free_slot(now):
             return Refusal.BUSY, None
         deadline = now + remaining_s
-        if queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s):
-            return Refusal.OVERLOADED, None
+        full = queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s)
         size = len(incoming.payload)
-        if size > SMALL_BYTES and not self.known.large.has_room(size):
+        if full or (size > SMALL_BYTES and not self.known.large.has_room(size)):
             return Refusal.OVERLOADED, None
         if self.known.held < self.held_limit:
             return None, None
