@@ -48,7 +48,8 @@ PAGE = ROOT / "docs" / "measurements.md"
 HEADING = "## Beside other load balancers: `scripts/compare`"
 BALANCES = {"haproxy": "leastconn", "round robin": "roundrobin"}
 POISONED_S = 6.0
-LEARN_S = 3.0  # of the same load before each measurement: a changed policy begins to learn
+LEARN_S = 3.0  # of the same load before each measurement of ours: a changed policy begins to learn
+LONG_FROM = 0.7  # a load from which on queues grow and shrink so slowly that it takes twice as long
 # So much of a processor an idle Ray Serve takes at most; after an overload it works on for long.
 CALM, CALM_LIMIT_S = 0.4, 60.0
 # So slow that the machine, which all processes share, is not what limits them.
@@ -80,6 +81,7 @@ def ours(rig: Rig, caller: Caller, policy: str, takes_s: float) -> Callable[[flo
 
     def measured(share: float, seconds: float) -> Result:
         rig.change(hedging=policy, timeout_s=TIMEOUT_S)
+        offer(asking(caller), share, LEARN_S, takes_s)
         before = rig.report(after=time.time())["services"][FLAG[0]]["sent"]
         used = sum(map(cpu_s, proxies))
         asked, took = offer(asking(caller), share, seconds, takes_s)
@@ -159,8 +161,8 @@ def loads(folder: Path, shares: Sequence[float], seconds: float, rounds: int, ra
                     for name, measure in systems.items():
                         if name == "all" and share > 0.3:  # it has the capacity of one
                             continue
-                        measure(share, LEARN_S)
-                        add(found[name], measure(share, seconds))
+                        lasts_s = seconds if share < LONG_FROM else 2 * seconds
+                        add(found[name], measure(share, lasts_s))
                 for name, result in found.items():
                     if result.asked:
                         rows.append([service, f"{share:.0%}", name, *result.cells()])
@@ -209,13 +211,12 @@ def faults(folder: Path, rounds: int) -> Rows:
         with pool(below, "constant", FAULT_MEDIAN_S, relayed=[0]) as (rig, caller):
             measure = ours(rig, caller, "auto", FAULT_MEDIAN_S)
             for name, harm in FAULTS.items():
-                measure(FAULT_LOAD, LEARN_S)
                 rig.follow([1, 2])
                 rig.wait_ready([1, 2])
                 add(healthy, measure(FAULT_LOAD, FAULT_S))
                 rig.follow([0, 1, 2])
                 rig.wait_ready([0, 1, 2])
-                measure(FAULT_LOAD, LEARN_S)
+                offer(asking(caller), FAULT_LOAD, LEARN_S, FAULT_MEDIAN_S)
                 harm(rig.replicas[0])
                 asked, took = offer(asking(caller), FAULT_LOAD, FAULT_S, FAULT_MEDIAN_S)
                 add(at_fault[name], Result(asked, took))
@@ -280,8 +281,9 @@ def text(measured: Mapping[str, Rows], rounds: int, seconds: float) -> str:
 do not wait; a request has failed after 2 s. Load is a share of what three can do. `haproxy` is
 HAProxy with `leastconn`, `round robin` the same with `roundrobin`, before HTTP servers that sleep
 alike; `ray serve` is Ray Serve with three replicas. Systems in turns, {rounds} rounds of
-{seconds:.0f} s after {LEARN_S:.0f} s of the same load, as a changed policy learns. Processor time
-is that of the proxies, or of the balancer, a request; of Ray Serve all its processes count.
+{seconds:.0f} s, from {LONG_FROM:.0%} on twice as long, of fogft after {LEARN_S:.0f} s of the same
+load, as a changed policy learns. Processor time is that of the proxies, or of the balancer, a
+request; of Ray Serve all its processes count.
 
 {table(["service", "load", "system", *cost], measured["loads"])}
 
@@ -303,6 +305,7 @@ def main() -> int:
     """Measure, print, and write the page; return the exit status."""
     parser = argparse.ArgumentParser(prog="scripts/compare", description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="one round, and the page as it was")
+    parser.add_argument("--rounds", type=int, default=3, help="how often each system has its turn")
     parser.add_argument(
         "--ray", default="", metavar="PYTHON", help="of an environment with ray[serve]"
     )
@@ -315,7 +318,7 @@ def main() -> int:
 
     environment.prepare(os.environ)
     memory_tuning.tune()
-    rounds, seconds = (1, 4.0) if options.quick else (3, 10.0)
+    rounds, seconds = (1, 4.0) if options.quick else (options.rounds, 10.0)
     shares = (0.1, 0.7) if options.quick else (0.1, 0.3, 0.5, 0.7, 0.9)
     with tempfile.TemporaryDirectory(prefix="fogft-compare-") as name:
         folder = Path(name)
