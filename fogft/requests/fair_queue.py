@@ -74,6 +74,11 @@ class FairQueue(Generic[T]):
         queue.given += 1.0
         return self._remove(entry)
 
+    def not_served(self, robot: str) -> None:
+        """Give a robot its turn back: what was taken came to nothing."""
+        if robot in self._robots:
+            self._robots[robot].given -= 1.0
+
     def remove(self, id: bytes) -> T | None:
         """Remove and return an item; None if it is not queued."""
         entry = self._entries.get(id)

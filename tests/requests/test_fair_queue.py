@@ -41,6 +41,15 @@ def test_turns_cannot_be_saved_up():
     assert drained(queue)[:4] in (["a8", "b0", "a9", "b1"], ["b0", "a8", "b1", "a9"])
 
 
+def test_what_came_to_nothing_costs_no_turn():
+    """What is too late when it comes up is not served: its robot still is next."""
+    queue = filled(*[("a", 1.0)] * 6, *[("b", 1.0)] * 3)
+    for _ in range(3):
+        assert queue.take() in ("a0", "a1", "a2")
+        queue.not_served("a")
+    assert drained(queue)[:4] in (["a3", "b6", "a4", "b7"], ["b6", "a3", "b7", "a4"])
+
+
 def test_when_full_the_robot_with_most_gives_way():
     queue = filled(("chatty", 1.0), ("chatty", 7.0), ("chatty", 5.0))
     assert queue.evict("quiet", 9.0) == "chatty1"

@@ -143,8 +143,11 @@ class ServiceQueue:
         if self.waiting():
             most_s = _TAKES_SHARE * self._longest_given_s
             needs_s += max(takes_s, min(_TAKES_TIMES * takes_s, most_s))
-        if job is not None and job.deadline > now + needs_s:
-            self.begin(job, now)
+        if job is not None:
+            if job.deadline > now + needs_s:
+                self.begin(job, now)
+            else:
+                self._waiting.not_served(job.robot)
         return job
 
     def begin(self, job: Job, now: float) -> None:
