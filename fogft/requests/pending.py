@@ -60,6 +60,7 @@ class PendingRequests:
         self.size = self._pending.__len__
         # Those that some replica may have to be asked for, as far as is known, and from when on.
         self._short: dict[bytes, float] = {}
+        self._rejected: dict[bytes, None] = {}  # those that have a rejected answer
         self._counts_deaths = counts_deaths
         self._cautious_until = -NEVER
         self._alarms = Alarms()
@@ -118,8 +119,12 @@ class PendingRequests:
         if choose.news:
             choose.news = False
             self.use(choose)
-        due = [request for request, at in self._short.items() if at <= now]
-        soonest = min((at for at in self._short.values() if at > now), default=NEVER)
+        due, soonest = [], NEVER
+        for request, at in self._short.items():  # under overload many, a hundred times a second
+            if at <= now:
+                due.append(request)
+            elif at < soonest:
+                soonest = at
         for request in due[::-1] if newest_first else due:
             choose.look_at = NEVER
             chosen, again_at = self._next_for(request, able, now)
@@ -252,6 +257,7 @@ class PendingRequests:
             else:
                 if means is Means.REJECTION or pending.rejection is None:
                     pending.rejection = payload
+                self._rejected[request] = None
                 pending.barred.add(replica)
                 verdict = self._ended(request, pending, replica)
                 self.choose.failed(request, replica, now, fault=False)
@@ -309,8 +315,7 @@ class PendingRequests:
 
     def idle(self) -> list[bytes]:
         """Return the requests that no replica works on and that have a rejected answer."""
-        all_of = self._pending
-        return [r for r in self._short if (p := all_of[r]).rejection is not None and not p.open]
+        return [request for request in self._rejected if not self._pending[request].open]
 
     def settle(self, request: bytes, able: Iterable[int]) -> Pending | None:
         """Remove a request that is answered by its rejection, as no other replica can be asked."""
@@ -368,6 +373,7 @@ class PendingRequests:
         """Remove a request; unless it is `over`, the fallback may still answer it."""
         del self._pending[request]
         self._short.pop(request, None)
+        self._rejected.pop(request, None)
         self.held_bytes -= len(pending.payload)
         self.decide.closed(request, pending)
         if over and self.fallback is not None:
