@@ -197,6 +197,8 @@ class Auto(Learning):
                 if other != replica and not self.is_spare(request, other):
                     self._beaten[request, other] = now
         self._replicas[replica].answered(request, load, now)
+        if load is not None:
+            self._demand.answered(load)
         if self._wanting:
             self._released(replica, now)
 
@@ -245,8 +247,7 @@ class Auto(Learning):
 
     def needed(self, able: int, now: float) -> int:
         """Return how many replicas would be enough if there are too few; else 0."""
-        times_s = sorted(known.service_s for known in self._replicas.values())
-        return self._demand.replicas(able, times_s[len(times_s) // 2], now) if times_s else 0
+        return self._demand.replicas(able, now)
 
     def report(self) -> dict[str, Any]:
         """Return counts, the budget, and each replica's estimate by ``slot.generation``."""

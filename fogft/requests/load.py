@@ -27,8 +27,10 @@ _AVOIDED_S = 0.1
 _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
 _MANY = 16.0  # requests ahead: behind more, a time tells little of what is unusual
-_DEMAND_OVER_S, _DEMAND_STEP_S = 10.0, 0.1
-_TOO_FULL, _FULL = 0.95, 0.8  # a share of what replicas can do: from when on it is too much
+_FULL_OVER_S, _ASKED_OVER_S, _DEMAND_STEP_S = 10.0, 30.0, 0.1
+_OFTEN = 0.5  # of the time something waits: there are too few replicas
+_PAUSE = 0.4  # of it: what was so before a longer one is no more
+_ENOUGH = 0.8  # of what replicas can do: so much they should have to do
 
 
 class Handling(IntFlag):
@@ -50,25 +52,40 @@ class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice
 
 
 class Demand:
-    """The recent request rate of a service."""
+    """What all robots ask of a service that is full, as one of them sees it."""
 
     def __init__(self) -> None:
-        self._asked = 0.0
+        self._full = False  # something waited at the replica that answered last
+        self._full_share = 0.0  # of the time, lately
+        self._asked = self._answered = 0.0  # while it was full, lately
         self._at = 0.0
 
     def asked(self, now: float) -> None:
         """Count a request."""
         if now > self._at + _DEMAND_STEP_S:
-            self._asked, self._at = self._lately(now), now
-        self._asked += 1.0
+            kept = math.exp((self._at - now) / _ASKED_OVER_S)
+            self._asked, self._answered = self._asked * kept, self._answered * kept
+            self._full_share, self._at = self._share(now), now
+        self._asked += self._full
 
-    def _lately(self, now: float) -> float:
-        return self._asked * math.exp((self._at - now) / _DEMAND_OVER_S)
+    def answered(self, load: Load) -> None:
+        """Count an answer."""
+        self._full = load.waiting > 0
+        self._answered += self._full
 
-    def replicas(self, able: int, service_s: float, now: float) -> int:
-        """Return how many replicas would be enough at `service_s` each, if too few; else 0."""
-        work = self._lately(now) / _DEMAND_OVER_S * service_s
-        return math.ceil(work / _FULL) if work > _TOO_FULL * max(1, able) else 0
+    def _share(self, now: float) -> float:
+        kept = math.exp((self._at - now) / _FULL_OVER_S)
+        return self._full_share * kept + min(1.0 - kept, _PAUSE) * self._full
+
+    def replicas(self, able: int, now: float) -> int:
+        """Return how many replicas would be enough, if there are too few; else 0.
+
+        Full ones do what they can, and serve robots in turns: each robot sees by how much too few
+        they are for all.
+        """
+        if self._share(now) <= _OFTEN or not self._answered:
+            return 0
+        return math.ceil(max(1, able) * max(1.0, self._asked / self._answered) / _ENOUGH)
 
 
 class ReplicaLoad:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -42,35 +40,44 @@ def known(
     return found
 
 
-# -- the rate of requests ---------------------------------------------------------------------
+# -- how many replicas are needed ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("per_s", "able", "needed"), [(9.0, 1, 0), (20.0, 1, 3), (20.0, 3, 0)])
-def test_more_replicas_are_needed_where_those_there_are_nearly_full(per_s, able, needed):
-    """At 100 ms a request, one does ten a second; asked for is what leaves a fifth free."""
-    demand = Demand()
-    for number in range(int(100 * per_s)):
-        demand.asked(number / per_s)
-    assert demand.replicas(able, 0.1, 100.0) == needed
+def crowded(seconds: float, *, answered: float = 1.0, waiting: int = 1) -> Demand:
+    """Return what a robot has seen that asks ten a second, of which that share is answered."""
+    demand, owed = Demand(), 0.0
+    for number in range(round(10 * seconds)):
+        demand.asked(number / 10)
+        owed += answered
+        if owed >= 1.0:
+            demand.answered(says(waiting=waiting))
+            owed -= 1.0
+    return demand
 
 
-def test_without_replicas_one_request_is_no_flood():
-    demand = Demand()
-    assert demand.replicas(0, 0.1, 0.0) == 0
-    demand.asked(0.0)
-    assert demand.replicas(0, 0.1, 0.0) == 0
-    for _ in range(100):
-        demand.asked(0.0)
-    assert demand.replicas(0, 0.1, 0.0) == 2, "none counts as one, which is not enough"
+@pytest.mark.parametrize(
+    ("answered", "able", "needed"), [(1.0, 1, 2), (1.0, 3, 4), (2 / 3, 3, 6), (1 / 3, 3, 12)]
+)
+def test_full_replicas_are_too_few_by_what_they_leave_unanswered(answered, able, needed):
+    """Asked for is what leaves a fifth free, whoever else asks."""
+    assert crowded(60.0, answered=answered).replicas(able, 60.0) == needed
 
 
-def test_what_was_asked_fades_to_a_third_in_ten_seconds():
-    demand = Demand()
-    for _ in range(1000):
-        demand.asked(0.0)
-    at_once, later = (demand.replicas(1, 0.1, now) for now in (0.0, 10.0))
-    assert (at_once, later) == (math.ceil(10 / 0.8), math.ceil(10 / math.e / 0.8))
-    assert demand.replicas(1, 0.1, 100.0) == 0
+def test_where_nothing_waits_there_are_enough_whatever_is_not_answered():
+    """It is lost to faults."""
+    assert crowded(60.0, answered=0.1, waiting=0).replicas(1, 60.0) == 0
+    assert Demand().replicas(0, 0.0) == 0
+
+
+def test_a_burst_is_no_reason_and_a_crowd_is_forgotten_within_ten_seconds():
+    demand = crowded(5.0)
+    assert demand.replicas(1, 5.0) == 0
+    demand = crowded(60.0)
+    demand.answered(says(waiting=0))
+    demand.asked(60.0)
+    assert demand.replicas(0, 65.0) == 2, "none counts as one"
+    assert demand.replicas(1, 69.0) == 0
+    assert crowded(60.0).replicas(1, 90.0) == 0, "it was full when it was last asked"
 
 
 # -- what is believed of one replica ----------------------------------------------------------

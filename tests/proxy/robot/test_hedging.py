@@ -423,6 +423,7 @@ def test_five_robots_with_stale_views_do_as_well_as_shortest_queues_by_the_same_
 ):
     worlds = served(AUTO, service, load, robots=5)
     assert lost(worlds) == 0
+    assert needed(worlds) == {0}
     monkeypatch.setattr(dispatcher, "Auto", Shortest)
     assert p99(worlds) <= 1.15 * p99(served(AUTO, service, load, robots=5))
 
@@ -439,10 +440,10 @@ def test_over_capacity_what_is_answered_is_answered_in_time_and_the_rest_costs_n
     """
     [world] = pool(service, rtt_s=rtt_s)
     offered([world], 1.5, 20.0)
-    assert world.dispatcher.report()["needed_replicas"] in (5, 6)  # 4.5 would be full
+    assert needed([world]) == {6}  # 4.5 would be full
     assert answered([world], 1000.0, 1020.0) >= 0.95 * 150 * 20
     world.poisson(75.0, 20.0, random.Random(3))
-    assert world.dispatcher.report()["needed_replicas"] == 0
+    assert needed([world]) == {0}
 
 
 @pytest.mark.parametrize("robots", [1, 5])
@@ -450,7 +451,7 @@ def test_over_capacity_what_is_answered_is_answered_in_time_and_the_rest_costs_n
 def test_five_seconds_after_an_overload_all_is_as_it_was_before(service, robots):
     """The times, and who does how much; what waits does not grow while it lasts.
 
-    Meanwhile each robot has the same share.
+    Meanwhile each robot has the same share, and sees how many replicas all of them need.
     """
     worlds = pool(service, robots=robots)
     calm, calm_shares = at_thirty_percent(worlds)
@@ -461,12 +462,19 @@ def test_five_seconds_after_an_overload_all_is_as_it_was_before(service, robots)
     assert waiting[1] < 1.2 * waiting[0]
     got = [len(world.answers) - n for world, n in zip(worlds, before, strict=True)]
     assert max(got) <= 1.1 * min(got)
+    assert needed(worlds) <= {5, 6, 7}  # of 4.5 each would be full
     offered(worlds, 0.3, 5.0)
     after, shares = at_thirty_percent(worlds)
+    assert needed(worlds) == {0}
     assert percentile(after, 50) < 1.1 * percentile(calm, 50)
     if robots == 1:  # it still knows what takes unusually long
         assert percentile(after, 99) < 1.5 * percentile(calm, 99)
     assert shares == pytest.approx(calm_shares, abs=0.1)
+
+
+def needed(worlds) -> set[int]:
+    """Return how many replicas would be enough, as robots say: 0 where there are."""
+    return {world.dispatcher.report()["needed_replicas"] for world in worlds}
 
 
 def at_thirty_percent(worlds) -> tuple[list[float], list[float]]:
