@@ -6,6 +6,7 @@ import heapq
 import operator
 import random
 from collections import defaultdict
+from collections.abc import Callable
 from functools import cache, partial
 from statistics import median
 
@@ -129,21 +130,36 @@ def central_queue(service: str, load: float, seconds: float, seed: int = 3) -> i
     return ended
 
 
-def shortest_queue(
-    service: str, load: float, seconds: float = 40.0, seed: int = 3, spells: str = "none"
+def shortest(queues: list[list[float]], source: random.Random) -> int:
+    return min(range(3), key=lambda slot: len(queues[slot]))
+
+
+def an_idle_one(queues: list[list[float]], source: random.Random) -> int:
+    """Return one where nothing is, if there is one; else any."""
+    return source.choice([slot for slot in range(3) if not queues[slot]] or range(3))
+
+
+def one_copy(
+    rule: Callable[[list[list[float]], random.Random], int],
+    service: str,
+    load: float,
+    seconds: float = 40.0,
+    seed: int = 3,
+    spells: str = "none",
 ) -> float:
-    """Return the p99 of one copy a request to the shortest of three queues, less the round trip.
+    """Return the p99 of one copy a request, before three queues, less the round trip.
 
     Requests come when they come to `served`, are as much work, and the network is the same: what
     has ended counts until its answer is here.
     """
     arrivals, draws, now, latencies = random.Random(seed), Draws(seed), 0.0, []
     ends: list[list[float]] = [[], [], []]
+    source = random.Random(seed)
     while now < seconds:
         now += arrivals.expovariate(load * 150.0)
         for queue in ends:
             queue[:] = [end for end in queue if end + ONE_WAY_S > now]
-        slot = min(range(3), key=lambda slot: len(ends[slot]))
+        slot = rule(ends, source)
         begun = max([now + ONE_WAY_S, *ends[slot][-1:]])
         work_s = SERVICES[service](draws(b"%d" % len(latencies)))
         end = begun + work_s * SPELLS[spells](slot, begun)
@@ -154,18 +170,25 @@ def shortest_queue(
 
 @pytest.mark.parametrize("service", sorted(SERVICES))
 @pytest.mark.parametrize("load", LOADS)
-def test_auto_is_as_good_as_the_shortest_queue_and_as_all_from_idle_to_full(service, load):
-    """Beyond the round trip, p99 is at most 1.05 of the better of the two; none is lost."""
-    seconds, ratios = 20.0 / load, []  # as many requests at each load
-    for seed in range(3, 3 + by_day(1, at_night=15)):
-        better = shortest_queue(service, load, seconds, seed)
+def test_auto_is_as_good_as_the_best_other_rule_from_idle_to_full(service, load):
+    """Beyond the round trip, p99 is at most 1.05 of the better of two others; none is lost.
+
+    These are one copy to the shortest queue, and all. It is never worse than one copy to an idle
+    replica, or to any where none is.
+    """
+    seconds, ratios, of_idle = 20.0 / load, [], []  # as many requests at each load
+    for seed in range(3, 3 + by_day(5 if load >= 0.7 else 1, at_night=15)):
+        better = one_copy(shortest, service, load, seconds, seed)
         if load <= 0.2:  # of more load `all` makes an endless queue
             worlds = served(HedgingMode.ALL, service, load, seconds=seconds, seed=seed)
             better = min(better, p99(worlds) - 2 * ONE_WAY_S)
         worlds = served(AUTO, service, load, seconds=seconds, seed=seed)
         assert lost(worlds) == 0
         ratios.append((p99(worlds) - 2 * ONE_WAY_S) / better)
+        idle = one_copy(an_idle_one, service, load, seconds, seed)
+        of_idle.append((p99(worlds) - 2 * ONE_WAY_S) / idle)
     assert median(ratios) <= 1.05
+    assert median(of_idle) <= 1.0
 
 
 @pytest.mark.parametrize("robots", [1, 5])
@@ -441,7 +464,8 @@ def test_over_capacity_what_is_answered_is_answered_in_time_and_the_rest_costs_n
     [world] = pool(service, rtt_s=rtt_s)
     offered([world], 1.5, 20.0)
     assert needed([world]) == {6}  # 4.5 would be full
-    assert answered([world], 1000.0, 1020.0) >= 0.95 * 150 * 20
+    could = central_queue(service, 1.5, 20.0)  # 3000, were each as much work as on average
+    assert answered([world], 1000.0, 1020.0) >= 0.95 * could
     world.poisson(75.0, 20.0, random.Random(3))
     assert needed([world]) == {0}
 
@@ -454,7 +478,8 @@ def test_five_seconds_after_an_overload_all_is_as_it_was_before(service, robots)
     Meanwhile each robot has the same share, and sees how many replicas all of them need.
     """
     worlds = pool(service, robots=robots)
-    calm, calm_shares = at_thirty_percent(worlds)
+    seconds = 60.0 if service == "stalling" else 20.0  # in which p99 is no chance
+    calm, calm_shares = at_thirty_percent(worlds, seconds)
     waiting, before = [], [len(world.answers) for world in worlds]
     for _ in range(2):
         offered(worlds, 1.5, 5.0)
@@ -464,7 +489,7 @@ def test_five_seconds_after_an_overload_all_is_as_it_was_before(service, robots)
     assert max(got) <= 1.1 * min(got)
     assert needed(worlds) <= {5, 6, 7}  # of 4.5 each would be full
     offered(worlds, 0.3, 5.0)
-    after, shares = at_thirty_percent(worlds)
+    after, shares = at_thirty_percent(worlds, seconds)
     assert needed(worlds) == {0}
     assert percentile(after, 50) < 1.1 * percentile(calm, 50)
     if robots == 1:  # it still knows what takes unusually long
@@ -477,11 +502,11 @@ def needed(worlds) -> set[int]:
     return {world.dispatcher.report()["needed_replicas"] for world in worlds}
 
 
-def at_thirty_percent(worlds) -> tuple[list[float], list[float]]:
+def at_thirty_percent(worlds, seconds: float) -> tuple[list[float], list[float]]:
     """Return how long requests took for a while, and each replica's share of the work."""
     asked = [len(world.asked) for world in worlds]
     before = [link.replica.service.ran for link in worlds[0].links]
-    offered(worlds, 0.3, 20.0)
+    offered(worlds, 0.3, seconds)
     worlds[0].run(0.5)
     ran = [link.replica.service.ran - n for link, n in zip(worlds[0].links, before, strict=True)]
     took = [s for world, n in zip(worlds, asked, strict=True) for s in world.latencies(n)]
