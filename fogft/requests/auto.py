@@ -157,15 +157,16 @@ class Auto(Learning):
         """Return who is expected to answer first; among equals any, by the request's random id."""
         if len(able) == 1:
             return able[0]
-        chance = request[-1] if request else 0
         known = [self._replicas[replica] for replica in able]
         times_s = sorted([one.service_s for one in known])
         typical_s = times_s[len(times_s) // 2]
-        ranks = [  # no generator: it would be entered anew for each
-            (one.avoided(now), one.expected_s(now, typical_s), (i * 167 ^ chance) & 0xFF, replica)
-            for i, (replica, one) in enumerate(zip(able, known, strict=True))
-        ]
-        return min(ranks)[-1]
+        ranks = [(one.avoided(now), one.expected_s(now, typical_s)) for one in known]
+        least = min(ranks)
+        equals = ranks.count(least)
+        if equals == 1:
+            return able[ranks.index(least)]
+        chance = int.from_bytes(request[-4:], "big") % equals
+        return [one for one, rank in zip(able, ranks, strict=True) if rank == least][chance]
 
     def is_spare(self, request: bytes, replica: int) -> bool:
         """Whether the replica should drop it unless idle."""

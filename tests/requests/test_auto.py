@@ -184,6 +184,20 @@ def test_among_equals_any_is_the_first_and_who_was_quick_once_gets_no_more():
     assert min(firsts[replica] for replica in (1, 2, 3)) > 60
 
 
+@pytest.mark.parametrize("equals", [2, 3, 5, 8])
+def test_each_of_equals_is_the_first_as_often_beside_one_that_is_none(equals):
+    """Each within a sixth of its share, beyond four times what chance does."""
+    policy = learned(r0=0.9, **{f"r{n}": 0.125 for n in range(1, equals + 1)})
+    source, firsts = random.Random(1), Counter[int]()
+    for _ in range(600 * equals):
+        firsts[policy.first(source.randbytes(16), range(equals + 1), 31.0)[0]] += 1
+        for replica in range(equals + 1):
+            policy.forget(replica)
+    assert set(firsts) == set(range(1, equals + 1))
+    assert min(firsts.values()) > 500
+    assert max(firsts.values()) < 700
+
+
 def test_while_replicas_are_busy_a_request_goes_to_one():
     policy = learned(r1=0.1, r2=0.1)
     assert len(policy.first(A, (1, 2), 31.0)) == 2
