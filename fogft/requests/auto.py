@@ -12,7 +12,7 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import NEVER, Demand, Load
+from fogft.requests.load import Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
@@ -82,15 +82,15 @@ class Auto(Learning):
         if not able:
             return ()
         for replica in able:  # what others answered first it may never end: `more` does not see it
-            begun = self._replicas[replica].oldest_begun
-            if begun < NEVER:
-                self._doubts(replica, begun, now)
+            known = self._replicas[replica]
+            if known.at_work:
+                self._doubts(replica, known.oldest_begun, now)
         best = self._best(request, able, now)
         known = self._replicas[best]
         self._spares.request(known.service_s, now)
         if self._spares.open and not known.free(now):
             self._spares.made_wait(known.service_s / len(able))
-        known.asked(request, now)
+        overdue_at = known.asked(request, now)
         if len(able) == 1:
             return able  # there is nobody to hedge it at
         copied = self._spares.chosen(request) and not self.dear
@@ -101,8 +101,8 @@ class Auto(Learning):
         elif len(spares) + 1 < len(others):
             self._wanting[request] = None
         if len(spares) + 1 < len(able):  # else there is nobody to hedge it at
-            self._look(known.overdue_at(request, now))
-        return [best, *self._spared(request, spares, now)]
+            self._look(overdue_at)
+        return [best, *self._spared(request, spares, now)] if spares else [best]
 
     def _spared(self, request: bytes, replicas: Sequence[int], now: float) -> Sequence[int]:
         for replica in replicas:
@@ -148,9 +148,7 @@ class Auto(Learning):
                     self._look(now + max(_RETRY_S, longer_s / 2))
                     return ()
         best = self._best(request, candidates, now)
-        known = self._replicas[best]
-        known.asked(request, now)
-        self._look(known.overdue_at(request, now))
+        self._look(self._replicas[best].asked(request, now))
         return (best,)
 
     def _best(self, request: bytes, able: Sequence[int], now: float) -> int:
@@ -198,7 +196,7 @@ class Auto(Learning):
                 if other != replica and not self.is_spare(request, other):
                     self._beaten[request, other] = now
         self._replicas[replica].answered(request, load, now)
-        if load is not None:
+        if load is not None and (load.waiting or self._demand.full):
             self._demand.answered(load)
         if self._wanting:
             self._released(replica, now)

@@ -55,7 +55,7 @@ class Demand:
     """What all robots ask of a service that is full, as one of them sees it."""
 
     def __init__(self) -> None:
-        self._full = False  # something waited at the replica that answered last
+        self.full = False  # something waited at the replica that answered last
         self._full_share = 0.0  # of the time, lately
         self._asked = self._answered = 0.0  # while it was full, lately
         self._at = 0.0
@@ -66,16 +66,16 @@ class Demand:
             kept = math.exp((self._at - now) / _ASKED_OVER_S)
             self._asked, self._answered = self._asked * kept, self._answered * kept
             self._full_share, self._at = self._share(now), now
-        self._asked += self._full
+        self._asked += self.full
 
     def answered(self, load: Load) -> None:
-        """Count an answer."""
-        self._full = load.waiting > 0
-        self._answered += self._full
+        """Count an answer; no need where it was not full, and nothing waits."""
+        self.full = load.waiting > 0
+        self._answered += self.full
 
     def _share(self, now: float) -> float:
         kept = math.exp((self._at - now) / _FULL_OVER_S)
-        return self._full_share * kept + min(1.0 - kept, _PAUSE) * self._full
+        return self._full_share * kept + min(1.0 - kept, _PAUSE) * self.full
 
     def replicas(self, able: int, now: float) -> int:
         """Return how many replicas would be enough, if there are too few; else 0.
@@ -99,7 +99,7 @@ class ReplicaLoad:
         self.asked_at = -NEVER
         # Our attempts that it has not ended, oldest first: when each began, when it is overdue, and
         # for how much its time counts.
-        self._at_work: dict[bytes, tuple[float, float, float]] = {}
+        self.at_work: dict[bytes, tuple[float, float, float]] = {}
         self._slots = 0
         self._rtt_s: float | None = None
         self._others = 0  # requests of other robots
@@ -113,7 +113,7 @@ class ReplicaLoad:
 
     def ahead(self, now: float) -> int:
         """Return the estimated number of requests at the replica."""
-        return len(self._at_work) + (self._others if now < self._others_until else 0)
+        return len(self.at_work) + (self._others if now < self._others_until else 0)
 
     def free(self, now: float) -> bool:
         """Whether a request that arrives now is expected to start (almost) at once."""
@@ -122,7 +122,7 @@ class ReplicaLoad:
         ahead = self.ahead(now)
         if ahead < max(1, self._slots):
             return True
-        if not ahead == len(self._at_work) == 1:
+        if not ahead == len(self.at_work) == 1:
             return False
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
         return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s)
@@ -136,13 +136,13 @@ class ReplicaLoad:
     @property
     def oldest_begun(self) -> float:
         """When the oldest of our open requests there began; infinity for none."""
-        for begun, _, _ in self._at_work.values():
+        for begun, _, _ in self.at_work.values():
             return begun
         return NEVER
 
     def _spent_s(self, now: float) -> float:
         """Return for how long it has been at the oldest of ours; 0 for none."""
-        return now - max(self.oldest_begun, self.ended_at) if self._at_work else 0.0
+        return now - max(self.oldest_begun, self.ended_at) if self.at_work else 0.0
 
     def avoided(self, now: float) -> bool:
         """Whether to prefer others: it is in doubt, or has failed."""
@@ -160,7 +160,7 @@ class ReplicaLoad:
             service_s = typical_s
         rtt_s = self._rtt_s or 0.0
         left_s = service_s * (1 + self.ahead(now))
-        if not self._at_work:
+        if not self.at_work:
             return rtt_s + left_s
         spent_s = self._spent_s(now)
         if spent_s <= _LATE * (rtt_s + service_s):
@@ -171,7 +171,7 @@ class ReplicaLoad:
 
     def overdue_at(self, request: bytes, begun: float) -> float:
         """Return when an attempt is slower than nearly all others and than its expected wait."""
-        return self._at_work.get(request, (0.0, begun + self.delay_s, 1.0))[1]
+        return self.at_work.get(request, (0.0, begun + self.delay_s, 1.0))[1]
 
     def doubtful_at(self, begun: float) -> float:
         """Return when an attempt that began then is long overdue.
@@ -185,19 +185,20 @@ class ReplicaLoad:
 
     # -- what happens ---------------------------------------------------------------------
 
-    def asked(self, request: bytes, now: float) -> None:
-        """Note an attempt about to be sent."""
+    def asked(self, request: bytes, now: float) -> float:
+        """Note an attempt about to be sent; return when it will be overdue."""
         ahead = self.ahead(now)
         overdue_s = _LATE * max(self.delay_s, (self._rtt_s or 0.0) + self.service_s * (1 + ahead))
         share = min(1.0, (_MANY / (1 + ahead)) ** 2)
-        self._at_work[request] = now, now + overdue_s, share
+        self.at_work[request] = now, now + overdue_s, share
         self.asked_at = now
+        return now + overdue_s
 
     def heard(self, request: bytes, load: Load, now: float) -> None:
         """Take its reported load, plus what was sent within the last round trip."""
         since = now - (self._rtt_s or 0.0)
-        seen = len(self._at_work) - (request in self._at_work)
-        for id, (begun, _, _) in reversed(self._at_work.items()):  # the newest first: few
+        seen = len(self.at_work) - (request in self.at_work)
+        for id, (begun, _, _) in reversed(self.at_work.items()):  # the newest first: few
             if begun <= since:
                 break
             seen -= id != request
@@ -206,14 +207,14 @@ class ReplicaLoad:
         self._slots = load.slots
         self.service_s = load.service_s
         if seen > there:  # the ends of some were lost
-            for lost in [id for id in self._at_work if id != request][: seen - there]:
-                del self._at_work[lost]
+            for lost in [id for id in self.at_work if id != request][: seen - there]:
+                del self.at_work[lost]
 
     def answered(self, request: bytes, load: Load | None, now: float) -> None:
         """Note that it has ended an attempt, with the load that it told."""
         if load is not None:
             self.heard(request, load, now)
-        sent = self._at_work.pop(request, None)
+        sent = self.at_work.pop(request, None)
         self.ended_at = now
         self.doubted = False
         self._avoided_s = 0.0
@@ -232,18 +233,18 @@ class ReplicaLoad:
 
     def dropped(self, request: bytes) -> None:
         """Note that an attempt has ended without the replica working on it."""
-        self._at_work.pop(request, None)
+        self.at_work.pop(request, None)
 
     def failed(self, request: bytes, now: float) -> None:
         """Note that an attempt failed by its fault: failing at once is not being quick."""
-        self._at_work.pop(request, None)
+        self.at_work.pop(request, None)
         self._avoided_s = min(_AVOIDED_LIMIT_S, max(_AVOIDED_S, 2 * self._avoided_s))
         self._avoided_until = now + self._avoided_s
 
     def overtaken(self, request: bytes, begun: float, now: float) -> None:
         """Learn from a stopped attempt, if it was already unusually slow."""
         if now - begun >= self.delay_s:
-            self._took(now - begun, now, self._at_work.get(request, (0.0, 0.0, 1.0))[2])
+            self._took(now - begun, now, self.at_work.get(request, (0.0, 0.0, 1.0))[2])
 
     def _took(self, seconds: float, now: float, share: float) -> None:
         self.latencies.add(seconds, now, share)
@@ -262,5 +263,5 @@ class ReplicaLoad:
 
     def forget(self) -> None:
         """Note that its link is new or gone: nothing is in flight, and doubts are over."""
-        self._at_work.clear()
+        self.at_work.clear()
         self.doubted = False

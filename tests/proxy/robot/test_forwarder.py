@@ -11,6 +11,7 @@ from fogft.model.spec import ServiceSpec
 from fogft.proxy.gateway.gateway import UNREADY_S, Forwarder
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.links import best_of, seen_through
+from fogft.requests.load import Handling
 from tests.fakes.proxy import UID, Clock, FakeIncoming, FakeLink
 
 READY = frozenset({"/s"})
@@ -116,7 +117,8 @@ def test_what_services_died_over_is_refused_as_it_is_given_up_and_when_it_comes_
         scene.crash(slot, killer.request_id)
         scene.clock.now += 0.1
         scene.dispatcher.tick()
-    scene.crash(0, killer.request_id)
+    (alone,) = [slot for slot in (0, 1) if scene.links[slot].handled[-1] is Handling.ALONE]
+    scene.crash(alone, killer.request_id)
     assert killer.outcome == [refused(Refusal.CRASHED)]
     asked = [len(link.offered) for link in scene.links]
     assert scene.request().outcome == [refused(Refusal.CRASHED)]
