@@ -395,12 +395,13 @@ def test_a_port_that_a_successor_removed_is_known_by_its_bytes(ros_domain: int) 
     caller = subprocess.Popen(command, env=environ, stdin=pipe, stdout=pipe, text=True)
     try:
         assert _broken(caller) == 0
-        found = 0
-        for _ in range(3):
+        found, left = 0, 10  # on a busy machine Fast DDS was first three times in a row
+        while not found and left:
+            left -= 1
             killed.kill()
             killed.wait()
             killed = _other_node(ros_domain, ORDINARY)
-            found = found or _broken(caller)
+            found = _broken(caller)
         assert found > 0
     finally:
         for process in (killed, caller):
