@@ -6,7 +6,7 @@ SMALL_BYTES = 16 << 10
 class ByteLimit:
     """The large messages held, in bytes: within a limit together, or one of any size.
 
-    Who has many small ones need not ask about these.
+    Small ones change nothing: where many come, callers do not ask about them.
     """
 
     def __init__(self, limit: int) -> None:

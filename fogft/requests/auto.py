@@ -195,9 +195,12 @@ class Auto(Learning):
             for other in open:
                 if other != replica and not self.is_spare(request, other):
                     self._beaten[request, other] = now
-        self._replicas[replica].answered(request, load, now)
-        if load is not None and (load.waiting or self._demand.full):
-            self._demand.answered(load)
+        known = self._replicas[replica]
+        if load is not None:
+            known.heard(request, load, now)
+            if load.waiting or self._demand.full:
+                self._demand.answered(load, now)
+        known.answered(request, load, now)
         if self._wanting:
             self._released(replica, now)
 
@@ -246,7 +249,8 @@ class Auto(Learning):
 
     def needed(self, able: int, now: float) -> int:
         """Return how many replicas would be enough if there are too few; else 0."""
-        return self._demand.replicas(able, now)
+        times_s = sorted(known.service_s for known in self._replicas.values())
+        return self._demand.replicas(able, times_s[len(times_s) // 2] if times_s else 0.0, now)
 
     def report(self) -> dict[str, Any]:
         """Return counts, the budget, and each replica's estimate by ``slot.generation``."""

@@ -29,8 +29,9 @@ NEVER = float("inf")
 _MANY = 16.0  # requests ahead: behind more, a time tells little of what is unusual
 _FULL_OVER_S, _ASKED_OVER_S, _DEMAND_STEP_S = 10.0, 30.0, 0.1
 _OFTEN = 0.5  # of the time something waits: there are too few replicas
-_PAUSE = 0.4  # of it: what was so before a longer one is no more
-_ENOUGH = 0.8  # of what replicas can do: so much they should have to do
+_UNANSWERED = 1.15  # times what full ones answer is asked: no chance
+_SILENT_S = 2.0  # without an answer nobody knows whether they are full
+_TOO_FULL, _ENOUGH = 0.95, 0.8  # shares of what replicas can do: too much, and what they should do
 
 
 class Handling(IntFlag):
@@ -52,40 +53,56 @@ class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice
 
 
 class Demand:
-    """What all robots ask of a service that is full, as one of them sees it."""
+    """What robots ask of a service: this one, and all, as far as full replicas show it."""
 
     def __init__(self) -> None:
         self.full = False  # something waited at the replica that answered last
+        self._full_until = -NEVER  # unless another answer says so
         self._full_share = 0.0  # of the time, lately
-        self._asked = self._answered = 0.0  # while it was full, lately
+        self._asked = 0.0  # lately
+        self._asked_full = self._answered_full = 0.0  # while it was full, lately
         self._at = 0.0
 
     def asked(self, now: float) -> None:
         """Count a request."""
         if now > self._at + _DEMAND_STEP_S:
-            kept = math.exp((self._at - now) / _ASKED_OVER_S)
-            self._asked, self._answered = self._asked * kept, self._answered * kept
-            self._full_share, self._at = self._share(now), now
-        self._asked += self.full
+            kept = self._kept(now, _FULL_OVER_S)
+            self._full_share, self._asked = self._share(now), self._asked * kept
+            self.full = self.full and now < self._full_until
+            kept = self._kept(now, _ASKED_OVER_S)
+            self._asked_full, self._answered_full = (
+                self._asked_full * kept, self._answered_full * kept
+            )  # fmt: skip
+            self._at = now
+        self._asked += 1.0
+        self._asked_full += self.full
 
-    def answered(self, load: Load) -> None:
+    def answered(self, load: Load, now: float) -> None:
         """Count an answer; no need where it was not full, and nothing waits."""
-        self.full = load.waiting > 0
-        self._answered += self.full
+        self.full, self._full_until = load.waiting > 0, now + _SILENT_S
+        self._answered_full += self.full
+
+    def _kept(self, now: float, over_s: float) -> float:
+        return math.exp((self._at - now) / over_s)
 
     def _share(self, now: float) -> float:
-        kept = math.exp((self._at - now) / _FULL_OVER_S)
-        return self._full_share * kept + min(1.0 - kept, _PAUSE) * self.full
+        kept, full = self._kept(now, _FULL_OVER_S), self.full and now < self._full_until
+        return self._full_share * kept + (1.0 - kept) * full
 
-    def replicas(self, able: int, now: float) -> int:
-        """Return how many replicas would be enough, if there are too few; else 0.
+    def replicas(self, able: int, service_s: float, now: float) -> int:
+        """Return how many replicas would be enough, at `service_s` a request, if too few; else 0.
 
-        Full ones do what they can, and serve robots in turns: each robot sees by how much too few
-        they are for all.
+        Enough for this robot; and for all, where full replicas leave requests unanswered: they
+        serve robots in turns, so those that ask as much see alike by how much they are too few.
         """
-        if self._share(now) <= _OFTEN or not self._answered:
-            return 0
-        return math.ceil(max(1, able) * max(1.0, self._asked / self._answered) / _ENOUGH)
+        able, needed = max(1, able), 0
+        work = self._asked * self._kept(now, _FULL_OVER_S) / _FULL_OVER_S * service_s
+        if work > _TOO_FULL * able:
+            needed = math.ceil(work / _ENOUGH)
+        answered = self._answered_full
+        if self._share(now) > _OFTEN and self._asked_full > _UNANSWERED * answered > 0.0:
+            needed = max(needed, math.ceil(able * self._asked_full / answered / _ENOUGH))
+        return needed
 
 
 class ReplicaLoad:
@@ -211,9 +228,7 @@ class ReplicaLoad:
                 del self.at_work[lost]
 
     def answered(self, request: bytes, load: Load | None, now: float) -> None:
-        """Note that it has ended an attempt, with the load that it told."""
-        if load is not None:
-            self.heard(request, load, now)
+        """Note that it has ended an attempt."""
         sent = self.at_work.pop(request, None)
         self.ended_at = now
         self.doubted = False

@@ -50,34 +50,50 @@ def crowded(seconds: float, *, answered: float = 1.0, waiting: int = 1) -> Deman
         demand.asked(number / 10)
         owed += answered
         if owed >= 1.0:
-            demand.answered(says(waiting=waiting))
+            demand.answered(says(waiting=waiting), number / 10)
             owed -= 1.0
     return demand
 
 
 @pytest.mark.parametrize(
-    ("answered", "able", "needed"), [(1.0, 1, 2), (1.0, 3, 4), (2 / 3, 3, 6), (1 / 3, 3, 12)]
+    ("answered", "able", "needed"),
+    [(1.0, 3, 0), (0.9, 3, 0), (0.8, 1, 2), (2 / 3, 3, 6), (1 / 3, 3, 12)],
 )
 def test_full_replicas_are_too_few_by_what_they_leave_unanswered(answered, able, needed):
     """Asked for is what leaves a fifth free, whoever else asks."""
-    assert crowded(60.0, answered=answered).replicas(able, 60.0) == needed
+    assert crowded(60.0, answered=answered).replicas(able, 0.0, 60.0) == needed
+
+
+@pytest.mark.parametrize(("service_s", "needed"), [(0.28, 0), (0.3, 4), (0.6, 8)])
+def test_what_one_robot_asks_is_enough_to_see_that_three_are_too_few(service_s, needed):
+    """Before anything waits at one: a service may be given more than it can work on."""
+    assert crowded(60.0, waiting=0).replicas(3, service_s, 60.0) == needed
+
+
+def test_where_nobody_answers_any_more_what_it_has_said_does_not_grow():
+    demand = crowded(60.0, answered=2 / 3)
+    for number in range(600, 1800):
+        demand.asked(number / 10)
+        assert demand.replicas(3, 0.0, number / 10) in ((6, 7) if number < 640 else (0, 6, 7))
+    assert demand.replicas(3, 0.0, 180.0) == 0
 
 
 def test_where_nothing_waits_there_are_enough_whatever_is_not_answered():
     """It is lost to faults."""
-    assert crowded(60.0, answered=0.1, waiting=0).replicas(1, 60.0) == 0
-    assert Demand().replicas(0, 0.0) == 0
+    assert crowded(60.0, answered=0.1, waiting=0).replicas(1, 0.0, 60.0) == 0
+    assert Demand().replicas(0, 0.0, 0.0) == 0
 
 
 def test_a_burst_is_no_reason_and_a_crowd_is_forgotten_within_ten_seconds():
-    demand = crowded(5.0)
-    assert demand.replicas(1, 5.0) == 0
-    demand = crowded(60.0)
-    demand.answered(says(waiting=0))
+    demand = crowded(5.0, answered=0.5)
+    assert demand.replicas(1, 0.0, 5.0) == 0
+    demand = crowded(60.0, answered=0.5)
+    demand.answered(says(waiting=0), 60.0)
     demand.asked(60.0)
-    assert demand.replicas(0, 65.0) == 2, "none counts as one"
-    assert demand.replicas(1, 69.0) == 0
-    assert crowded(60.0).replicas(1, 90.0) == 0, "it was full when it was last asked"
+    assert demand.replicas(0, 0.0, 65.0) == 3, "none counts as one"
+    assert demand.replicas(1, 0.0, 69.0) == 0
+    late = crowded(60.0, answered=0.5).replicas(1, 0.0, 90.0)
+    assert late == 0, "it was full when it was last asked"
 
 
 # -- what is believed of one replica ----------------------------------------------------------
@@ -243,7 +259,7 @@ def test_only_what_was_slow_already_is_learned_of_what_was_stopped():
 def test_an_answer_to_what_is_not_known_says_that_it_lives_and_no_more():
     found = known()
     found.doubted = True
-    found.answered(B, None, 20.0)
+    found.answered(B, says(service_s=9.0, spent_s=0.0), 20.0)
     assert (found.doubted, found.ended_at) == (False, 20.0)
     assert found.expected_s(20.0, 0.1) == pytest.approx(0.1)
 

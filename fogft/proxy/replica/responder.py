@@ -19,7 +19,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.known_requests import KnownRequests
-from fogft.proxy.replica.service_queue import HOLD_LIMIT_S, TOGETHER_S, Job, ServiceQueue
+from fogft.proxy.replica.service_queue import HOLD_LIMIT_S, Job, ServiceQueue
 from fogft.requests.load import Handling
 from fogft.ros.port import RosClient
 
@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 # The default depth of a service's queue (rmw_qos_profile_services_default). Kept true by
 # tests/proxy/test_processes.py, which sends a burst to an ordinary service.
 OUTSTANDING = 10
+
+_TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
 
 CANCEL_TYPE = "std_srvs/srv/Trigger"
 # A serialised message without fields: the header, the byte that stands for no fields, padding.
@@ -270,7 +272,7 @@ class Responder:
                     self.known.forget(job)
                 elif not job.unwanted:
                     self.known.keep(job, payload)
-            more = queue.at_work > 1 and queue.limit.service_s < TOGETHER_S
+            more = queue.at_work > 1 and queue.limit.service_s < _TOGETHER_S
             load = queue.load(now - job.arrived, ended=1)
         try:
             for incoming in waiting:

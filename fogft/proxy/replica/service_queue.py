@@ -29,7 +29,6 @@ _LONGEST_FADES = 0.999  # with each answer
 # share of the longest time that one was given here: what takes longer than most comes too late.
 _TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
 HOLD_LIMIT_S = 2.0  # a cancel service that has not answered by then is given up
-TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
 
 
 class Job:
@@ -137,6 +136,7 @@ class ServiceQueue:
         job = self._waiting.take()
         if job is not None and not self._has_room(job):
             self.put(job)  # when the service has nothing else
+            self._waiting.not_served(job.robot)
             return None
         takes_s = self.limit.takes_s
         needs_s = takes_s if self.at_work >= self.limit.limit else 0.0

@@ -152,7 +152,6 @@ class Dispatcher:
             chosen = requests.begin(
                 request, payload, able, deadline=deadline, now=now, handle=handle
             )
-            count["sent"] += len(chosen)  # less those that decline
             if self._ledger.traced is not None and (pending := requests.get(request)) is not None:
                 pending.trace = Trace(dict.fromkeys(chosen, now), {})
             soon = min(requests.choose.look_at, deadline)
@@ -360,10 +359,10 @@ class Dispatcher:
         now, self._next_look = self._clock(), NEVER
         if now >= self._tell_at:  # its owner has told the links
             self._tell_at = NEVER
-        if not self._waits:
-            self._requests.choose.news = False  # it concerns nobody
-            return NEVER
         with self._lock:
+            if not self._waits:
+                self._requests.choose.news = False  # it concerns nobody
+                return NEVER
             expired = self._requests.expire(now)
         for request, pending in expired:
             self._delivery.expired(request, pending)

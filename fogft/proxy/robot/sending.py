@@ -39,17 +39,19 @@ class Sender:
         self, request: bytes, payload: bytes, links: Mapping[int, Link], chosen: Sequence[int],
         timeout_s: float,
     ) -> None:  # fmt: skip
-        """Offer a new request to its chosen replicas, for all of which it was counted."""
+        """Offer a new request to its chosen replicas."""
         name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
-        several = len(chosen) > 1  # one alone is no spare
+        several, taken = len(chosen) > 1, 0  # one alone is no spare
         for replica in chosen:
             spare = several and is_spare(request, replica)
             handling = Handling.DROP_IF_BUSY if spare else Handling.NORMAL
-            if not links[replica].offer(
+            if links[replica].offer(
                 name, request, payload, timeout_s, more=self._in_burst, handling=handling
             ):
+                taken += 1
+            else:
                 self._declined(request, replica, is_copy=True)
-                self._count(-1)
+        self._count(taken)
         if several and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)
