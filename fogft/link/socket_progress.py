@@ -67,8 +67,6 @@ class Throughput:
 
     def bytes_per_s(self, now: float) -> float | None:
         """Return the recent throughput; None if unknown."""
-        if not self.spans:  # the usual case
-            return None
         rates = [rate for at, rate in self.spans if now - at <= KEPT_S]
         return median_high(rates) if len(rates) >= ENOUGH else None
 

@@ -70,9 +70,8 @@ class Demand:
             self._full_share, self._asked = self._share(now), self._asked * kept
             self.full = self.full and now < self._full_until
             kept = self._kept(now, _ASKED_OVER_S)
-            self._asked_full, self._answered_full = (
-                self._asked_full * kept, self._answered_full * kept
-            )  # fmt: skip
+            self._asked_full *= kept
+            self._answered_full *= kept
             self._at = now
         self._asked += 1.0
         self._asked_full += self.full

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -64,12 +66,6 @@ def test_full_replicas_are_too_few_by_what_they_leave_unanswered(answered, able,
     assert crowded(60.0, answered=answered).replicas(able, 0.0, 60.0) == needed
 
 
-@pytest.mark.parametrize(("service_s", "needed"), [(0.28, 0), (0.3, 4), (0.6, 8)])
-def test_what_one_robot_asks_is_enough_to_see_that_three_are_too_few(service_s, needed):
-    """Before anything waits at one: a service may be given more than it can work on."""
-    assert crowded(60.0, waiting=0).replicas(3, service_s, 60.0) == needed
-
-
 def test_where_nobody_answers_any_more_what_it_has_said_does_not_grow():
     demand = crowded(60.0, answered=2 / 3)
     for number in range(600, 1800):
@@ -94,6 +90,34 @@ def test_a_burst_is_no_reason_and_a_crowd_is_forgotten_within_ten_seconds():
     assert demand.replicas(1, 0.0, 69.0) == 0
     late = crowded(60.0, answered=0.5).replicas(1, 0.0, 90.0)
     assert late == 0, "it was full when it was last asked"
+
+
+@pytest.mark.parametrize(("per_s", "able", "needed"), [(9.0, 1, 0), (20.0, 1, 3), (20.0, 3, 0)])
+def test_more_replicas_are_needed_where_those_there_are_nearly_full(per_s, able, needed):
+    """At 100 ms a request, one does ten a second; asked for is what leaves a fifth free."""
+    demand = Demand()
+    for number in range(int(100 * per_s)):
+        demand.asked(number / per_s)
+    assert demand.replicas(able, 0.1, 100.0) == needed
+
+
+def test_without_replicas_one_request_is_no_flood():
+    demand = Demand()
+    assert demand.replicas(0, 0.1, 0.0) == 0
+    demand.asked(0.0)
+    assert demand.replicas(0, 0.1, 0.0) == 0
+    for _ in range(100):
+        demand.asked(0.0)
+    assert demand.replicas(0, 0.1, 0.0) == 2, "none counts as one, which is not enough"
+
+
+def test_what_was_asked_fades_to_a_third_in_ten_seconds():
+    demand = Demand()
+    for _ in range(1000):
+        demand.asked(0.0)
+    at_once, later = (demand.replicas(1, 0.1, now) for now in (0.0, 10.0))
+    assert (at_once, later) == (math.ceil(10 / 0.8), math.ceil(10 / math.e / 0.8))
+    assert demand.replicas(1, 0.1, 100.0) == 0
 
 
 # -- what is believed of one replica ----------------------------------------------------------
