@@ -94,7 +94,13 @@ class Decide:
     sends_requests = False
 
     def __init__(self, accepts: Accepts | None = None) -> None:
+        self.accept(accepts)
+
+    def accept(self, accepts: Accepts | None) -> None:
+        """Set which responses are ok; None for all."""
         self.accepts = accepts
+        # Then any response is a success: `began`, `read`, `judge` and `closed` need not be asked.
+        self.takes_any = accepts is None and type(self) is Decide
 
     def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         """Note a new request, and the replicas that can answer it."""

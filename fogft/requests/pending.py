@@ -108,7 +108,8 @@ class PendingRequests:
         if not chosen or len(chosen) < len(able):
             self._short[request] = 0.0
         self.held_bytes += len(payload)
-        self.decide.began(request, pending, able)
+        if not self.decide.takes_any:
+            self.decide.began(request, pending, able)
         return chosen
 
     def more(
@@ -230,7 +231,9 @@ class PendingRequests:
         success; who else is to stop working on that; what is to be done where it goes on.
         """
         pending = None if request is None else self._pending.get(request)
-        means = self.decide.judge(id, replica, payload, reading, pending)
+        means: Judgement = Means.SUCCESS
+        if not self.decide.takes_any:
+            means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
             return means, None, (), Verdict.LATE
         if means is Means.SUCCESS and pending is not None and now < pending.deadline:
@@ -375,6 +378,7 @@ class PendingRequests:
         self._short.pop(request, None)
         self._rejected.pop(request, None)
         self.held_bytes -= len(pending.payload)
-        self.decide.closed(request, pending)
+        if not self.decide.takes_any:
+            self.decide.closed(request, pending)
         if over and self.fallback is not None:
             self.fallback.ended(request)

@@ -85,6 +85,9 @@ class SerialisedNode:
 
         self_test()
         self._middleware: str = get_rmw_implementation_identifier()
+        # Returns what tells a request, of its handle, to each process that received it.
+        by_cyclone = self._middleware == cyclone.MIDDLEWARE
+        self.identity: Callable[[bytes], bytes] = cyclone.identity if by_cyclone else bytes
         self._new_wait_set: Any = rclpy_implementation.WaitSet
         quality = partial(
             QoSProfile,
@@ -244,10 +247,6 @@ class SerialisedNode:
     def _reads(self, process: bytes, topic: str) -> bool:
         readers = self._endpoints(self._node.get_subscriptions_info_by_topic, topic)
         return any(bytes(one.endpoint_gid).startswith(process) for one in readers)
-
-    def identity(self, handle: bytes) -> bytes:
-        """Return what tells a request, of its handle, to each process that received it."""
-        return cyclone.identity(handle) if self._middleware == cyclone.MIDDLEWARE else handle
 
     def participant(self, service: str) -> bytes:
         """Return the first bytes of our DDS participant's id; empty before `service` is offered.

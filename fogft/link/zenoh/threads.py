@@ -20,20 +20,15 @@ import zenoh
 
 log = logging.getLogger(__name__)
 
-_idents: set[int] = set()
+idents: set[int] = set()  # Zenoh's threads, by `threading.get_ident`
 
 
 def note() -> None:
     """Mark this thread as Zenoh's. Called by each callback of requests and answers."""
     ident = threading.get_ident()
-    if ident not in _idents:
-        _idents.add(ident)
+    if ident not in idents:
+        idents.add(ident)
         ctypes.pythonapi.PyGILState_Ensure()  # never released
-
-
-def is_this() -> bool:
-    """Whether this thread is one of Zenoh's."""
-    return threading.get_ident() in _idents
 
 
 WAIT_S = 2.0

@@ -125,16 +125,16 @@ class Forwarder:
             job = self._known.get(id)
             if job is None or job.waiting is None:
                 return
-            waiting = self._release(job)
+            waiting = self._end(job)
             self._known.forget(job)
         self._dispatchers[job.service].cancel(id)
         for incoming in waiting:
             self._refuse(incoming, reason)
 
-    def _release(self, job: Job) -> list[Incoming]:
+    def _end(self, job: Job, answer: bytes | None = None) -> list[Incoming]:
         """End a request; return who waits for it. Under the lock."""
         waiting, job.waiting = job.waiting or [], None
-        self._known.release(job)
+        self._known.end(job, answer)
         self._by_robot[job.robot] -= 1
         if not self._by_robot[job.robot]:
             del self._by_robot[job.robot]
@@ -175,8 +175,7 @@ class Forwarder:
         with self._lock:
             if job.waiting is None:
                 return
-            waiting = self._release(job)
-            self._known.keep(job, payload)
+            waiting = self._end(job, payload)
             more = self._known.held > 0
         for incoming in waiting:
             incoming.reply(payload, more=more)

@@ -59,20 +59,13 @@ class KnownRequests:
         if job.size > SMALL_BYTES:
             self.large.add(job.size)
 
-    def release(self, job: Job) -> None:
-        """Note that a job is done."""
+    def end(self, job: Job, answer: bytes | None = None) -> None:
+        """Note that a job is done; its answer is kept for copies, within the bounds."""
         self.held -= 1
         if job.size > SMALL_BYTES:
             self.large.remove(job.size)
-
-    def forget(self, job: Job) -> None:
-        """Forget a finished job, so that a copy is run again."""
-        del self._jobs[job.id]
-        if self._kept.pop(job.id, None) is not None:
-            self._kept_bytes -= len(job.answer or b"")
-
-    def keep(self, job: Job, answer: bytes) -> None:
-        """Keep the answer to a job for copies, within the bounds."""
+        if answer is None:
+            return
         job.answer = answer
         self._kept[job.id] = job
         self._kept_bytes += len(answer)
@@ -84,6 +77,12 @@ class KnownRequests:
             oldest_done = next((job for job in self._jobs.values() if job.waiting is None), None)
             if oldest_done is not None:
                 self.forget(oldest_done)
+
+    def forget(self, job: Job) -> None:
+        """Forget a finished job, so that a copy is run again."""
+        del self._jobs[job.id]
+        if self._kept.pop(job.id, None) is not None:
+            self._kept_bytes -= len(job.answer or b"")
 
     def expired(self, now: float) -> list[bytes]:
         """Forget jobs past their deadline; return the ids that a caller still waits for."""

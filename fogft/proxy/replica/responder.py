@@ -267,11 +267,10 @@ class Responder:
         with self._lock:
             waiting, job.waiting = job.waiting or [], None
             if waiting:
-                self.known.release(job)
-                if self._passing is not None and self._passing(job.service, payload):
+                passing = self._passing is not None and self._passing(job.service, payload)
+                self.known.end(job, None if passing or job.unwanted else payload)
+                if passing:
                     self.known.forget(job)
-                elif not job.unwanted:
-                    self.known.keep(job, payload)
             more = queue.at_work > 1 and queue.limit.service_s < _TOGETHER_S
             load = queue.load(now - job.arrived, ended=1)
         try:
@@ -298,7 +297,7 @@ class Responder:
             job = self.known.get(id)
             if job is None or job.waiting is None:
                 return
-            self.known.release(job)
+            self.known.end(job)
             self.known.forget(job)
             waiting, job.waiting = job.waiting, None
             queue = self._queues[job.service]

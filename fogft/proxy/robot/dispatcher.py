@@ -92,7 +92,7 @@ class Dispatcher:
         self.max_pending_bytes = max_pending_bytes
         self._decide = Decide() if decide is None else decide
         if spec.ok_field and ok_of is not None:
-            self._decide.accepts = ok_of(spec.ok_field)
+            self._decide.accept(ok_of(spec.ok_field))
         self._requests = PendingRequests(
             policy(spec),
             self._decide,
@@ -210,10 +210,11 @@ class Dispatcher:
         if payload is None:
             self._refused(replica, answer, answer.refusal or Refusal.LOST)
             return
-        request = self._decide.request_of(answer.request_id)
+        decide, attempt = self._decide, answer.request_id
+        request = decide.request_of(attempt) if decide.replicates else attempt
         try:
             fault = "" if request is None else self._fault_of(payload)
-            reading = None if fault else self._decide.read(payload)
+            reading = None if fault or decide.takes_any else decide.read(payload)
         except RosError as error:
             fault = error.message
         if fault:  # no response of this type
@@ -223,7 +224,7 @@ class Dispatcher:
         now, outcomes = self._clock(), self.outcomes
         with self._lock:
             means, pending, losers, verdict = self._requests.answered(
-                answer.request_id, request, replica, payload, reading, answer.load, now
+                attempt, request, replica, payload, reading, answer.load, now
             )
         if self._requests.choose.news:
             self._wake()
@@ -340,7 +341,7 @@ class Dispatcher:
             accepts = self._ok_of(spec.ok_field) if spec.ok_field else None
         with self._lock:
             old = self.spec
-            self._decide.accepts = accepts
+            self._decide.accept(accepts)
             self._ledger.adopt(spec)
             self._delivery.adopt(spec, fallback)
             if old.hedging is not spec.hedging:

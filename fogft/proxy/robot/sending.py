@@ -51,7 +51,8 @@ class Sender:
                 taken += 1
             else:
                 self._declined(request, replica, is_copy=True)
-        self._count(taken)
+        with self._ledger.lock:
+            self._ledger.outcomes.count["sent"] += taken
         if several and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)

@@ -51,7 +51,7 @@ def surplus(links: Mapping[Address, str]) -> list[Address]:
 
 
 class ConnectionReaper:
-    """Watches one port until closed; `thin` are the holders to whom a link is thin.
+    """Watches one port until closed; has in `thin` the holders to whom a link is thin.
 
     `links` are the peers' addresses of authenticated links, with their holders; those of who is
     `revoked` are ended, as are those that have bytes to deliver and delivered none for
@@ -65,6 +65,7 @@ class ConnectionReaper:
         revoked: Callable[[], Collection[str]],
         counters: Counters,
         *,
+        thin: set[str],
         also: Callable[[], None],
         stuck_after_s: float,
     ) -> None:
@@ -74,7 +75,7 @@ class ConnectionReaper:
         self._counters = counters
         self._also = also
         self._stuck_after_s = stuck_after_s
-        self.thin: frozenset[str] = frozenset()
+        self._thin = thin
         self._progress: dict[Address, SocketProgress] = {}
         self._linked: dict[Address, str] = {}  # oldest first
         self._filter = ListenFilter(port)
@@ -193,7 +194,8 @@ class ConnectionReaper:
             if one.stuck_s(now) > self._stuck_after_s:
                 self._end(found[peer], peer, "stuck_links", links[peer])
         self._progress = progress
-        self.thin = frozenset(thin)
+        self._thin &= thin
+        self._thin |= thin
 
     def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:
         sockets.end(connection)

@@ -60,10 +60,10 @@ class ControlQueries:
         except FrameError as error:
             self._malformed(error, asked)
             return
-        if not self._sessions.admits(token):
+        holder = self._sessions.holder(token)
+        if not holder:
             self._turn_away(asked, Refusal.NOT_ADMITTED, "it did not greet")
             return
-        holder = self._sessions.holder(token)
         for gone, query in self._streams.opened(token, asked.query, holder):
             self._queues.end(gone, "gone", QueryEnd(query, asked.turns))
 

@@ -31,7 +31,7 @@ from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
 from fogft.link.zenoh.work_queue import WorkQueue
 from fogft.model import names
-from fogft.model.credentials import CredentialPaths
+from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.records.accepting import listening
@@ -84,7 +84,8 @@ class ZenohListener:
         self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
-        self.streams = Streams(slow=self._slow)
+        self._thin: set[str] = set()  # the holders to whom a link is thin
+        self.streams = Streams(slow=self._thin.__contains__)
         self._records = RecordSet(id.pool_uid, Verifier(credentials.ca, lazy=True))
         # The newest one of the manager that robots have passed on; None before the first.
         self.lease = partial(self._records.get, RecordKind.LEASE)
@@ -126,6 +127,7 @@ class ZenohListener:
             self._peers,
             lambda: self._sessions.revoked,
             self._counters,
+            thin=self._thin,
             also=self._count_handshakes,
             stuck_after_s=self._settings.stuck_after_s,
         )
@@ -146,9 +148,6 @@ class ZenohListener:
         session = self._session
         links = [] if session is None else session.info.links()
         return {address(link.dst): link.auth_identifier or "" for link in links}
-
-    def _slow(self, holder: str) -> bool:
-        return self._reaper is not None and holder in self._reaper.thin
 
     def _count_handshakes(self) -> None:
         for reason in self._handshakes.refusals() if self._handshakes else ():
@@ -207,7 +206,8 @@ class ZenohListener:
     ) -> None:
         token = requests[0][0].token
         stream = self.streams.of(token)
-        if stream is None or not self._sessions.admits(token):
+        holder = self._sessions.of(token)
+        if stream is None or holder is None:
             self._counters.warn(
                 log, "not_admitted", "robot_not_admitted reason=%r", "it did not greet"
             )
@@ -218,15 +218,15 @@ class ZenohListener:
         if service is None:
             self._refuse(stream, Refusal.NOT_READY, *requests)
             return
-        robot = self._sessions.robot(token)
-        if robot not in ("", requests[0][0].robot):  # it asks in its own name, whatever it says
-            requests = [(header._replace(robot=robot), content) for header, content in requests]
+        # A robot asks in its own name, whatever it says; a gateway in that of any.
+        if holder.role is Role.ROBOT and holder.name != requests[0][0].robot:
+            requests = [(one._replace(robot=holder.name), content) for one, content in requests]
         for header, payload in requests:
             if not header.packed:
                 self._hand_over(on_request, service, header, stream, payload)
                 continue
             hand_over = partial(self._hand_over, on_request, service, header, stream)
-            if not self._unpacker.put(self._sessions.holder(token), payload, hand_over):
+            if not self._unpacker.put(holder.common_name, payload, hand_over):
                 self._refuse(stream, Refusal.OVERLOADED, (header, payload))
         stream.seen(requests[0][0].seen)
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
+from threading import get_ident
 
 from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.counters import Counters
@@ -143,7 +144,7 @@ class ReplyQueues:
         """
         size, counted = len(reply.payload), "refused" if reply.refusal else "replies"
         small = size <= SMALL_BYTES and not reply.may_pack
-        if small and not more and not self._closed and not threads.is_this():
+        if small and not more and not self._closed and get_ident() not in threads.idents:
             try:
                 sent = reply.stream.send_at_once(reply.send)
             except Exception as error:

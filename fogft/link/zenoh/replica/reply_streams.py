@@ -61,17 +61,14 @@ class ReplyCredit:
         if stamp not in self._outstanding:  # nothing new, as mostly
             return
         with self._lock:
-            sent = self._outstanding.get(stamp)
-            if sent is not None and sent.connection is connection:
-                self._forget(connection, stamp)
-
-    def _forget(self, connection: object, last: bytes = b"") -> None:
-        """Forget what was sent on a connection, up to a stamp. Under the lock."""
-        for stamp, sent in list(self._outstanding.items()):
-            if sent.connection is connection:
-                del self._outstanding[stamp]
-            if stamp == last:
+            last = self._outstanding.get(stamp)
+            if last is None or last.connection is not connection:
                 return
+            for earlier, sent in list(self._outstanding.items()):
+                if sent.connection is connection:
+                    del self._outstanding[earlier]
+                if sent is last:
+                    return
 
     def send_at_once(self, connection: object, send: Send) -> bool:
         """Call `send` for at most 16 KiB if it cannot block; return whether it was called."""
@@ -82,7 +79,8 @@ class ReplyCredit:
             with self._lock:
                 if self._blockable or (self._outstanding and self._full(connection)):
                     return False
-                self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=False)
+                # `_Sent(...)` would be one more call of Python.
+                self._outstanding[stamp] = tuple.__new__(_Sent, (connection, self._clock(), False))
             send(stamp)
             return True
         finally:
@@ -106,7 +104,8 @@ class ReplyCredit:
         stamp = os.urandom(STAMP_BYTES)
         with self._gate, self._lock:
             self._blockable += 1
-            self._forget(connection)  # who has seen this has seen those before it
+            outstanding = self._outstanding.items()  # who sees this has seen those before it
+            self._outstanding = {s: o for s, o in outstanding if o.connection is not connection}
             self._forget_old(connection)
             self._outstanding[stamp] = _Sent(connection, math.inf, may_block=True)  # it goes on
         try:

@@ -47,7 +47,7 @@ class AuthenticatedSessions:
         self._verify = verify
         self._lock = threading.Lock()
         self._tokens: dict[bytes, Holder] = {}
-        self.admits = self._tokens.__contains__  # whether a token is let in; asked for each request
+        self.of = self._tokens.get  # whose connection has a token, if that is let in
         # When each token was let in, oldest first, by holder.
         self._holders: OrderedDict[str, OrderedDict[bytes, float]] = OrderedDict()
         self.revoked: frozenset[str] = frozenset()  # common names that are let in no more
@@ -100,11 +100,6 @@ class AuthenticatedSessions:
         """Return the holder of the connection with a token; empty if unknown."""
         found = self._tokens.get(token)
         return "" if found is None else found.common_name
-
-    def robot(self, token: bytes) -> str:
-        """Return in which robot's name a connection asks; empty for any, as a gateway's does."""
-        found = self._tokens.get(token)
-        return found.name if found is not None and found.role is Role.ROBOT else ""
 
     def revoke(self, names: Collection[str]) -> None:
         """Admit these holders no more. Earlier revocations stay in force."""

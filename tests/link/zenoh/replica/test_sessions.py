@@ -16,6 +16,7 @@ from fogft.link.zenoh.replica.sessions import (
     AuthenticatedSessions,
     NotAdmittedError,
 )
+from fogft.model.credentials import holder_of
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from tests.records import certificate_names
@@ -50,13 +51,13 @@ def test_who_greeted_is_let_in_and_nobody_else(sessions: AuthenticatedSessions) 
     assert refusal(sessions, Greeting(token(1))) == Refusal.NOT_ADMITTED
     sessions.greet(greeting(1))
     sessions.greet(Greeting(token(1)))  # further probes bring the token only
-    assert sessions.admits(token(1))
-    assert not sessions.admits(token(2))
+    assert sessions.of(token(1))
+    assert not sessions.of(token(2))
 
 
 def test_a_gateway_may_ask_too(sessions: AuthenticatedSessions) -> None:
     sessions.greet(greeting(1, certificate_names.gateway(UID, "edge"), "gateway"))
-    assert sessions.admits(token(1))
+    assert sessions.of(token(1))
 
 
 @pytest.mark.parametrize(
@@ -88,7 +89,7 @@ def test_a_gateway_may_ask_too(sessions: AuthenticatedSessions) -> None:
 )
 def test_who_may_not_ask_is_not_let_in(sessions: AuthenticatedSessions, said: Greeting) -> None:
     assert refusal(sessions, said) == Refusal.NOT_ADMITTED
-    assert not sessions.admits(token(1))
+    assert not sessions.of(token(1))
 
 
 def test_the_revoked_are_let_in_no_more(sessions: AuthenticatedSessions) -> None:
@@ -97,7 +98,7 @@ def test_the_revoked_are_let_in_no_more(sessions: AuthenticatedSessions) -> None
         sessions.greet(greeting(number, name))
     sessions.revoke([EVE])
     sessions.revoke([])  # nothing is ever taken back
-    assert [sessions.admits(token(n)) for n in (1, 2, 3)] == [False, False, True]
+    assert [bool(sessions.of(token(n))) for n in (1, 2, 3)] == [False, False, True]
     assert refusal(sessions, greeting(4, EVE)) == Refusal.REVOKED
     sessions.greet(greeting(5, certificate_names.robot(UID, "eve", 2)))
 
@@ -106,7 +107,7 @@ def test_a_token_cannot_be_taken_over(sessions: AuthenticatedSessions) -> None:
     sessions.greet(greeting(1, ADA))
     assert refusal(sessions, greeting(1, EVE)) == Refusal.NOT_ADMITTED
     sessions.revoke([EVE])
-    assert sessions.admits(token(1))
+    assert sessions.of(token(1))
 
 
 @given(st.integers(1, 3 * TOKENS_LIMIT))
@@ -117,9 +118,9 @@ def test_one_holder_cannot_push_out_another(count: int) -> None:
     sessions.greet(greeting(10_000, ADA))
     for number in range(count):
         sessions.greet(greeting(number, EVE))
-    assert sessions.admits(token(10_000))
-    assert sum(sessions.admits(token(n)) for n in range(count)) == min(count, TOKENS_LIMIT)
-    assert sessions.admits(token(count - 1))
+    assert sessions.of(token(10_000))
+    assert sum(bool(sessions.of(token(n))) for n in range(count)) == min(count, TOKENS_LIMIT)
+    assert sessions.of(token(count - 1))
 
 
 def test_who_greets_too_often_is_refused_and_keeps_what_he_has() -> None:
@@ -128,24 +129,27 @@ def test_who_greets_too_often_is_refused_and_keeps_what_he_has() -> None:
     for number in range(TOKENS_LIMIT):
         sessions.greet(greeting(number, EVE))
     assert refusal(sessions, greeting(TOKENS_LIMIT, EVE)) == Refusal.OVERLOADED
-    assert all(sessions.admits(token(number)) for number in range(TOKENS_LIMIT))
+    assert all(sessions.of(token(number)) for number in range(TOKENS_LIMIT))
     sessions.greet(greeting(10_000, ADA))
     now = TOKENS_WITHIN_S
     sessions.greet(greeting(TOKENS_LIMIT, EVE))
-    assert not sessions.admits(token(0))
+    assert not sessions.of(token(0))
 
 
-def test_a_robot_s_connection_asks_in_its_name_and_a_gateway_s_in_any(
+def test_a_robot_and_a_gateway_are_known_by_the_tokens_of_their_connections(
     sessions: AuthenticatedSessions,
 ) -> None:
     sessions.greet(greeting(1, ADA))
-    sessions.greet(greeting(2, certificate_names.gateway(UID, "edge"), "gateway"))
-    assert [sessions.robot(token(number)) for number in (1, 2, 3)] == ["ada", "", ""]
+    sessions.greet(greeting(2, edge := certificate_names.gateway(UID, "edge"), "gateway"))
+    assert [sessions.of(token(number)) for number in (1, 2, 3)] == [
+        *map(holder_of, (ADA, edge)),
+        None,
+    ]
 
 
 def test_what_is_remembered_is_bounded(sessions: AuthenticatedSessions) -> None:
     for number in range(HOLDERS_LIMIT + 5):
         sessions.greet(greeting(number, certificate_names.robot(UID, f"r{number}")))
-    admitted = [sessions.admits(token(number)) for number in range(HOLDERS_LIMIT + 5)]
+    admitted = [sessions.of(token(number)) is not None for number in range(HOLDERS_LIMIT + 5)]
     assert sum(admitted) == HOLDERS_LIMIT
-    assert not sessions.admits(token(0))
+    assert not sessions.of(token(0))
