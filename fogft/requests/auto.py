@@ -156,9 +156,10 @@ class Auto(Learning):
         if len(able) == 1:
             return able[0]
         known = [self._replicas[replica] for replica in able]
-        times_s = sorted([one.service_s for one in known])
-        typical_s = times_s[len(times_s) // 2]
-        ranks = [(one.avoided(now), one.expected_s(now, typical_s)) for one in known]
+        middle = len(known) // 2
+        typical_s = sorted([one.service_s for one in known])[middle]
+        usual_s = sorted([one.usual_s for one in known])[middle]
+        ranks = [(one.avoided(now), one.expected_s(now, typical_s, usual_s)) for one in known]
         least = min(ranks)
         equals = ranks.count(least)
         if equals == 1:

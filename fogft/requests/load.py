@@ -17,7 +17,10 @@ _SAMPLES_NEEDED = 5  # with fewer, the 95 % quantile is but the longest one
 _WORD_HOLDS_S = 1.0  # of a replica, about other robots' requests
 _RTT_GAIN = 0.1
 NEARLY = 0.8  # of what it usually takes
-_ALIKE = 4.0
+# Times as slow or quick as most: by less than the first, by what is known over a long time, no
+# difference counts; by the second even one that is new does.
+_ALIKE, _ALIKE_LATELY = 1.7, 4.0
+_USUAL_GAIN = 0.02
 # Of what a request is expected to take, and of what is ever at work:
 _LATE, _STALLS = 1.2, 3.0
 _DOUBT_AFTER = 2.0
@@ -109,7 +112,8 @@ class ReplicaLoad:
 
     def __init__(self) -> None:
         self.latencies = Latencies()
-        self.service_s = 0.0  # how long it works on a request, as far as is known
+        self.service_s = 0.0  # how long it lately worked on a request, as far as is known
+        self.usual_s = 0.0  # the same, over a long time
         self.doubted = False  # an attempt is overdue, and it has ended none since that one began
         self.ended_at = -NEVER  # when it last ended an attempt, with an answer or too late for one
         self.asked_at = -NEVER
@@ -164,16 +168,19 @@ class ReplicaLoad:
         """Whether to prefer others: it is in doubt, or has failed."""
         return self.doubted or now < self._avoided_until
 
-    def expected_s(self, now: float, typical_s: float) -> float:
+    def expected_s(self, now: float, typical_s: float, usual_s: float) -> float:
         """Return the expected latency of a request sent now; 0 where nothing is known: it is tried.
 
         Round trip, and one service time for it and for each request before it, less what the one at
         work has had; one that takes far too long is taken to go on for as long again. A replica
-        that is not four times as slow or quick as `typical_s`, that of most, is taken for equal.
+        that is about as quick as most is taken for equal: those take `typical_s` a request lately,
+        `usual_s` over a long time.
         """
         service_s = self.service_s
-        if typical_s / _ALIKE < service_s < typical_s * _ALIKE:
-            service_s = typical_s
+        if typical_s / _ALIKE_LATELY < service_s < typical_s * _ALIKE_LATELY:
+            service_s = self.usual_s
+            if usual_s / _ALIKE < service_s < usual_s * _ALIKE:
+                service_s = typical_s
         rtt_s = self._rtt_s or 0.0
         left_s = service_s * (1 + self.ahead(now))
         if not self.at_work:
@@ -222,6 +229,8 @@ class ReplicaLoad:
         self._others, self._others_until = max(0, there - seen), now + _WORD_HOLDS_S
         self._slots = load.slots
         self.service_s = load.service_s
+        gain = max(_USUAL_GAIN, 1.0 / (1 + self.latencies.samples))
+        self.usual_s += gain * (load.service_s - self.usual_s)
         if seen > there:  # the ends of some were lost
             for lost in [id for id in self.at_work if id != request][: seen - there]:
                 del self.at_work[lost]
@@ -269,7 +278,7 @@ class ReplicaLoad:
             self._learns_from = 1 + min(samples // 16, 15)
             self.delay_s = max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
         if self._rtt_s is None:  # it never told its load
-            self.service_s = self.latencies.mean_below_s(LATE_SHARE) or 0.0
+            self.service_s = self.usual_s = self.latencies.mean_below_s(LATE_SHARE) or 0.0
 
     def doubt(self, begun: float, now: float) -> bool:
         """Doubt it if an attempt is long overdue and none has ended since; return whether it is."""

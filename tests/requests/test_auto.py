@@ -68,7 +68,7 @@ def test_the_round_trip_is_what_the_replica_did_not_spend():
     known.asked(A, 10.0)
     known.heard(A, idle(0.02), 10.05)
     known.answered(A, idle(0.02), 10.05)
-    assert known.expected_s(10.1, 0.02) == pytest.approx(0.05)
+    assert known.expected_s(10.1, 0.02, 0.02) == pytest.approx(0.05)
     assert known.free(10.1)
 
 
@@ -79,7 +79,7 @@ def test_each_request_before_it_costs_a_service_time_ours_and_those_of_others():
     known.answered(A, Load(2, 1, 0, 0.02, 0.02), 10.02)
     known.asked(B, 10.03)
     assert known.ahead(10.03) == 4
-    assert known.expected_s(10.03, 0.02) == pytest.approx(0.02 * 5)
+    assert known.expected_s(10.03, 0.02, 0.02) == pytest.approx(0.02 * 5)
     assert not known.free(10.03)
     assert known.ahead(12.0) == 1  # its word holds for a second
 

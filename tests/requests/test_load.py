@@ -126,7 +126,7 @@ def test_what_was_asked_fades_to_a_third_in_ten_seconds():
 def test_of_one_that_nobody_has_asked_nothing_is_expected_and_it_is_free():
     """So it is tried first."""
     found = ReplicaLoad()
-    assert (found.expected_s(0.0, 0.1), found.wait_s(0.0), found.ahead(0.0)) == (0.0, 0.0, 0)
+    assert (found.expected_s(0.0, 0.1, 0.1), found.wait_s(0.0), found.ahead(0.0)) == (0.0, 0.0, 0)
     assert found.free(0.0)
     assert not found.avoided(0.0)
     assert found.oldest_begun == NEVER
@@ -178,29 +178,39 @@ def test_one_begins_when_the_one_before_it_has_ended():
 def test_what_is_at_work_counts_for_what_is_left_of_it():
     found = known()
     found.asked(A, 20.0)
-    assert found.expected_s(20.0, 0.1) == pytest.approx(0.2)
-    assert found.expected_s(20.06, 0.1) == pytest.approx(0.14)
-    assert found.expected_s(20.11, 0.1) == pytest.approx(0.1), "it is over at any moment"
-    assert found.expected_s(20.2, 0.1) == pytest.approx(0.2), "it takes longer than it should"
-    assert found.expected_s(20.5, 0.1) == pytest.approx(0.7), "and so it may for as long again"
+    assert found.expected_s(20.0, 0.1, 0.1) == pytest.approx(0.2)
+    assert found.expected_s(20.06, 0.1, 0.1) == pytest.approx(0.14)
+    assert found.expected_s(20.11, 0.1, 0.1) == pytest.approx(0.1), "it is over at any moment"
+    assert found.expected_s(20.2, 0.1, 0.1) == pytest.approx(0.2), "it takes longer than it should"
+    assert found.expected_s(20.5, 0.1, 0.1) == pytest.approx(0.7), "and so it may for as long again"
 
 
 @pytest.mark.parametrize(
     ("service_s", "taken_for"),
-    [(0.1, 0.2), (0.79, 0.2), (0.81, 0.81), (0.051, 0.2), (0.049, 0.049)],
+    [(0.2, 0.2), (0.33, 0.2), (0.35, 0.35), (0.12, 0.2), (0.11, 0.11)],
 )
-def test_one_that_is_not_four_times_as_slow_or_quick_as_most_is_their_like(service_s, taken_for):
-    assert known(service_s, service_s=service_s).expected_s(20.0, 0.2) == pytest.approx(taken_for)
+def test_one_that_is_about_as_quick_as_most_is_taken_for_their_like(service_s, taken_for):
+    found = known(service_s, service_s=service_s)
+    assert found.expected_s(20.0, 0.2, 0.2) == pytest.approx(taken_for)
+
+
+@pytest.mark.parametrize(("lately_s", "taken_for"), [(0.79, 0.2), (0.81, 0.81), (0.051, 0.2)])
+def test_of_one_that_is_otherwise_than_usual_only_much_counts(lately_s, taken_for):
+    found = known(0.2, service_s=0.2, count=200)
+    found.asked(A, 20.0)
+    found.heard(A, says(service_s=lately_s), 20.1)
+    found.answered(A, says(service_s=lately_s), 20.1)
+    assert found.expected_s(20.1, 0.2, 0.2) == pytest.approx(taken_for, rel=0.01)
 
 
 def test_the_round_trip_shrinks_at_once_and_grows_slowly():
     """A short one proves that the way is short; a long one may be chance."""
     found = known(0.15)
-    assert found.expected_s(20.0, 0.1) == pytest.approx(0.15)
+    assert found.expected_s(20.0, 0.1, 0.1) == pytest.approx(0.15)
     for took_s, expected_s in ((0.11, 0.11), (0.21, 0.12), (0.05, 0.1)):
         found.asked(A, 20.0)
         found.answered(A, says(), 20.0 + took_s)
-        assert found.expected_s(20.5, 0.1) == pytest.approx(expected_s)
+        assert found.expected_s(20.5, 0.1, 0.1) == pytest.approx(expected_s)
 
 
 def test_what_is_sent_within_the_last_round_trip_it_cannot_have_seen():
@@ -234,7 +244,7 @@ def test_there_is_never_less_than_nothing_and_no_wait_without_somebody_ahead(ste
         else:
             found.failed(request, now)
         assert found.ahead(now) >= 0
-        assert found.expected_s(now, 0.1) >= 0
+        assert found.expected_s(now, 0.1, 0.1) >= 0
         assert found.wait_s(now) == 0.0 or found.ahead(now)
         assert found.free(now) is (found.wait_s(now) == 0.0) or not found.service_s
         assert found.oldest_begun <= now or found.oldest_begun == NEVER
@@ -285,7 +295,7 @@ def test_an_answer_to_what_is_not_known_says_that_it_lives_and_no_more():
     found.doubted = True
     found.answered(B, says(service_s=9.0, spent_s=0.0), 20.0)
     assert (found.doubted, found.ended_at) == (False, 20.0)
-    assert found.expected_s(20.0, 0.1) == pytest.approx(0.1)
+    assert found.expected_s(20.0, 0.1, 0.1) == pytest.approx(0.1)
 
 
 def test_one_that_never_tells_its_load_is_judged_by_how_long_it_takes():
@@ -294,7 +304,7 @@ def test_one_that_never_tells_its_load_is_judged_by_how_long_it_takes():
         found.asked(A, float(number))
         found.answered(A, None, number + 0.5)
     assert found.service_s == pytest.approx(0.5, rel=0.11)
-    assert found.expected_s(20.0, 0.5) == pytest.approx(0.5, rel=0.11)
+    assert found.expected_s(20.0, 0.5, 0.5) == pytest.approx(0.5, rel=0.11)
 
 
 # -- latencies --------------------------------------------------------------------------------

@@ -407,6 +407,46 @@ def test_what_a_replica_that_says_it_hangs_has_goes_to_others_at_once():
         assert lost([world]) == 0
 
 
+def by_one_who_sees_all(means_s: list[float], rtts_s: list[float], load: float, seed: int) -> float:
+    """Return the p99 where each request goes to where it should end first, by queues as they are.
+
+    The services take exponential times.
+    """
+    arrivals, draws, now, latencies = random.Random(seed), random.Random(seed + 1), 0.0, []
+    rate, ends = load * sum(1.0 / mean_s for mean_s in means_s), [list[float]() for _ in means_s]
+    while now < 200.0:
+        now += arrivals.expovariate(rate)
+        expected_s = []
+        for queue, mean_s, rtt_s in zip(ends, means_s, rtts_s, strict=True):
+            queue[:] = [end for end in queue if end > now]
+            expected_s.append(rtt_s + mean_s * (1 + len(queue)))
+        slot = expected_s.index(min(expected_s))
+        begun = max([now + rtts_s[slot] / 2, *ends[slot][-1:]])
+        ends[slot].append(begun + exponential(means_s[slot])(draws))
+        latencies.append(ends[slot][-1] + rtts_s[slot] / 2 - now)
+    return percentile(latencies, 99)
+
+
+@pytest.mark.parametrize(
+    ("means_s", "rtts_s"),
+    [
+        ([0.02, 0.02, 0.06], [0.002] * 3),
+        ([0.02] * 3, [0.005, 0.04, 0.08]),
+        ([0.06, 0.02, 0.02], [0.005, 0.03, 0.03]),
+    ],
+    ids=["one is slow", "near and far", "the near one is slow"],
+)
+def test_unlike_replicas_get_what_each_can_do(means_s, rtts_s):
+    """Other machines, other regions: little beyond who sees all queues at once."""
+    world = World(AUTO)
+    for mean_s, rtt_s in zip(means_s, rtts_s, strict=True):
+        world.replica(exponential(mean_s), serial=True, rtt_s=rtt_s)
+    world.poisson(0.7 * sum(1.0 / mean_s for mean_s in means_s), 40.0, random.Random(3))
+    world.run(11.0)
+    assert lost([world]) == 0
+    assert p99([world]) <= 1.3 * by_one_who_sees_all(means_s, rtts_s, 0.7, 3)
+
+
 def test_one_that_is_ten_times_as_slow_gets_few_requests():
     world = World(AUTO, timeout_s=2.0)
     for service_s in (0.2, 0.02, 0.02):
