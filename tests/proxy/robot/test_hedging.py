@@ -8,7 +8,7 @@ import random
 from collections import defaultdict
 from collections.abc import Callable
 from functools import cache, partial
-from statistics import median
+from statistics import fmean
 
 import pytest
 from hypothesis import given, settings
@@ -177,7 +177,8 @@ def test_auto_is_as_good_as_the_best_other_rule_from_idle_to_full(service, load)
     replica, or to any where none is.
     """
     seconds, ratios, of_idle = 20.0 / load, [], []  # as many requests at each load
-    for seed in range(3, 3 + by_day(5 if load >= 0.7 else 1, at_night=15)):
+    chance = load >= 0.7 and service != "constant"
+    for seed in range(3, 3 + by_day(8 if chance else 1, at_night=20)):
         better = one_copy(shortest, service, load, seconds, seed)
         if load <= 0.2:  # of more load `all` makes an endless queue
             worlds = served(HedgingMode.ALL, service, load, seconds=seconds, seed=seed)
@@ -187,8 +188,8 @@ def test_auto_is_as_good_as_the_best_other_rule_from_idle_to_full(service, load)
         ratios.append((p99(worlds) - 2 * ONE_WAY_S) / better)
         idle = one_copy(an_idle_one, service, load, seconds, seed)
         of_idle.append((p99(worlds) - 2 * ONE_WAY_S) / idle)
-    assert median(ratios) <= 1.05
-    assert median(of_idle) <= 1.0
+    assert fmean(ratios) <= 1.05
+    assert fmean(of_idle) <= 1.0
 
 
 @pytest.mark.parametrize("robots", [1, 5])
