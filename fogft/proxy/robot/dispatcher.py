@@ -214,7 +214,7 @@ class Dispatcher:
         request = decide.request_of(attempt) if decide.replicates else attempt
         try:
             fault = "" if request is None else self._fault_of(payload)
-            reading = None if fault or decide.takes_any else decide.read(payload)
+            reading = None if fault else decide.takes_any or decide.read(payload)
         except RosError as error:
             fault = error.message
         if fault:  # no response of this type

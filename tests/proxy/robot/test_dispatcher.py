@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -463,6 +464,29 @@ def test_a_changed_ok_field_counts_from_the_next_answer_on():
             dispatcher.answered(links[0], links[0].reply(rejected))
         dispatcher.answered(links[1], links[1].reply(b"good" if field else b"bad"))
     assert responses == [("ok", b"good"), ("fine", b"good"), ("", b"bad")]
+
+
+def test_an_answer_that_came_as_the_ok_field_changed_is_no_rejection():
+    """It was taken before there was one, and is judged after."""
+    now, changes, responses = Clock(), list[Callable[[], None]](), []
+
+    def clock() -> float:
+        while changes:
+            changes.pop()()
+        return now()
+
+    spec = ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0)
+    checks = {"ok": lambda payload: payload == b"good"}
+    dispatcher = Dispatcher(
+        spec, lambda *response: responses.append(response), ok_of=checks.__getitem__, clock=clock
+    )
+    link = FakeLink(0)
+    dispatcher.route([link])
+    dispatcher.submit(b"q", "caller")
+    changes.append(lambda: dispatcher.adopt(replace(spec, ok_field="ok")))
+    dispatcher.answered(link, link.reply(b"good"))
+    assert responses == [("caller", b"good")]
+    assert dispatcher.report()["rejected"] == 0
 
 
 def test_a_service_may_become_one_that_answers_empty_at_the_deadline():
