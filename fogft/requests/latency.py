@@ -26,38 +26,29 @@ class Latencies:
         self._weight = 1.0  # of the next sample: grows, instead of all others shrinking
         self._total = 0.0
         self._newest: float | None = None
-        self._counted = 0
-        self.new: list[tuple[float, float, float]] = []  # those that are in no bucket yet
-        self.note = self.new.append  # as `add`: later, and at next to no cost
-
-    @property
-    def samples(self) -> int:
-        """How many latencies were counted."""
-        return self._counted + len(self.new)
+        self._new: list[tuple[float, float, float]] = []  # those that are in no bucket yet
+        self.samples = 0
 
     def add(self, took_s: float, now: float, share: float = 1.0) -> None:
         """Count a latency, in seconds, for that share of one."""
-        self.note((took_s, now, share))
-        self._count_new()
+        self._new.append((took_s, now, share))
+        self.samples += 1
 
-    def _count_new(self) -> None:
-        for took_s, now, share in self.new:
-            self._count(took_s, now, share)
-        self.new.clear()
-
-    def _count(self, took_s: float, now: float, share: float) -> None:
-        if self._newest is not None and now > self._newest:
-            self._weight *= 2.0 ** min((now - self._newest) / self.half_life_s, 60.0)
-        self._newest = now
-        self._weight *= self.per_sample
-        if self._weight > _RESCALE_AT:
-            self._rescale()
-        bucket = 0  # whose upper end is the first that is not below it
-        if took_s > _FIRST_S:
-            bucket = min(_BUCKETS - 1, math.ceil(math.log(took_s / _FIRST_S) / _LOG_GROWTH))
-        self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight * share
-        self._total += self._weight * share
-        self._counted += 1
+    def _sort_new(self) -> None:
+        """Put what is new into buckets: once for many, where quantiles are asked for seldom."""
+        for took_s, now, share in self._new:
+            if self._newest is not None and now > self._newest:
+                self._weight *= 2.0 ** min((now - self._newest) / self.half_life_s, 60.0)
+            self._newest = now
+            self._weight *= self.per_sample
+            if self._weight > _RESCALE_AT:
+                self._rescale()
+            bucket = 0  # whose upper end is the first that is not below it
+            if took_s > _FIRST_S:
+                bucket = min(_BUCKETS - 1, math.ceil(math.log(took_s / _FIRST_S) / _LOG_GROWTH))
+            self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight * share
+            self._total += self._weight * share
+        self._new.clear()
 
     def _rescale(self) -> None:
         scale = 1.0 / self._weight
@@ -67,7 +58,7 @@ class Latencies:
 
     def quantile_s(self, share: float) -> float | None:
         """Return the time within which this share of answers came; None before the first."""
-        self._count_new()
+        self._sort_new()
         above = (1.0 - share) * self._total
         for bucket in sorted(self._weights, reverse=True):  # interesting ones are high
             weight = self._weights[bucket]
@@ -78,7 +69,7 @@ class Latencies:
 
     def mean_below_s(self, share: float) -> float | None:
         """Return the mean of this share of answers, the fastest; None before the first."""
-        self._count_new()
+        self._sort_new()
         left, sum_below = share * self._total, 0.0
         for bucket in sorted(self._weights):
             weight = min(self._weights[bucket], left)

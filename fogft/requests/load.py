@@ -128,7 +128,7 @@ class ReplicaLoad:
         self._avoided_s = 0.0
         self._avoided_until = -NEVER
         self.delay_s = UNKNOWN_DELAY_S  # after it an attempt takes unusually long
-        self._learns_from = _SAMPLES_NEEDED  # new times: of many, one more makes no difference
+        self._delay_holds_until = _SAMPLES_NEEDED
 
     # -- what is believed -----------------------------------------------------------------
 
@@ -253,9 +253,7 @@ class ReplicaLoad:
                 self._rtt_s = rtt_s
             else:
                 self._rtt_s = known + _RTT_GAIN * (rtt_s - known)
-        self.latencies.note((took_s, now, share))
-        if len(self.latencies.new) >= self._learns_from or self._rtt_s is None:
-            self._learn()
+        self._took(took_s, now, share)
 
     def dropped(self, request: bytes) -> None:
         """Note that an attempt has ended without the replica working on it."""
@@ -270,13 +268,13 @@ class ReplicaLoad:
     def overtaken(self, request: bytes, begun: float, now: float) -> None:
         """Learn from a stopped attempt, if it was already unusually slow."""
         if now - begun >= self.delay_s:
-            self.latencies.note((now - begun, now, self.at_work.get(request, (0.0, 0.0, 1.0))[2]))
-            self._learn()
+            self._took(now - begun, now, self.at_work.get(request, (0.0, 0.0, 1.0))[2])
 
-    def _learn(self) -> None:
+    def _took(self, seconds: float, now: float, share: float) -> None:
+        self.latencies.add(seconds, now, share)
         samples = self.latencies.samples
-        if samples >= _SAMPLES_NEEDED:
-            self._learns_from = 1 + min(samples // 16, 15)
+        if samples >= self._delay_holds_until:  # of many, one more makes little difference
+            self._delay_holds_until = samples + 1 + min(samples // 16, 15)
             self.delay_s = max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
         if self._rtt_s is None:  # it never told its load
             self.service_s = self.usual_s = self.latencies.mean_below_s(LATE_SHARE) or 0.0

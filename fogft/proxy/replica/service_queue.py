@@ -173,12 +173,8 @@ class ServiceQueue:
             took_s = now - job.begun
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
-            job.passed_on = False
-            self.at_work -= 1
-            self._alone = False
-        if job is self._next:
-            self._next = None
-        elif self._next is not None:  # only now does the service begin with it
+        self.free(job)
+        if self._next is not None:  # only now does the service begin with it
             self._next.begun, self._next.level = now, self.at_work
             self._begun_last, self._next = now, None
         self._unanswered = self.at_work

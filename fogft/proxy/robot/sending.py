@@ -51,8 +51,7 @@ class Sender:
                 taken += 1
             else:
                 self._declined(request, replica, is_copy=True)
-        with self._ledger.lock:
-            self._ledger.outcomes.count["sent"] += taken
+        self._count(taken)
         if several and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)
