@@ -40,6 +40,10 @@ class Choose:
         """Whether the replica drops an attempt unless idle."""
         return False
 
+    def too_busy(self, replica: int, within_s: float, now: float) -> bool:
+        """Whether a request is expected to wait there for longer than that."""
+        return False
+
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
         """Note that a chosen replica was not asked: its window was full, or there was no need."""
 
@@ -101,6 +105,11 @@ class Learning(Choose):
 
     def __init__(self) -> None:
         self._replicas: defaultdict[int, ReplicaLoad] = defaultdict(ReplicaLoad)
+
+    def too_busy(self, replica: int, within_s: float, now: float) -> bool:
+        """Whether what is before a request there takes longer; of one in doubt nobody knows."""
+        known = self._replicas[replica]
+        return not known.doubted and known.wait_s(now) > within_s
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float

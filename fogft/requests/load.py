@@ -152,7 +152,9 @@ class ReplicaLoad:
         """Return how long a request that arrives now is expected to wait: endless if in doubt."""
         if self.doubted:
             return NEVER
-        return 0.0 if self.free(now) else self.service_s * self.ahead(now) / max(1, self._slots)
+        if self.free(now):
+            return 0.0
+        return self.service_s * max(1, self.ahead(now) + 1 - max(1, self._slots))
 
     @property
     def oldest_begun(self) -> float:

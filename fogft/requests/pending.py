@@ -148,6 +148,11 @@ class PendingRequests:
             for replica in able
             if replica not in pending.open and replica not in pending.barred
         }
+        for replica in pending.waits:  # it has refused, and would again
+            if rests_until.get(replica, NEVER) <= now and self.choose.too_busy(
+                replica, pending.deadline - now, now
+            ):
+                rests_until[replica] = now + RETRY_LIMIT_S
         candidates = [replica for replica, at in rests_until.items() if at <= now]
         room = len(able)
         if pending.deaths:  # alone

@@ -10,7 +10,7 @@ Not here: what is said (`fogft.proxy.robot.diagnostics`).
 
 import logging
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from queue import SimpleQueue
 from typing import Any
@@ -180,12 +180,14 @@ def _diagnostics_publisher(node: Any) -> Any:
 
 OURS = "fogft"  # the logger above all of ours
 RECORDS_LIMIT = 1000
+SAME_LIMIT = 10  # a second of one kind: rclpy takes longer for each than a request does
 
 
 class RosLog(logging.Handler):
     """A log handler that forwards records to a node's logger, and so to `/rosout`.
 
-    Whoever changes that logger's level changes ours. `wake` has `pass_on` called soon.
+    Of those that differ in their values only, `SAME_LIMIT` a second; the rest are counted. Whoever
+    changes that logger's level changes ours. `wake` has `pass_on` called soon.
     """
 
     def __init__(self, logger: Any, wake: Callable[[], None]) -> None:
@@ -194,6 +196,7 @@ class RosLog(logging.Handler):
         self._wake = wake
         self._waiting: deque[logging.LogRecord] = deque()
         self._dropped = 0
+        self._second, self._same = 0, Counter[str]()  # how many of each kind in that second
         ours = logging.getLogger(OURS)
         level = ours.getEffectiveLevel() // 10 * 10  # the numbers of both are the same
         logger.set_level(max(logging.DEBUG, min(logging.CRITICAL, level)))
@@ -202,7 +205,11 @@ class RosLog(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Keep a record for `pass_on`."""
-        if len(self._waiting) >= RECORDS_LIMIT:
+        if (second := int(record.created)) != self._second:
+            self._second = second
+            self._same.clear()
+        self._same[record.msg] += 1
+        if len(self._waiting) >= RECORDS_LIMIT or self._same[record.msg] > SAME_LIMIT:
             self._dropped += 1
             return
         self._waiting.append(record)

@@ -135,9 +135,9 @@ def test_of_one_that_nobody_has_asked_nothing_is_expected_and_it_is_free():
 
 @pytest.mark.parametrize(
     ("waiting", "running", "slots", "wait_s"),
-    [(0, 0, 1, 0.0), (0, 1, 1, 0.1), (2, 1, 1, 0.3), (0, 1, 2, 0.0), (1, 2, 2, 0.15)],
+    [(0, 0, 1, 0.0), (0, 1, 1, 0.1), (2, 1, 1, 0.3), (0, 1, 2, 0.0), (1, 2, 2, 0.2)],
 )
-def test_the_wait_is_what_is_there_at_its_pace_over_all_its_slots(waiting, running, slots, wait_s):
+def test_the_wait_is_until_a_slot_is_free_at_the_pace_of_all_slots(waiting, running, slots, wait_s):
     found = known(slots=slots)
     found.heard(A, says(waiting, running, slots), 10.0)
     assert found.wait_s(10.5) == pytest.approx(wait_s)

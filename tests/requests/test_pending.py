@@ -16,6 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from fogft.model.choices import FallbackSpec
 from fogft.model.refusal import Effect, Refusal
 from fogft.requests.alarms import ALARM_S, FALSE_ALARMS, LATELY_S
+from fogft.requests.auto import Auto
 from fogft.requests.choose import All
 from fogft.requests.decide import Decide, Means
 from fogft.requests.fallback import FallbackTimer
@@ -92,6 +93,26 @@ def test_what_is_refused_for_good_is_not_asked_there_again(refusal):
     asked = requests.more((1,), 5.0, newest_first=False)
     final = refusal in (Refusal.EXPIRED, Refusal.FORGOTTEN, Refusal.MALFORMED)
     assert asked == ([] if final else [(A, 1)])
+
+
+def test_what_a_full_replica_refused_is_offered_there_again_once_it_would_be_in_time():
+    """Not every few hundredths of a second: under overload that was most of a proxy's work."""
+    requests = PendingRequests(Auto(), Decide())
+    requests.begin(A, b"question", (1,), deadline=10.0, now=0.0)
+    requests.refused(A, 1, Refusal.OVERLOADED, 0.0)
+
+    def offered(now: float, *, waiting: int | None = None) -> bool:
+        if waiting is not None:
+            requests.choose.heard(B, 1, Load(waiting, 1, 1, 0.1, 0.0), now)
+        chosen = requests.more((1,), now, newest_first=False)
+        return any(requests.attempt(A, replica, now) for _, replica in chosen)
+
+    assert not offered(0.5, waiting=200)  # 20 s
+    assert not offered(0.5 + RETRY_LIMIT_S, waiting=100)  # 10 s
+    assert offered(0.5 + 2 * RETRY_LIMIT_S, waiting=50)
+    requests.refused(A, 1, Refusal.OVERLOADED, 2.0)
+    assert not offered(2.5, waiting=100)
+    assert offered(3.5)  # nothing was heard for a second
 
 
 def test_an_answer_that_is_about_no_request_changes_nothing():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from fogft.errors import RosError
 from fogft.ros.port import Level, Status
+from fogft.ros.visible import SAME_LIMIT
 from tests.ros.nodes.person import Person
 
 pytestmark = pytest.mark.ros
@@ -56,6 +58,26 @@ def test_diagnostics_and_the_log_reach_whoever_looks(person, make_node, ros_doma
     person.wait(lambda: any(m == "cannot go on" for _, _, m in person.log), "the log")
     ours = [(level, text) for level, name, text in person.log if name == "fogft_arm"]
     assert ours == [(20, "link_up replica=0.1"), (30, "link_lost"), (40, "cannot go on")]
+
+
+def test_a_flood_of_one_kind_is_told_in_part(person, make_node, ros_domain):
+    """As of requests that time out under overload; what else happens is told all the same."""
+    make_node(ros_domain).make_visible("fogft_arm", lambda _: "")
+    person.watch_log()
+    person.wait(lambda: log.warning("found") or person.log, "the first record")
+    for n in range(500):
+        log.warning("timed_out request=%d", n)
+    log.error("disk_full")
+    time.sleep(1.0)  # the next second begins
+
+    def told(what: str) -> list[str]:
+        return [text for _, _, text in person.log if text.startswith(what)]
+
+    person.wait(lambda: log.info("ended") or told("ended"), "the last record")
+    assert told("disk_full")
+    assert SAME_LIMIT <= len(told("timed_out")) <= 2 * SAME_LIMIT  # a second may have ended there
+    counts = sum(int(text.partition("count=")[2]) for text in told("log_records_dropped"))
+    assert counts >= 500 - len(told("timed_out"))
 
 
 def test_parameters_are_judged_and_shown(person, make_node, ros_domain):

@@ -500,13 +500,15 @@ def test_over_capacity_what_is_answered_is_answered_in_time_and_the_rest_costs_n
 ):
     """At 150 % nearly all that three can do is done, and the pool is known to be too small.
 
-    However far away they are: what replicas end just in time must still be here in time.
+    However far away they are: what replicas end just in time must still be here in time. What all
+    have refused is not offered again and again.
     """
     [world], seconds = pool(service, rtt_s=rtt_s), 12.0
     offered([world], 1.5, seconds)
     assert needed([world]) == {6}  # 4.5 would be full
     could = central_queue(service, 1.5, seconds)  # 1800, were each as much work as on average
     assert answered([world], 1000.0, 1000.0 + seconds) >= 0.95 * could
+    assert world.copies() < 3.0
     world.poisson(75.0, 20.0, random.Random(3))
     assert needed([world]) == {0}
 
