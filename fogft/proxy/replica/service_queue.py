@@ -135,8 +135,8 @@ class ServiceQueue:
             return None
         job = self._waiting.take()
         if job is not None and not self._has_room(job):
-            self.put(job)  # when the service has nothing else
             self._waiting.not_served(job.robot)
+            self.put(job)  # when the service has nothing else
             return None
         takes_s = self.limit.takes_s
         needs_s = takes_s if self.at_work >= self.limit.limit else 0.0

@@ -551,6 +551,20 @@ def test_a_chatty_robot_does_not_starve_another():
     assert b"quiet" in [payload for payload, _ in scene.client.calls[:3]]
 
 
+def test_what_cannot_begin_yet_saves_up_no_turns_for_its_robot():
+    """What is to run alone waits, whatever comes meanwhile: then its robot is served in turns."""
+    scene = Scene(limits={"/s": 2})
+    scene.ask(A)
+    scene.ask(B, robot="a", handling=Handling.ALONE)
+    for robot in ("b", "a"):
+        for n in range(20):
+            scene.ask(robot.encode() + bytes([n]) * 15, payload=robot.encode(), robot=robot)
+    for n in range(8):
+        scene.answer(n)
+    served = [payload for payload, _ in scene.client.calls[2:]]
+    assert served.count(b"b") >= 3
+
+
 def test_when_full_the_chatty_robot_gives_way_to_another():
     scene = Scene(held_limit=4, outstanding=1)
     chatty = [scene.ask(bytes([n]) * 16, robot="chatty", remaining_s=5.0 + n) for n in range(4)]
