@@ -14,7 +14,7 @@ from typing import Any
 
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
-from fogft.proxy.replica.known_requests import KnownRequests
+from fogft.proxy.replica.known_requests import COPIES_LIMIT, KnownRequests
 from fogft.proxy.replica.service_queue import Job
 from fogft.proxy.robot.dispatcher import Dispatcher
 
@@ -22,7 +22,6 @@ log = logging.getLogger(__name__)
 
 # As long as a link takes to come back by itself, and no longer.
 UNREADY_S = 0.5
-_COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
 _POISON_KEPT = 256  # ids of requests that must not be sent again
 
 
@@ -84,7 +83,7 @@ class Forwarder:
                 answer = known.answer
                 if known.waiting is not None:
                     known.waiting.append(incoming)
-                    del known.waiting[:-_COPIES_LIMIT]  # refused as lost: its link is long gone
+                    del known.waiting[:-COPIES_LIMIT]  # refused as lost: its link is long gone
         if answer is not None:
             incoming.reply(answer)
         elif reason is not None:

@@ -11,6 +11,7 @@ from collections import OrderedDict
 from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.proxy.replica.service_queue import Job
 
+COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
 _DEADLINES_KEPT = 1024  # of jobs that were forgotten
 
 

@@ -18,7 +18,7 @@ from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
-from fogft.proxy.replica.known_requests import KnownRequests
+from fogft.proxy.replica.known_requests import COPIES_LIMIT, KnownRequests
 from fogft.proxy.replica.service_queue import HOLD_LIMIT_S, Job, ServiceQueue
 from fogft.requests.load import Handling
 from fogft.ros.port import RosClient
@@ -137,6 +137,7 @@ class Responder:
             if known is not None:
                 if known.waiting is not None and not known.unwanted:
                     known.waiting.append(incoming)
+                    del known.waiting[:-COPIES_LIMIT]  # refused as lost: its link is long gone
                     return
                 answer = known.answer
                 reason: Refusal | None = Refusal.CANCELLED if known.unwanted else Refusal.FORGOTTEN

@@ -173,6 +173,16 @@ def test_a_copy_joins_the_work_in_progress():
     assert scene.responder.ran == 1
 
 
+def test_few_copies_of_one_request_are_held():
+    """Each is of a connection: of one that asks again and again the oldest are long gone."""
+    scene = Scene()
+    copies = [scene.ask(A) for _ in range(100)]
+    (job,) = scene.responder.known.unanswered(None)
+    assert len(job.waiting) < 10
+    scene.answer(0)
+    assert copies[-1].outcome == [b"r"]
+
+
 def test_a_reply_that_cannot_be_sent_keeps_no_room():
     """What waits for it goes on, and the next requests too."""
     scene = Scene(limits={"/s": 1})
