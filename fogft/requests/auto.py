@@ -12,11 +12,13 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import Demand, Load
+from fogft.requests.load import NEW, Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
 _DOUBTED_TRIAL_EVERY_S = 1.0
+# More often while it is new: a first call may take seconds, and would bar all others.
+_NEW_TRIAL_EVERY_S = 0.1
 FEWEST_SPARES = 0.01
 _CUT = 0.5
 # Spares come back while nothing is asked: a pause counts beyond so many service times, and after so
@@ -116,8 +118,13 @@ class Auto(Learning):
 
     def _stale(self, able: Sequence[int], now: float) -> list[int]:
         """Return those of which nothing was heard for long: one spare copy shows how they do."""
-        due = now - TRIAL_EVERY_S
-        return [r for r in able if self._replicas[r].asked_at <= due or self._replicas[r].doubted]
+        stale = []
+        for replica in able:
+            known = self._replicas[replica]
+            every_s = _NEW_TRIAL_EVERY_S if known.told < NEW else TRIAL_EVERY_S
+            if known.doubted or known.asked_at <= now - every_s:
+                stale.append(replica)
+        return stale
 
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float

@@ -4,12 +4,17 @@ What waits inside a service nobody can take back or overtake. How many it works 
 throughput, limit / latency: docs/design/server-proxy.md. Who waits is `fair_queue`'s.
 """
 
+from bisect import insort
+
 QUICK_S = 0.003  # one that answers as often is not limited: what waits is over before it matters
 IN_HAND_S = 0.1  # below this, one more is in hand
 _NEAR = 0.85
 _SAMPLES = 30
 _TRY_AGAIN_S = 60.0
 _WEIGHT = 0.1  # of a sample in the mean
+# A call of seconds must not stand for all others: it counts as so many usual ones, and of so many
+# first calls, which may load what they need, the median counts.
+_OUTLIER, _FIRST = 10.0, 20
 
 
 class ConcurrencyLimit:
@@ -22,6 +27,7 @@ class ConcurrencyLimit:
         self.known = given or 0  # the limit, if given or learned; else 0
         self.takes_s = 0.0  # recent service time of a request, in seconds; 0 before the first
         self.service_s = 0.0  # the same, divided by how many were at work
+        self._first_s: list[float] = []  # what the first ones took, in order
         # Of the limit in force, while as many as it allows were at work:
         self._samples = 0
         self._sum_s = 0.0
@@ -39,7 +45,13 @@ class ConcurrencyLimit:
         """Learn from an answer; at its start `level` requests were running, itself included."""
         weight = _WEIGHT if self.takes_s else 1.0
         self.takes_s = self.takes_s * (1 - weight) + weight * took_s
-        self.service_s = self.service_s * (1 - weight) + weight * took_s / max(1, level)
+        each_s = took_s / max(1, level)
+        if len(self._first_s) < _FIRST:
+            insort(self._first_s, each_s)
+            self.service_s = self._first_s[(len(self._first_s) - 1) // 2]
+        else:
+            most_s = _OUTLIER * self.service_s or each_s
+            self.service_s += _WEIGHT * (min(each_s, most_s) - self.service_s)
         if self._given is not None or level != self.limit:
             return
         self._samples += 1

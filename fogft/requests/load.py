@@ -21,6 +21,7 @@ NEARLY = 0.8  # of what it usually takes
 # difference counts; by the second even one that is new does.
 _ALIKE, _ALIKE_LATELY = 1.7, 4.0
 _USUAL_GAIN = 0.02
+NEW = 20  # words of a replica: they say little
 # Of what a request is expected to take, and of what is ever at work:
 _LATE, _STALLS = 1.2, 3.0
 _DOUBT_AFTER = 2.0
@@ -114,7 +115,7 @@ class ReplicaLoad:
         self.latencies = Latencies()
         self.service_s = 0.0  # how long it lately worked on a request, as far as is known
         self.usual_s = 0.0  # the same, over a long time
-        self._told = 0  # how often it has said so
+        self.told = 0  # how often it has said so
         self.doubted = False  # an attempt is overdue, and it has ended none since that one began
         self.ended_at = -NEVER  # when it last ended an attempt, with an answer or too late for one
         self.asked_at = -NEVER
@@ -232,8 +233,9 @@ class ReplicaLoad:
         self._others, self._others_until = max(0, there - seen), now + _WORD_HOLDS_S
         self._slots = load.slots
         self.service_s = load.service_s
-        self._told += 1
-        self.usual_s += max(_USUAL_GAIN, 1.0 / self._told) * (load.service_s - self.usual_s)
+        self.told += 1
+        gain = max(_USUAL_GAIN, 1.0 / max(1, self.told - NEW))
+        self.usual_s += gain * (load.service_s - self.usual_s)
         if seen > there:  # the ends of some were lost
             for lost in [id for id in self.at_work if id != request][: seen - there]:
                 del self.at_work[lost]

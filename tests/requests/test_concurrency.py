@@ -93,9 +93,24 @@ def test_one_more_is_in_hand_where_requests_are_short_and_the_limit_is_learned(t
 
 def test_what_it_takes_follows_the_answers_and_counts_those_at_work_beside_it():
     limit = ConcurrencyLimit(10, given=4)
-    limit.finished(4, 0.4, 0.0)
+    for _ in range(20):
+        limit.finished(4, 0.4, 0.0)
     assert (limit.takes_s, limit.service_s) == pytest.approx((0.4, 0.1))
     limit.finished(2, 0.8, 0.0)
     assert (limit.takes_s, limit.service_s) == pytest.approx((0.44, 0.13))
     limit.finished(0, 0.44, 0.0)
     assert limit.takes_s == pytest.approx(0.44), "none at its start counts as one"
+
+
+def test_a_call_of_seconds_does_not_stand_for_others_and_many_do():
+    """It is a first one that loads a model, or a stall. What has become slow is known soon."""
+    limit = ConcurrencyLimit(10, given=1)
+    for took_s in (5.0, 0.02, 0.02):
+        limit.finished(1, took_s, 0.0)
+    assert limit.service_s == pytest.approx(0.02)
+    for took_s in (*[0.02] * 20, 5.0):
+        limit.finished(1, took_s, 0.0)
+    assert limit.service_s < 0.04
+    for _ in range(30):
+        limit.finished(1, 5.0, 0.0)
+    assert limit.service_s > 4.0

@@ -459,6 +459,31 @@ def test_one_that_is_ten_times_as_slow_gets_few_requests():
     assert percentile(world.latencies(), 99) < 0.1
 
 
+@pytest.mark.parametrize("how", ["first call", "hangs"])
+def test_one_call_that_takes_seconds_costs_a_replica_its_share_for_seconds_only(how):
+    """Where copies gain nothing it is hardly asked for them: its word then stays what it was."""
+    [world] = pool("constant")
+    if how == "hangs":
+        offered([world], 0.5, 10.0)
+        slow = world.links[0]
+        slow.replica.service.hangs_until = world.now + 5.0
+        offered([world], 0.5, 5.0)
+    else:
+        world.links.pop().usable = False
+        world.route()
+        offered([world], 0.5, 10.0)
+        times = iter([5.0])
+        slow = world.replica(lambda source: next(times, 0.02), serial=True)
+        offered([world], 0.5, 5.0)
+    offered([world], 0.5, 7.0)
+    before, ran = len(world.asked), [link.replica.service.ran for link in world.links]
+    offered([world], 0.5, 5.0)
+    world.run(0.5)
+    ran = [link.replica.service.ran - n for link, n in zip(world.links, ran, strict=True)]
+    assert ran[world.links.index(slow)] > 0.2 * sum(ran)
+    assert percentile(world.latencies(before), 50) < 0.03
+
+
 class Shortest(Choose):
     """One copy to the shortest queue, as far as each robot knows."""
 
