@@ -7,7 +7,7 @@ Laws: a request always has a copy that is no spare; late hedges <= capacity + sh
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from fogft.model.replica import short
@@ -255,10 +255,11 @@ class Auto(Learning):
             for key in [key for key in copies if key[1] == replica]:
                 del copies[key]
 
-    def needed(self, able: int, now: float) -> int:
+    def needed(self, able: Collection[int], now: float) -> int:
         """Return how many replicas would be enough if there are too few; else 0."""
-        times_s = sorted(known.service_s for known in self._replicas.values())
-        return self._demand.replicas(able, times_s[len(times_s) // 2] if times_s else 0.0, now)
+        times_s = sorted(t for r in able if (t := self._replicas[r].service_s))
+        typical_s = times_s[len(times_s) // 2] if times_s else 0.0
+        return self._demand.replicas(len(able), typical_s, now)
 
     def report(self) -> dict[str, Any]:
         """Return counts, the budget, and each replica's estimate by ``slot.generation``."""

@@ -8,7 +8,7 @@ which answer wins (`decide`).
 """
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from fogft.requests.load import NEVER, Load, ReplicaLoad
@@ -75,7 +75,7 @@ class Choose:
     def forget(self, replica: int) -> None:
         """Note that a replica's link is new or gone: attempts in flight end without a report."""
 
-    def needed(self, able: int, now: float) -> int:
+    def needed(self, able: Collection[int], now: float) -> int:
         """Return how many replicas would be enough if there are too few; else 0."""
         return 0
 

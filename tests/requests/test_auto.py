@@ -344,3 +344,19 @@ def test_whatever_happens_late_hedges_stay_within_the_budget(steps):
             elif kind == 5:
                 policy.late(known, replica, now, answered=flag)
     assert policy.hedges <= BUDGET_CAPACITY + 0.1 * len(steps)
+
+
+# -- how many are needed ------------------------------------------------------------------------
+
+
+def test_what_replicas_took_that_are_gone_does_not_count_in_how_many_are_needed():
+    """Those before took a tenth: by the times of all that ever were, one would do."""
+    auto, now = Auto(), 0.0
+    for replica, service_s in ((1, 0.1), (2, 0.1), (3, 1.0)):
+        for number in range(100):
+            request = number.to_bytes(16, "big")
+            now += 0.5
+            auto.first(request, (replica,), now)
+            auto.answered(request, {replica: now}, replica, idle(service_s), now + service_s)
+        auto.forget(replica)
+    assert auto.needed((3,), now) == 3

@@ -423,7 +423,7 @@ class Dispatcher:
                 "pending": len(requests) + len(requests.fallback or ()),
                 "pending_bytes": requests.held_bytes,
                 "hedging": requests.choose.report(),
-                "needed_replicas": requests.choose.needed(len(self._sender.able), self._clock()),
+                "needed_replicas": requests.choose.needed(self._sender.able, self._clock()),
                 **self._decide.report(),
             }
 
