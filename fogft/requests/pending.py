@@ -279,8 +279,10 @@ class PendingRequests:
         if crashed and self._alarms.believed(replica, now):
             self._cautious_until = now + CAUTIOUS_S
             if pending is not None and replica in pending.open:
-                # Beside others it is but suspected: any of them may have been the cause.
-                alone = replica in pending.alone_at
+                # Beside others it is but suspected: any of them may have been the cause. So may be
+                # the replica, if it has died over this before while another works on it.
+                again = replica in pending.died_at and len(pending.open) > 1
+                alone = replica in pending.alone_at and not again
                 pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
                 pending.alone_until = (now + pending.deadline) / 2
                 pending.died_at.add(replica)

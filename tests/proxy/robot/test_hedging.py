@@ -22,6 +22,7 @@ from fogft.requests.load import Load, ReplicaLoad
 from tests.estimates import percentile
 from tests.nightly import NIGHTLY, by_day
 from tests.proxy.robot.simulated import (
+    KILLS,
     RESTART_S,
     Draws,
     SimulatedIncoming,
@@ -256,6 +257,22 @@ def test_for_a_minute_after_a_death_no_request_is_at_all_replicas_at_once():
     world, _, at_all = killed("exponential", 0.05)
     assert at_all == []
     assert sum(len(link.replica.deaths) for link in world.links) <= (3 + 1) + 2 * (1 + 1)
+
+
+@pytest.mark.parametrize("replicas", [2, 3])
+@pytest.mark.parametrize("mode", [AUTO, HedgingMode.ALL])
+def test_a_replica_that_dies_over_all_requests_ends_none_that_another_works_on(mode, replicas):
+    """Also where that takes so long that it is asked a second time meanwhile."""
+    world = World(mode)
+    links = [world.replica(constant(6.0)) for _ in range(replicas)]
+    broken = links[0].replica.service
+    broken.call = partial(lambda call, _, told: call(KILLS, told), broken.call)  # type: ignore[method-assign]
+    for _ in range(20):
+        world.ask()
+        world.run(7.0)
+    world.run(4.0)
+    assert len(links[0].replica.deaths) > 3
+    assert lost([world]) == 0
 
 
 @pytest.mark.parametrize("pause_s", [0.001, 0.2])
