@@ -7,6 +7,7 @@ Laws: a request always has a copy that is no spare; late hedges <= capacity + sh
 Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
 """
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -19,48 +20,58 @@ TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare co
 _DOUBTED_TRIAL_EVERY_S = 1.0
 # More often while it is new: a first call may take seconds, and would bar all others.
 _NEW_TRIAL_EVERY_S = 0.1
-FEWEST_SPARES = 0.01
-_CUT = 0.5
-# Spares come back while nothing is asked: a pause counts beyond so many service times, and after so
-# many of these every request has spares again.
-_PAUSE = 10.0
-_RECOVERED_AFTER = 3000.0
-_MEMORY = 0.98  # of what spares saved and cost, from one request to the next
+# Of spare copies, in service times: for how long it is known what they saved and cost, and how much
+# at most; the difference that changes how many there are; how long after a change they are tried
+# again; what it costs a request to wait for one. So many requests try it sooner.
+_REMEMBERED, _REMEMBERED_MOST = 1000.0, 10.0
+_MATTERS = 0.5
+_TRIED_AFTER = 3000.0
+_WAIT = 0.6
+_TRIED_SHARE = 0.02
 _RETRY_S = 0.02
 
 
 class Spares:
-    """Which requests get spare copies: all, unless those cost more waiting than they save."""
+    """How many idle replicas spare copies leave free: more, the more waiting they cause."""
 
     def __init__(self) -> None:
-        self.share = 1.0  # of requests that get them
-        self._saved_s = 0.0
-        self._cost_s = 0.0
-        self._at: float | None = None
+        self.left_free = 0
+        self._balance_s = 0.0  # what they saved, less what they cost
+        self._at = 0.0
+        self._changed_at: float | None = None
         self.open: dict[tuple[bytes, int], float] = {}  # when each was sent that has not ended
 
-    def request(self, service_s: float, now: float) -> None:
+    def request(self, service_s: float, replicas: int, now: float) -> None:
         """Note a request; old data decays."""
-        self._saved_s *= _MEMORY
-        self._cost_s *= _MEMORY
-        if self._at is not None and self.share < 1.0:
-            paused = (now - self._at) / max(service_s, 1e-4) - _PAUSE
-            self.share = min(1.0, self.share + max(0.0, paused) / _RECOVERED_AFTER)
+        service_s = max(service_s, 1e-4)
+        if self._changed_at is None:
+            self._changed_at = now
+        self._balance_s *= math.exp((self._at - now) / (_REMEMBERED * service_s))
+        self._balance_s = min(self._balance_s, _REMEMBERED_MOST * service_s)
         self._at = now
+        if self._balance_s < -_MATTERS * service_s:
+            self._change(min(self.left_free + 1, replicas - 1), now)
+        elif self.left_free and self._balance_s > _MATTERS * service_s:
+            self.left_free -= 1
+            self._changed_at = now
+        elif self.left_free and now > self._changed_at + _TRIED_AFTER * service_s:
+            self._change(self.left_free - 1, now)
 
-    def chosen(self, request: bytes) -> bool:
-        """Whether a request gets spares, by its random id."""
-        return int.from_bytes(request[:2], "big") < self.share * 65536
+    def _change(self, left_free: int, now: float) -> None:
+        self.left_free, self._changed_at, self._balance_s = left_free, now, 0.0
+
+    def left_free_by(self, request: bytes) -> int:
+        """Return how many one request leaves free, by its random id: some try with one fewer."""
+        tries = int.from_bytes(request[:2], "big") < _TRIED_SHARE * 65536
+        return self.left_free - (tries and self.left_free > 0)
 
     def saved(self, seconds: float) -> None:
         """Note that a spare was first, and by how much."""
-        self._saved_s += seconds
+        self._balance_s += seconds
 
     def made_wait(self, seconds: float) -> None:
         """Note that a request has to wait for a spare, and for about how long."""
-        self._cost_s += seconds
-        if self._cost_s > self._saved_s:
-            self.share = max(FEWEST_SPARES, self.share * _CUT)
+        self._balance_s -= seconds
 
 
 class Auto(Learning):
@@ -89,17 +100,18 @@ class Auto(Learning):
                 self._doubts(replica, known.oldest_begun, now)
         best = self._best(request, able, now)
         known = self._replicas[best]
-        self._spares.request(known.service_s, now)
+        self._spares.request(known.service_s, len(able), now)
         if self._spares.open and not known.free(now):
-            self._spares.made_wait(known.service_s / len(able))
+            self._spares.made_wait(_WAIT * known.service_s)
         overdue_at = known.asked(request, now)
         if len(able) == 1:
             return able  # there is nobody to hedge it at
-        copied = self._spares.chosen(request) and not self.dear
+        left_free = self._spares.left_free_by(request)
+        copied = left_free < len(able) - 1 and not self.dear
         others = able if copied else self._stale(able, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
-        if self._spares.share < 1.0 and others is able:
-            spares = spares[:-1]  # spares were in the way: from now on they leave a replica free
+        if copied and left_free:
+            spares = spares[:-left_free]
         elif len(spares) + 1 < len(others):
             self._wanting[request] = None
         if len(spares) + 1 < len(able):  # else there is nobody to hedge it at
@@ -265,7 +277,7 @@ class Auto(Learning):
         """Return counts, the budget, and each replica's estimate by ``slot.generation``."""
         return {
             "hedges": self.hedges,
-            "spare_share": self._spares.share,
+            "left_free": self._spares.left_free,
             "tokens": self._tokens,
             "replicas": {
                 short(replica): {

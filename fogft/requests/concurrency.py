@@ -29,8 +29,7 @@ class ConcurrencyLimit:
         self.service_s = 0.0  # the same, divided by how many were at work
         self._first_s: list[float] = []  # what the first ones took, in order
         # Of the limit in force, while as many as it allows were at work:
-        self._samples = 0
-        self._sum_s = 0.0
+        self._took_s: list[float] = []
         self._kept: tuple[int, float] | None = None  # during a trial: the limit to compare with
         self._tried: dict[int, float] = {}  # when each limit was last found not to be better
 
@@ -54,14 +53,14 @@ class ConcurrencyLimit:
             self.service_s += _WEIGHT * (min(each_s, most_s) - self.service_s)
         if self._given is not None or level != self.limit:
             return
-        self._samples += 1
-        self._sum_s += took_s
-        if self._samples >= _SAMPLES:
+        self._took_s.append(took_s)
+        if len(self._took_s) >= _SAMPLES:
             self._judge(now)
 
     def _judge(self, now: float) -> None:
         """Enough was seen of this limit: end a trial, or begin one."""
-        each_s = self._sum_s / self._samples / self.limit  # per answer
+        quicker = sorted(self._took_s)[: len(self._took_s) * 2 // 3]  # what waits behind one stall
+        each_s = sum(quicker) / len(quicker) / self.limit  # per answer
         rate = 1.0 / max(each_s, 1e-9)
         tried, kept = self.limit, self._kept
         self._kept = None
@@ -87,8 +86,7 @@ class ConcurrencyLimit:
     def _set(self, limit: int) -> None:
         self.limit = limit
         self.known = limit if self._tried else 0
-        self._samples = 0
-        self._sum_s = 0.0
+        self._took_s = []
 
     def wait_s(self, ahead: int, at_work: int) -> float:
         """Return the expected wait behind those `ahead` and `at_work`, if known."""

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.requests.auto import BUDGET_CAPACITY, FEWEST_SPARES, Auto, Spares
+from fogft.requests.auto import BUDGET_CAPACITY, Auto, Spares
 from fogft.requests.latency import Latencies
 from fogft.requests.load import NEVER, Load, ReplicaLoad
 
@@ -127,23 +127,40 @@ def test_it_is_doubted_when_long_overdue_unless_it_ended_another_meanwhile():
 # -- spare copies -----------------------------------------------------------------------------
 
 
-def test_spares_that_cost_more_than_they_save_become_few_and_come_back():
-    spares = Spares()
-    for n in range(40):
-        spares.request(0.02, n * 0.05)
-        spares.made_wait(0.02)
-    assert spares.share == pytest.approx(FEWEST_SPARES, rel=0.5)
-    spares.request(0.02, 100.0)
-    assert spares.share == 1.0
+def test_spares_that_cost_more_than_they_save_become_fewer_and_are_tried_again():
+    spares, seen = Spares(), []
+    for n in range(3000):
+        spares.request(0.02, 3, n * 0.05)
+        seen.append(spares.left_free)
+        if n < 10:
+            spares.made_wait(0.02)
+    assert seen[:3] == [0, 1, 2]
+    assert seen[20] == 2  # and one has the request
+    assert [left for left, before in zip(seen[1:], seen, strict=False) if left < before] == [1, 0]
 
 
 def test_spares_that_save_more_than_they_cost_stay():
     spares = Spares()
     for n in range(40):
-        spares.request(0.02, n * 0.05)
+        spares.request(0.02, 3, n * 0.05)
         spares.saved(0.1)
         spares.made_wait(0.02)
-    assert spares.share == 1.0
+    assert spares.left_free == 0
+
+
+def test_some_requests_show_what_more_spares_would_save():
+    """And where that is much, all have them, without waiting until they are tried again."""
+    spares = Spares()
+    for n in range(5):
+        spares.request(0.02, 3, n * 0.05)
+        spares.made_wait(0.02)
+    tries = [spares.left_free_by(n.to_bytes(2, "big")) for n in range(0, 65536, 64)]
+    assert set(tries) == {1, 2}
+    assert 0.01 < tries.count(1) / len(tries) < 0.03
+    spares.saved(0.2)
+    spares.request(0.02, 3, 0.5)
+    spares.request(0.02, 3, 0.55)
+    assert spares.left_free == 0
 
 
 # -- the policy -------------------------------------------------------------------------------
@@ -316,7 +333,7 @@ def test_spares_at_a_replica_that_is_gone_are_not_blamed_for_ever():
     policy.forget(other)
     for n in range(20):
         policy.first(bytes([n]) * 16, (first,), 31.2)
-    assert policy.report()["spare_share"] == 1.0
+    assert policy.report()["left_free"] == 0
 
 
 @given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 2), st.booleans()), max_size=200))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import heapq
 import random
+from collections import deque
 
 import pytest
 
@@ -35,6 +36,22 @@ def test_it_learns_how_many_a_service_works_on(workers, expected, sigma):
     assert limit.limit in expected
     mean_s = 0.05 * (1.063 if sigma else 1.0)
     assert rate > 0.93 * min(workers, 10) / mean_s  # what is learned costs no throughput
+
+
+def test_one_stall_behind_which_all_wait_misleads_no_trial():
+    """Else a serial service is taken for a wide one, and has spare copies that wait."""
+    limits = []
+    for seed in range(10):
+        limit, source, at = ConcurrencyLimit(10), random.Random(seed), deque[tuple[float, int]]()
+        now = 0.0
+        for _ in range(1000):
+            while len(at) < limit.limit:
+                at.append((now, len(at) + 1))
+            now += 0.22 if source.random() < 0.01 else 0.02
+            began, level = at.popleft()
+            limit.finished(level, now - began, now)
+        limits.append(limit.limit)
+    assert limits == [1] * 10
 
 
 def test_a_quick_service_is_not_limited():
