@@ -164,6 +164,7 @@ def hand_over(
 
     `callers` counts who may call each service that we offer; `release` gives up the lock, and all
     else that the standby needs for itself. Replicas that dial in have one door: nothing is shared.
+    Where the pool's folder goes, nothing more is waited for.
     """
     taken, order = _files(config.lock)
     lock = disk.Lock(order)
@@ -177,20 +178,24 @@ def hand_over(
         log.error("handover_failed reason=%r", str(error))
         return False
     log.info("handover_began pool=%s", config.pool)
+
+    def run(limit_s: float, done: Callable[[], bool]) -> bool:
+        return _run(proxy, limit_s, lambda: done() or not config.lock.parent.exists())
+
     proxy.begin_hand_over()
     release()
-    if _run(proxy, BEGIN_LIMIT_S, lambda: _takes(config.status, callers())):
-        _run(proxy, KNOWN_AFTER_S, lambda: False)
+    if run(BEGIN_LIMIT_S, lambda: _takes(config.status, callers())):
+        run(KNOWN_AFTER_S, lambda: False)
     proxy.take_no_more()
-    _run(proxy, ORDER_LIMIT_S, lambda: proxy.waiting(ordered=True) == 0)
+    run(ORDER_LIMIT_S, lambda: proxy.waiting(ordered=True) == 0)
     told = {name: [id.hex() for id in ids] for name, ids in proxy.hold().items()}
     try:
         disk.write_json(taken, told, durable=False)
     except StateError as error:
         log.error("handover_failed reason=%r", error.message)
     lock.release()
-    if _run(proxy, FINISH_LIMIT_S, lambda: proxy.waiting() == 0):
-        _run(proxy, _PACED_S, lambda: False)
+    if run(FINISH_LIMIT_S, lambda: proxy.waiting() == 0):
+        run(_PACED_S, lambda: False)
     log.info("handover_ended pool=%s", config.pool)
     return True
 
