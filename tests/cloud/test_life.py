@@ -165,7 +165,9 @@ def test_a_machine_ends_with_its_server(local):
     state = json.loads((local.folder(machine.id) / "state.json").read_text())
     os.kill(state["pids"]["serve"], 9)
     local.wait_gone(machine.id)
-    assert "was killed by SIGKILL" in Path(local.cloud.log(machine.id)).read_text()
+    log = Path(local.cloud.log(machine.id)).read_text()
+    assert "was killed by SIGKILL" in log
+    assert "Task was destroyed" not in log
 
 
 def test_connections_wait_for_a_server_that_is_still_starting(local):

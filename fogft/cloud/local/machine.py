@@ -104,6 +104,8 @@ class Machine:
             self._say(State(MachinePhase.FAILED, failure=failed.reason))
         finally:
             self._end_the_rest({self._guard})
+            if self._relay is not None:
+                self._relay.close()
 
     def _end_the_rest(self, spare: set[int]) -> None:
         processes.end_machine(str(self._folder.id), spare=spare)
