@@ -193,6 +193,18 @@ def test_auto_is_as_good_as_the_best_other_rule_from_idle_to_full(service, load)
     assert fmean(of_idle) <= 1.0
 
 
+def test_while_replicas_slow_down_in_turns_an_idle_pool_does_as_well_as_with_all_copies():
+    """What spare copies saved in one slow spell is remembered for the next."""
+    ratios = []
+    for seed in range(3, 3 + by_day(2, at_night=6)):
+        p99s = [
+            p99(served(mode, "stalling", 0.1, seconds=80.0, seed=seed, spells="one by one"))
+            for mode in (AUTO, HedgingMode.ALL)
+        ]
+        ratios.append((p99s[0] - 2 * ONE_WAY_S) / (p99s[1] - 2 * ONE_WAY_S))
+    assert fmean(ratios) <= 1.05
+
+
 @pytest.mark.parametrize("robots", [1, 5])
 @pytest.mark.parametrize("service", sorted(SERVICES))
 def test_nearly_full_they_end_as_much_as_one_queue_before_them_without_copies(service, robots):
