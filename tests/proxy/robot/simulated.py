@@ -18,7 +18,7 @@ from fogft.requests.load import Handling, Load
 
 UID = "0123456789abcdef"
 TICK_S = 0.02
-TELL_S = 0.01  # until a replica is told what is not wanted any more
+TELL_S = 0.1  # until a replica is told what is not wanted any more: as the dispatcher
 KILLS = b"kills"  # a request that ends whatever process works on it, so long after it began:
 KILLS_AFTER_S = 0.005
 RESTART_S = 1.0  # until a service that has died answers again
