@@ -20,14 +20,13 @@ TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare co
 _DOUBTED_TRIAL_EVERY_S = 1.0
 # More often while it is new: a first call may take seconds, and would bar all others.
 _NEW_TRIAL_EVERY_S = 0.1
-# Of spare copies, in service times: for how long it is known what they saved and cost, and how much
-# at most; the difference that changes how many there are; how long after a change they are tried
-# again; what it costs a request to wait for one. So many requests try it sooner.
-_REMEMBERED, _REMEMBERED_MOST = 1000.0, 10.0
-_MATTERS = 0.5
-_TRIED_AFTER = 3000.0
-_WAIT = 0.6
-_TRIED_SHARE = 0.02
+# Of spare copies, in service times:
+_REMEMBERED = 1000.0  # for how long it counts what they saved and cost
+_REMEMBERED_MOST = 10.0  # how much more they saved than they cost counts at most
+_MATTERS = 0.5  # a difference that changes how many there are
+_TRIED_AFTER = 3000.0  # so long after a change there is one more again
+_WAIT = 0.6  # what it costs a request to wait for one
+_TRIED_SHARE = 0.02  # of requests, which try one more meanwhile
 _RETRY_S = 0.02
 
 
@@ -37,15 +36,12 @@ class Spares:
     def __init__(self) -> None:
         self.left_free = 0
         self._balance_s = 0.0  # what they saved, less what they cost
-        self._at = 0.0
-        self._changed_at: float | None = None
+        self._at = self._changed_at = 0.0
         self.open: dict[tuple[bytes, int], float] = {}  # when each was sent that has not ended
 
     def request(self, service_s: float, replicas: int, now: float) -> None:
         """Note a request; old data decays."""
         service_s = max(service_s, 1e-4)
-        if self._changed_at is None:
-            self._changed_at = now
         self._balance_s *= math.exp((self._at - now) / (_REMEMBERED * service_s))
         self._balance_s = min(self._balance_s, _REMEMBERED_MOST * service_s)
         self._at = now
