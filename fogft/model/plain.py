@@ -6,6 +6,7 @@ have written them.
 """
 
 import dataclasses
+import threading
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +21,9 @@ from fogft.model import keys
 T = TypeVar("T")
 Read = Callable[[Any], Any]
 
-_READERS: dict[Any, Read] = {}
+_READERS: dict[Any, Read] = {}  # some of them only begun: to be touched with `_MAKING`
+_MADE: dict[Any, Read] = {}
+_MAKING = threading.Lock()
 LINE_LIMIT = 1000  # characters
 _MOST = 1e300  # further on there is no arithmetic
 
@@ -92,8 +95,12 @@ def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
 
 def from_plain(cls: type[T], raw: Any) -> T:
     """Return the value that JSON data describes. Raises ValueError, which begins with the key."""
+    read = _MADE.get(cls)
+    if read is None:
+        with _MAKING:
+            read = _MADE[cls] = _reader(cls)
     try:
-        made: T = _reader(cls)(raw)
+        made: T = read(raw)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
     return made
