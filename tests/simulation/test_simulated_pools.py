@@ -85,7 +85,7 @@ def test_a_loss_costs_a_boot_and_its_detection_unless_it_was_announced(notice_s,
 # -- the real planner's rules, as they come out ------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(by_day(2, at_night=20)))
+@pytest.mark.parametrize("seed", range(by_day(1, at_night=20)))
 def test_asking_only_when_something_can_change_changes_nothing(seed):
     """The same events as when the manager looks every second, as it does in real life.
 
@@ -100,7 +100,7 @@ def test_asking_only_when_something_can_change_changes_nothing(seed):
     assert lazily.outcome().usd_per_hour == pytest.approx(eagerly.outcome().usd_per_hour)
 
 
-@pytest.mark.parametrize("seed", range(by_day(2, at_night=20)))
+@pytest.mark.parametrize("seed", range(by_day(1, at_night=20)))
 def test_planning_on_adds_nothing_to_a_plan_that_is_said_to_be_closed(seed, monkeypatch):
     """The same events as when each plan that changes anything is planned on while under way."""
     wanted = any_scenario(seed, days=0.2)
