@@ -6,12 +6,11 @@ have written them.
 """
 
 import dataclasses
-import threading
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
-from functools import partial
+from functools import cache, partial
 from pathlib import Path, PurePath
 from typing import Annotated, Any, TypeVar
 
@@ -21,9 +20,6 @@ from fogft.model import keys
 T = TypeVar("T")
 Read = Callable[[Any], Any]
 
-_READERS: dict[Any, Read] = {}  # some of them only begun: to be touched with `_MAKING`
-_MADE: dict[Any, Read] = {}
-_MAKING = threading.Lock()
 LINE_LIMIT = 1000  # characters
 _MOST = 1e300  # further on there is no arithmetic
 
@@ -95,12 +91,9 @@ def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
 
 def from_plain(cls: type[T], raw: Any) -> T:
     """Return the value that JSON data describes. Raises ValueError, which begins with the key."""
-    read = _MADE.get(cls)
-    if read is None:
-        with _MAKING:
-            read = _MADE[cls] = _reader(cls)
+    hint: Any = cls
     try:
-        made: T = read(raw)
+        made: T = _reader(hint)(raw)
     except RecursionError as error:
         raise ValueError("it is nested too deep") from error
     return made
@@ -114,14 +107,8 @@ def stored(cls: type[T], raw: Any, what: str, hint: str = "") -> T:
         raise StateError(f"{what}: {error}", hint) from error
 
 
-def _reader(hint: Any) -> Read:
-    if hint not in _READERS:
-        _READERS[hint] = partial(from_plain, hint)  # for one that contains itself
-        _READERS[hint] = _made(hint)
-    return _READERS[hint]
-
-
-def _made(hint: Any) -> Read:  # noqa: PLR0911
+@cache
+def _reader(hint: Any) -> Read:  # noqa: PLR0911
     origin, arguments = typing.get_origin(hint), typing.get_args(hint)
     if hint is Any:
         return lambda raw: raw
@@ -139,7 +126,7 @@ def _made(hint: Any) -> Read:  # noqa: PLR0911
     if issubclass(hint, Enum):
         return _by_value(hint)
     if dataclasses.is_dataclass(hint):
-        return _class(hint)
+        return partial(_class, hint)
     if hint is Path:
         return _path
     return _scalar(hint)
@@ -219,19 +206,20 @@ def _items(raw: Any) -> Iterable[tuple[Any, Any]]:
     return raw.items()
 
 
-def _class(cls: Any) -> Read:
+def _class(cls: Any, raw: Any) -> Any:
+    entries, reads = _fields(cls)
+    found = {n: _at(n, reads[n], value) for n, value in _items(raw) if n in reads}
+    for name, one in entries.items():
+        if one.required and name not in found:
+            raise Misfit((name,), "is missing")
+    return cls(**{entries[name].field: value for name, value in found.items()})
+
+
+@cache  # made as one is read: a class may contain itself
+def _fields(cls: Any) -> tuple[dict[str, keys.Entry], dict[str, Read]]:
     hints = typing.get_type_hints(cls, include_extras=True)
     entries = {one.name: one for one in keys.entries_of(cls)}
-    reads = {one.name: _of_key(one, _reader(hints[one.field])) for one in entries.values()}
-
-    def read(raw: Any) -> Any:
-        found = {n: _at(n, reads[n], value) for n, value in _items(raw) if n in reads}
-        for name, one in entries.items():
-            if one.required and name not in found:
-                raise Misfit((name,), "is missing")
-        return cls(**{entries[name].field: value for name, value in found.items()})
-
-    return read
+    return entries, {n: _of_key(one, _reader(hints[one.field])) for n, one in entries.items()}
 
 
 def _of_key(entry: keys.Entry, read: Read) -> Read:
