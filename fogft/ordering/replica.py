@@ -89,6 +89,10 @@ class OrderedReplica(Generic[T]):
         """Whether the service is working on a request."""
         return self._work is not None
 
+    def works_on(self, serial: int) -> bool:
+        """Whether the call with this serial was begun last, and has not ended."""
+        return self._work is not None and self._work.serial == serial
+
     @property
     def in_flight(self) -> int:
         """Requests that are held and not yet answered."""

@@ -94,8 +94,11 @@ class OrderedResponder:
                 self._begin(effect)
 
     def _begin(self, begin: Begin) -> None:
-        self._begun, self._begun_at = begin, self._clock()
-        clients = self._clients
+        with self._lock:
+            if not self._machine.works_on(begin.serial):
+                return  # its service has died since, and another one is not to be given it
+            self._begun, self._begun_at = begin, self._clock()
+            clients = self._clients
         try:
             if clients is None:
                 raise RosError("ROS has shut down")
