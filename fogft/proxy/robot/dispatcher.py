@@ -119,17 +119,15 @@ class Dispatcher:
     @property
     def able(self) -> bool:
         """Whether a request that arrives now can be answered."""
-        return self._decide.ready if self._decide.sends_requests else bool(self._sender.able)
+        if not self._decide.sends_requests:
+            return bool(self._sender.able)
+        with self._lock:  # a thread that takes a request may begin a term, and claim replicas
+            return self._decide.ready
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to the replicas that the policy chooses."""
         spec = self._ledger.spec
-        request = self._id_of(spec.name, handle)
-        if self.takes_no_more:
-            return
-        if self.taken is not None:
-            self.taken.append(request)
-        self.forward(request, payload, handle, spec.timeout_s)
+        self.forward(self._id_of(spec.name, handle), payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Do the same for a request with an id; return whether taken.
@@ -138,6 +136,10 @@ class Dispatcher:
         """
         now, requests, outcomes = self._clock(), self._requests, self.outcomes
         with self._lock:
+            if self.takes_no_more:
+                return False
+            if self.taken is not None:  # it begins by the same lock: `hold` tells of no other
+                self.taken.append(request)
             count = outcomes.count
             count["received"] += 1
             count["request_bytes"] += len(payload)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from fogft.errors import RosError, Unreadable
@@ -9,6 +12,7 @@ from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.state import StateService, StateSpec
+from fogft.ordering.peer import Peer
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.order_mark import OrderMark
@@ -189,6 +193,73 @@ def test_numbers_of_a_term_that_another_has_ended_are_given_anew(scene):
     assert scene.responses == []
 
 
+def test_a_request_that_comes_as_its_proxy_stops_ordering_is_ordered_by_one_of_both(
+    scene, monkeypatch
+):
+    """The other one would leave to the first what that is said to have taken."""
+    scene.run()
+    first, second = scene.dispatcher, scene.start(held=True)
+    first.taken, told = [], []
+
+    def stops(clock):
+        """The main thread does, while another one takes a request."""
+        monkeypatch.undo()
+        first.takes_no_more = True
+        told.extend(first.hold())
+        return clock.now
+
+    monkeypatch.setattr(Clock, "__call__", stops)
+    first.submit(b"q", 0)
+    second.submit(b"q", 0)
+    scene.dispatcher = second
+    second.take_over(told)
+    scene.run()
+    assert scene.serve(1, b"a") == b"q"  # the other is asked for its state
+    scene.run()
+    assert scene.responses == [(0, b"a")]
+
+
+def test_whether_it_can_answer_is_asked_while_another_thread_begins_a_term(scene, monkeypatch):
+    """Where a request comes in, or an answer does: the proxy's own thread asks, and must go on."""
+    scene.run()
+    first = scene.dispatcher
+    scene.dispatcher = scene.start()
+    scene.run()  # a term of another's, of which the first does not know
+    first.submit(b"q0", 0)
+    for link, responder in zip(scene.links, scene.responders, strict=True):
+        offered, link.offered = link.offered, []
+        for _, request, payload, _ in offered:
+            responder.request(Incoming(scene, link, request, payload))
+    for link, answer in scene.answers:
+        first.answered(link, answer)
+    begun, asked, over = threading.Event(), threading.Event(), threading.Event()
+
+    class Seen(Peer):
+        def __init__(self):
+            super().__init__()
+            if begun.is_set():  # of the second replica: the first is known
+                asked.wait(0.2)
+            begun.set()
+
+        @property
+        def joined(self):
+            asked.set()
+            over.wait(0.2)
+            return False
+
+    monkeypatch.setattr("fogft.ordering.sequencer.Peer", Seen)
+
+    def take():
+        first.submit(b"q1", 1)
+        over.set()
+
+    with ThreadPoolExecutor(1) as other:
+        taking = other.submit(take)
+        assert begun.wait(10.0)
+        assert not first.able
+        taking.result()
+
+
 def test_requests_wait_until_a_replica_has_joined(tmp_path):
     scene = Scene(tmp_path, replicas=1)
     scene.clients[0].restore.there = False
@@ -263,6 +334,34 @@ def test_a_crashed_service_does_not_answer_from_its_first_state(scene):
     scene.run(1)
     # The log still has everything from the start: it is replayed in order.
     assert [scene.serve(1, b"a%d" % i) for i in (1, 2)] == [b"q1", b"q2"]
+
+
+def test_what_a_crash_overtakes_is_not_passed_on_to_the_service_that_starts_anew(
+    scene, monkeypatch
+):
+    """It would apply the request from its first state, and later once more in its turn."""
+    scene.run()
+    for i in range(2):
+        scene.dispatcher.submit(b"q%d" % i, i)
+    scene.run()
+    responder, clients = scene.responders[0], scene.clients[0]
+    reply = Incoming.reply
+
+    def dies(incoming, payload, **_):
+        """The main thread sees it while this one has yet to pass on what is next."""
+        monkeypatch.undo()
+        reply(incoming, payload)
+        responder.crashed()
+        responder.use(None)
+
+    monkeypatch.setattr(Incoming, "reply", dies)
+    assert scene.serve(0, b"a0") == b"q0"
+    responder.use(clients)
+    for _ in range(2):
+        responder.tick(alive=True)
+    assert clients.service.calls == []
+    scene.run()
+    assert [payload for payload, _ in clients.service.calls] == [b"q0"]
 
 
 def test_a_request_that_ros_refuses_for_now_is_passed_on_later(scene):
