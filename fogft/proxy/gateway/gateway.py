@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from queue import SimpleQueue
 from typing import Any
 
+from fogft.counters import Counters
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.known_requests import COPIES_LIMIT, KnownRequests
@@ -45,7 +46,7 @@ class Forwarder:
         self.queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
         self.joined = 0  # copies of requests that were known
-        self.refused: Counter[Refusal] = Counter()
+        self.refused = Counters()
 
     def start(self) -> None:
         """Start forwarding on its own thread, since the link's threads must not send."""
@@ -102,7 +103,7 @@ class Forwarder:
         return Refusal.OVERLOADED if full or too_large else None
 
     def _refuse(self, incoming: Incoming, reason: Refusal) -> None:
-        self.refused[reason] += 1
+        self.refused.add(reason.value)
         incoming.refuse(reason)
 
     def cancel(self, ids: Iterable[bytes]) -> None:
@@ -202,12 +203,12 @@ class Forwarder:
             "in_flight": self.in_flight,
             "passed": self.passed,
             "joined": self.joined,
-            "refused": {reason.value: count for reason, count in self.refused.items()},
+            "refused": dict(self.refused.snapshot()),
         }
 
     def work(self) -> dict[str, float]:
         """Return the counters in the form of a probe's answer."""
-        refused = {reason.value: float(count) for reason, count in self.refused.items()}
+        refused = self.refused.snapshot()
         return {"held": self.in_flight, "ran": self.passed, "joined": self.joined, **refused}
 
     def close(self) -> None:

@@ -80,7 +80,7 @@ class Responder:
     @property
     def at_work(self) -> int:
         """The number of requests in the services."""
-        return sum(queue.at_work for queue in self._queues.values())
+        return sum(queue.at_work for queue in tuple(self._queues.values()))
 
     @property
     def in_flight(self) -> int:
@@ -115,7 +115,7 @@ class Responder:
     @property
     def limits(self) -> dict[str, int]:
         """How many requests each service may have concurrently."""
-        return {name: queue.limit.limit for name, queue in self._queues.items()}
+        return {name: self._queues[name].limit.limit for name in tuple(self._queues)}
 
     def use(
         self,

@@ -11,6 +11,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.responder import EMPTY_REQUEST, Responder
 from fogft.requests.load import Handling, Load
 from tests.fakes.proxy import Clock, FakeClient, FakeIncoming
+from tests.racing import meanwhile
 
 A = b"a" * 16
 B, C, D = b"b" * 16, b"c" * 16, b"d" * 16
@@ -660,3 +661,18 @@ def test_every_copy_gets_exactly_one_outcome_and_runs_never_overlap(steps):
             assert incoming.outcome == [b"to " + incoming.payload]
     waiting = sum(1 for incoming in asked if not incoming.outcome)
     assert (waiting == 0) == (scene.responder.in_flight == 0)
+
+
+def test_its_numbers_are_told_while_services_get_their_first_requests():
+    """The main thread reads them at each look, and a scrape does: neither may fail over it."""
+    names = [f"/{number}" for number in range(50)]
+    for _ in range(20):
+        scene = Scene()
+        scene.responder.use(dict.fromkeys(names, scene.client))
+
+        def ask(scene=scene):
+            for number, name in enumerate(names):
+                scene.ask(b"%016d" % number, service=name)
+
+        meanwhile(ask, lambda scene=scene: (scene.responder.at_work, scene.responder.limits))
+        assert scene.responder.at_work == len(scene.responder.limits) == len(names)

@@ -13,6 +13,7 @@ from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.links import best_of, seen_through
 from fogft.requests.load import Handling
 from tests.fakes.proxy import UID, Clock, FakeIncoming, FakeLink
+from tests.racing import meanwhile
 
 READY = frozenset({"/s"})
 
@@ -207,3 +208,24 @@ def test_the_best_sight_of_a_replica_counts():
         (1, "connecting", "one"),
     ]
     assert ReplicaId(UID, found[1]["slot"], found[1]["generation"]).short == "1.2"
+
+
+def test_its_numbers_are_told_while_the_first_are_refused(scene):
+    """Its own thread writes them into a file, and probes ask for them: neither may fail over it."""
+    for number in range(30):
+        forwarder = Forwarder()
+        forwarder.tick(READY)
+        forwarder.use("/s", scene.dispatcher)
+        asked = [
+            FakeIncoming(b"0" * 16, remaining_s=0.0),
+            FakeIncoming(b"1" * 16, service="/unknown"),
+            FakeIncoming(b"2" * 16),
+        ]
+
+        def refuse(forwarder=forwarder, asked=asked):
+            forwarder.poisoned(b"2" * 16)
+            for incoming in asked:
+                forwarder.request(incoming)
+
+        meanwhile(refuse, lambda forwarder=forwarder: (forwarder.work(), forwarder.report()))
+        assert sum(forwarder.report()["refused"].values()) == len(asked), number
