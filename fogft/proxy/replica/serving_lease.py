@@ -30,11 +30,11 @@ class HeldLease:
         if record.order <= self._order:
             return
         lease, now = roster.lease(record), self._clock()
-        if self._ahead is None:
-            self._ahead = now - lease.at
-        ends_at = min(now, lease.at + self._ahead) + lease.lasts_s
+        ahead = now - lease.at if self._ahead is None else self._ahead
+        ends_at = min(now, lease.at + ahead) + lease.lasts_s
         self._order, self._heard_at = record.order, now
         self._ends_at = max(ends_at, self._ends_at)
+        self._ahead = ahead  # last: by it other threads see that there is a lease
 
     @property
     def age_s(self) -> float | None:

@@ -67,3 +67,17 @@ def test_a_clock_that_is_set_ends_no_replica_early(steps):
         assert held.left_s is not None
         assert before is None or held.left_s >= before - 1e-6
         assert clock.now + held.left_s <= longest + 1e-6
+
+
+def test_whoever_looks_while_the_first_lease_is_taken_sees_all_of_it_or_none():
+    """Probes are answered by another thread: a lease of no time would be told to people."""
+    seen = set()
+
+    class Seen(HeldLease):
+        def __setattr__(self, name, value):
+            super().__setattr__(name, value)
+            if vars(self).keys() >= {"_ahead", "_heard_at", "_ends_at"}:
+                seen.add((self.age_s, self.left_s))
+
+    Seen(Clock()).renew(lease(1, at=0.0, lasts_s=DAY_S))
+    assert seen == {(None, None), (0.0, DAY_S)}
