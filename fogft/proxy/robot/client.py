@@ -192,7 +192,7 @@ class ClientProxy:
         service = self._services.get(answer.service)
         if service is not None:
             service.dispatcher.answered(link, answer)
-        elif answer.service in self._topics:
+        else:
             self._topics.answered(key_of(link), answer)
 
     def changed(self, link: Link) -> None:
@@ -297,11 +297,12 @@ class ClientProxy:
                 }
                 for name, service in self._services.items()
             }
+            topics = self._topics.report()
         return {
             "links": links,
             "gateways": gateways,
             "services": services,
-            "topics": self._topics.report(),
+            "topics": topics,
             "uplink_suspected": self.links.silent_together,
             "certificate": self._dialer.certificate(),
         }

@@ -273,9 +273,6 @@ class TopicsOnRobot:
         self._topics: dict[str, RobotTopic] = {}
         self._trouble: dict[str, str] = {}
 
-    def __contains__(self, name: str) -> bool:
-        return name in self._topics
-
     def serve(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> bool:
         """Pass exactly these topics; return whether they have changed."""
         wanted = {topic.key_name: topic for topic in topics}
@@ -312,7 +309,9 @@ class TopicsOnRobot:
 
     def answered(self, key: int, answer: Answer) -> None:
         """Pass the end of an attempt to its topic."""
-        self._topics[answer.service].answered(key, answer)
+        topic = self._topics.get(answer.service)
+        if topic is not None:  # else it is passed no more
+            topic.answered(key, answer)
 
     def misreads(self, key: int) -> bool:
         """Whether a replica's messages were malformed, repeatedly."""

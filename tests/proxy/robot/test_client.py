@@ -6,20 +6,23 @@ import signal
 import threading
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from fogft.errors import RosError
-from fogft.link.port import ProbeAnswer
+from fogft.link.port import Answer, ProbeAnswer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.model.spec import HedgingMode, Part, ServiceSpec
+from fogft.model.topic import Origin, TopicSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.proxied_service import HOLD_S
 from tests.fakes.proxy import UID, Clock, FakeDialer, FakeNode
+from tests.racing import meanwhile
 
 SET_BOOL = "std_srvs/srv/SetBool"
 OURS = {SET_BOOL: Definition(fields={"request": (("data", "boolean"),)})}
@@ -397,3 +400,24 @@ def test_a_service_is_not_withdrawn_under_a_request_that_waits():
     assert not scene.node.servers["/s"].closed
     scene.proxy.answered(link, link.reply(b"r"))
     assert scene.node.servers["/s"].responses == [("caller", b"r")]
+
+
+def test_topics_are_told_and_answered_while_they_change():
+    """By a scrape's thread and by the links': neither may fail over a new pool file."""
+    scene = Scene()
+    scene.follow(member(0))
+    (link,) = scene.dialer.links
+    end = SimpleNamespace(close=lambda: None)
+    node = SimpleNamespace(publisher=lambda topic: end, subscribe=lambda topic, heard: end)
+    topics = [TopicSpec(f"/{number}", "p/msg/T", Origin.ROBOT) for number in range(20)]
+
+    def change() -> None:
+        for number in range(60):
+            scene.proxy.pass_topics(topics if number % 2 else (), node)
+
+    def look() -> None:
+        scene.proxy.answered(link, Answer(b"i" * 16, service=topics[0].key_name))
+        scene.proxy.report()
+
+    meanwhile(change, look)
+    assert scene.proxy.report()["topics"].keys() == {topic.name for topic in topics}
