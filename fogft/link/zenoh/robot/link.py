@@ -206,7 +206,6 @@ class ZenohLink:
         self._renew_at = NEVER
         new = self._open()
         if new is not None and self._attend(new, until_up=True) and new is self._live:
-            self._retiring.append(old)
             log.info("link_renewed replica=%s", self.peer.id.short)
             return new
         if new is not None:
@@ -342,7 +341,10 @@ class ZenohLink:
         attempts, rtt_s = connection.attempts, self._probing.rtt_s or 0.0
         attempts.round_trip_s = min(attempts.round_trip_s or rtt_s, rtt_s)
         self.ready = answer.ready
-        if self._live is not connection:
+        old = self._live
+        if old is not connection:
+            if old is not None:  # first: what is offered there is yet to be sent, or forgotten
+                self._retiring.append(old)
             self._state = LinkState.UP
             self._detail = ""
             self.offer, self._live = connection.attempts.offer, connection
