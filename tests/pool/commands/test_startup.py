@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import pytest
 
@@ -50,6 +51,24 @@ def test_a_changed_file_is_applied_and_keeps_the_scale(scene: Scene) -> None:
     assert store.intent().wanted(store.spec()) == 3
     scene.write(replicas=4)
     assert store.intent().wanted(store.spec()) == 4
+
+
+def test_a_changed_file_never_looks_to_a_manager_as_if_scale_was_forgotten(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It looks at each file that changes: the old file alone would have it end three replicas."""
+    scene.write(replicas=2)
+    store, write, seen = scene.store, disk.write_whole, set[int]()
+    store.write_intent(intents.scale(store.intent(), store.spec(), 3))
+
+    def written(*given: Any, **how: Any) -> None:
+        write(*given, **how)
+        seen.add(store.intent().wanted(store.spec()))
+
+    monkeypatch.setattr(disk, "write_whole", written)
+    scene.write(replicas=6)
+    assert seen <= {5, 6}
+    assert store.intent().wanted(store.spec()) == 6
 
 
 def test_the_same_name_from_another_file_is_refused(scene: Scene) -> None:
