@@ -23,7 +23,7 @@ COMPACT_AFTER = 20_000
 class HistoryFile:
     """The events of one pool. Safe to use from several threads; one process writes it.
 
-    `heard` is called with each event, once it is written.
+    `heard` is called with each event, once it is written. Reading changes nothing on disk.
     """
 
     def __init__(self, path: Path, clock: Callable[[], float]) -> None:
@@ -32,19 +32,24 @@ class HistoryFile:
         self._lock = threading.Lock()
         self._known: History | None = None
         self._appended = 0
+        self._is_long = False  # the file, which its writer alone may make shorter
         self.heard: Callable[[Event], object] = lambda _: None
 
     def history(self) -> History:
         """Return the history so far."""
         with self._lock:
             if self._known is None:
-                self._known = History(self._load())
+                self._known = self._load()
             return self._known
 
     def append(self, event: Event) -> None:
         """Append an event; it is on disk when this returns."""
         history = self.history()
         with self._lock:
+            if self._is_long:
+                kept = compacted(_read_events(self._path), self._clock())
+                disk.write_whole(self._path, "".join(map(_line, kept)))
+                self._is_long = False
             try:
                 _append_durably(self._path, _line(event).encode())
             except OSError as error:
@@ -55,20 +60,18 @@ class HistoryFile:
             history.add(event)
             self._appended += 1
             if self._appended >= COMPACT_AFTER:
-                self._known = History(self._load())
+                self._known = self._load()
         self.heard(event)
 
     def recent(self, count: int = 20) -> list[Event]:
         """Return the last events, oldest first."""
         return _read_events(self._path)[-count:]
 
-    def _load(self) -> list[Event]:
+    def _load(self) -> History:
         events = _read_events(self._path)
         kept = compacted(events, self._clock())
-        self._appended = 0
-        if len(kept) < len(events):
-            disk.write_whole(self._path, "".join(map(_line, kept)))
-        return kept
+        self._appended, self._is_long = 0, len(kept) < len(events)
+        return History(kept)
 
 
 def _line(event: Event) -> str:

@@ -7,6 +7,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -17,6 +18,7 @@ from fogft.errors import PoolNotFound, StateError
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Membership
+from fogft.planning.observed import history
 from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.folder import history_file, lease
 from fogft.pool.folder.store import read_identity
@@ -96,6 +98,30 @@ def test_history_is_compacted_as_it_grows(pool: Scene, monkeypatch: pytest.Monke
     record = store_of(pool.home).history().record(0, 1)
     assert record is not None
     assert (record.first_ready_at, record.unready_since) == (0.0, 199.0)
+
+
+def test_who_reads_a_long_history_loses_nothing_of_what_its_manager_writes_meanwhile(
+    pool: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `fogft up` does on a pool that is managed; the next manager makes the file shorter."""
+    pool.store.append(LAUNCH)
+    for at in range(20):
+        pool.store.append(Event(float(at), (EventKind.READY, EventKind.UNREADY)[at % 2], 0, 1))
+    later = replace(LAUNCH, generation=2)
+
+    def compacted(*given: Any) -> list[Event]:
+        kept = history.compacted(*given)
+        pool.store.append(later)
+        return kept
+
+    with monkeypatch.context() as patch:
+        patch.setattr(history_file, "compacted", compacted)
+        store_of(pool.home).history()
+    assert pool.store.recent(1) == [later]
+    successor = store_of(pool.home)
+    assert successor.history().generations[0] == 2
+    successor.append(replace(READY, generation=2))
+    assert len(successor.recent(100)) < 10
 
 
 def test_intent_and_membership_round_trip(pool: Scene) -> None:
