@@ -176,8 +176,9 @@ class Lock:
 
     def take(self, how: int) -> bool:
         """Call flock; return False where it is told not to wait, and would have to."""
+        creates = 0 if how & fcntl.LOCK_SH else os.O_CREAT
         try:
-            descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            descriptor = os.open(self._path, os.O_RDWR | creates | os.O_CLOEXEC, 0o600)
         except OSError as error:
             if error.errno != errno.EROFS:
                 raise
@@ -187,6 +188,10 @@ class Lock:
         except BlockingIOError:
             os.close(descriptor)
             return False
+        with contextlib.suppress(FileNotFoundError):
+            if not os.path.samestat(os.fstat(descriptor), self._path.stat()):
+                os.close(descriptor)  # while we waited the file was removed, and made anew
+                return self.take(how)
         self._descriptor = descriptor
         return True
 

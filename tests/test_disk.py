@@ -16,6 +16,7 @@ import pytest
 
 from fogft import disk
 from fogft.errors import StateError
+from tests.fakes.threads import waits_for
 from tests.fakes.waiting import wait_for
 from tests.needs import needs
 
@@ -186,6 +187,36 @@ def test_nothing_is_locked_where_there_is_no_file(tmp_path):
 def test_nothing_is_locked_in_a_folder_that_goes_at_that_moment(tmp_path, monkeypatch):
     monkeypatch.setattr(pathlib.Path, "exists", lambda path: True)
     assert not disk.is_locked(tmp_path / "gone" / "lock")
+
+
+def test_a_glance_at_a_lock_makes_no_file_in_a_folder_that_goes(tmp_path, monkeypatch):
+    """It would keep the folder there, and `fogft down` from removing it."""
+    monkeypatch.setattr(pathlib.Path, "exists", lambda path: True)
+    assert not disk.is_locked(tmp_path / "lock")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_who_waits_for_a_lock_whose_file_is_made_anew_has_not_the_old_one(tmp_path):
+    """As an `up` that waits for a `down`, while another `up` creates the pool again."""
+    path, freed, found = tmp_path / "lock", threading.Event(), []
+    old, new = disk.Lock(path), disk.Lock(path)
+
+    def wait() -> None:
+        with disk.locked(path):
+            found.append(freed.is_set())
+
+    assert old.acquire(wait=False)
+    waiting = threading.Thread(target=wait)
+    waiting.start()
+    wait_for(lambda: waits_for(path))
+    path.unlink()
+    assert new.acquire(wait=False)
+    old.release()
+    wait_for(lambda: found or waits_for(path))
+    freed.set()
+    new.release()
+    waiting.join()
+    assert found == [True]
 
 
 def test_a_lock_in_a_folder_that_is_gone_is_a_clear_error(tmp_path):

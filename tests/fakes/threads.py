@@ -1,0 +1,43 @@
+"""Threads that meet where they seldom would: side by side, or one in the midst of another."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from threading import Barrier
+
+from tests.fakes.waiting import wait_for
+
+
+def at_once(*steps: Callable[[], object]) -> None:
+    """Run steps on a thread each, which take turns at every chance; raise what one raises."""
+    together = Barrier(len(steps))
+
+    def run(step: Callable[[], object]) -> None:
+        together.wait()
+        step()
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(len(steps)) as threads:
+            for done in [threads.submit(run, step) for step in steps]:
+                done.result()
+    finally:
+        sys.setswitchinterval(interval)
+
+
+def waits_for(lock: Path) -> bool:
+    """Whether somebody waits for a lock, by the kernel's list."""
+    inode = lock.stat().st_ino if lock.exists() else -1
+    lines = Path("/proc/locks").read_text().splitlines()
+    return any("->" in line and f":{inode} " in line for line in lines)
+
+
+def amid(threads: ThreadPoolExecutor, step: Callable[[], object], lock: Path) -> Future[object]:
+    """Run a step on another thread until it is done, or waits for a lock."""
+    running = threads.submit(step)
+    wait_for(lambda: running.done() or waits_for(lock))
+    return running
