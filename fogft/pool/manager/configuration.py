@@ -114,10 +114,11 @@ def certify_robot(
 
 def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
     """Issue new credentials to this machine's client proxy, which switches to them itself."""
-    holder, issued = Ledger(paths.credentials).issue_next(
-        Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
-    )
-    authority.write(issued, paths.credentials, "robot")
+    with disk.locked(paths.credentials / "robot.lock"):  # key and certificate are two files
+        holder, issued = Ledger(paths.credentials).issue_next(
+            Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
+        )
+        authority.write(issued, paths.credentials, "robot")
     return holder
 
 

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fogft import disk
 from fogft.model.choices import MetricsSpec, Middleware, Speaks
 from fogft.model.replica import Offer, Placement, ReplicaId
 from fogft.model.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
@@ -18,6 +22,8 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager import configuration
 from fogft.proxy.config import read_client, read_server
+from fogft.records.signing import Signer
+from tests.fakes.threads import amid
 
 UID = "0123456789abcdef"
 SERVICES = (
@@ -152,3 +158,24 @@ def test_a_replicas_certificate_outlives_the_pool_and_a_margin(
     lasts = said.not_after - datetime.datetime.now(datetime.timezone.utc)
     least = max(365.0, (max_hours or 0.0) / 24 + configuration.MARGIN_DAYS)
     assert lasts > datetime.timedelta(days=least) - datetime.timedelta(hours=1)
+
+
+def test_of_two_rotations_at_once_key_and_certificate_are_of_the_same(
+    paths: PoolPaths, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A key beside another's certificate opens no link, until somebody rotates again."""
+    asked = paths, identity(paths.folder), spec()
+    write, later = disk.write_whole, list[Future[object]]()
+    rotate = functools.partial(configuration.rotate_robot, *asked)
+
+    def written(path: Path, *given: Any, **how: Any) -> None:
+        write(path, *given, **how)
+        if path.name == "robot.key" and not later:
+            later.append(threads.submit(object))
+            later[0] = amid(threads, rotate, paths.credentials / "robot.lock")
+
+    with ThreadPoolExecutor(2) as threads:
+        monkeypatch.setattr(disk, "write_whole", written)
+        rotate()
+        later[0].result()
+    assert Signer(paths.credentials / "robot.crt", paths.credentials / "robot.key").common_name
