@@ -22,6 +22,7 @@ class Kept(Generic[T]):
     failed: Callable[[CloudError | SpecError], None]  # hears why it was not renewed elsewhere
     answer: T | None = field(default=None, init=False)  # None: there was none yet
     _at: float = field(default=-math.inf, init=False)
+    _forgotten: int = field(default=0, init=False)  # how often
     _renewing: bool = field(default=False, init=False)
 
     def get(self) -> T:
@@ -36,13 +37,16 @@ class Kept(Generic[T]):
 
     def renew(self) -> T:
         """Ask now; return the answer."""
-        begun_at = self.clock()
+        begun_at, forgotten = self.clock(), self._forgotten
         answer = self.ask()
-        self._at, self.answer = begun_at, answer
+        # What was asked before it was to be forgotten is no newer for being answered after.
+        self.answer = answer
+        self._at = begun_at if forgotten == self._forgotten else -math.inf
         return answer
 
     def forget(self) -> None:
         """Ask the next time."""
+        self._forgotten += 1
         self._at = -math.inf
 
     def _renew_elsewhere(self) -> None:
