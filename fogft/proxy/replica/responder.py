@@ -216,20 +216,20 @@ class Responder:
             if client is not None:
                 with self._lock:
                     held = queue.hold(job, self._clock())
-                if held:
-                    self._interrupt(job.service, client)
+                if held is not None:
+                    self._interrupt(job.service, client, held)
 
-    def _interrupt(self, service: str, client: RosClient) -> None:
+    def _interrupt(self, service: str, client: RosClient, held: float) -> None:
         try:
-            client.call(EMPTY_REQUEST, lambda _: self._interrupted(service))
+            client.call(EMPTY_REQUEST, lambda _: self._interrupted(service, held))
             self.interrupted += 1
         except RosError as error:
             log.warning("cancel_not_called service=%s reason=%r", service, str(error))
-            self._interrupted(service)
+            self._interrupted(service, held)
 
-    def _interrupted(self, service: str) -> None:
+    def _interrupted(self, service: str, held: float) -> None:
         with self._lock:
-            self._queues[service].release()
+            self._queues[service].release(held)  # and no later one: it may answer late
         self._pass_on(service)
 
     # -- to the service -------------------------------------------------------------------

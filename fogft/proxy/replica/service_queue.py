@@ -192,17 +192,20 @@ class ServiceQueue:
             if not self._unanswered:
                 self._quiet_since = None
 
-    def hold(self, job: Job, now: float) -> bool:
-        """Begin nothing more until `release`; False if the job does not run, or one is held."""
+    def hold(self, job: Job, now: float) -> float | None:
+        """Begin nothing more until `release`; return until when at most.
+
+        None if the job does not run, or one is held.
+        """
         if self.held_until < NEVER or not job.passed_on:
-            return False
+            return None
         self.at_work += 1
         self.held_until = now + HOLD_LIMIT_S
-        return True
+        return self.held_until
 
-    def release(self) -> None:
-        """End a `hold`, if there is one."""
-        if self.held_until < NEVER:
+    def release(self, until: float | None = None) -> None:
+        """End a `hold`, if there is one; with `until` that one only."""
+        if self.held_until < NEVER and until in (None, self.held_until):
             self.held_until = NEVER
             self.at_work -= 1
 

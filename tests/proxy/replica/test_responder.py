@@ -676,3 +676,20 @@ def test_its_numbers_are_told_while_services_get_their_first_requests():
 
         meanwhile(ask, lambda scene=scene: (scene.responder.at_work, scene.responder.limits))
         assert scene.responder.at_work == len(scene.responder.limits) == len(names)
+
+
+def test_a_cancel_service_that_answers_late_is_not_taken_to_have_answered_again():
+    """It was given up, and what it stops now might be the next request."""
+    scene, stop = interruptible()
+    for id in (A, B, C):
+        scene.ask(id)
+    scene.responder.cancel([A])
+    scene.answer(0)
+    scene.clock.now += 3.0
+    scene.responder.tick()
+    scene.responder.cancel([B])
+    scene.answer(1)
+    stop.calls[0][1](b"ok")
+    assert len(scene.client.calls) == 2
+    stop.calls[1][1](b"ok")
+    assert len(scene.client.calls) == 3
