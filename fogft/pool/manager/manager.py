@@ -141,19 +141,40 @@ class Manager:
             self._attempt(lambda: proxy_supervisor.allow_restart(self._paths))
             watchdog = Watchdog()
             while not stop.is_set():
-                if self._work():
+                if self._work() and self._attempt(self._let_go):
                     break
                 notify("READY=1")
                 watchdog.work()
                 self._rest(stop)
-            proxy_supervisor.forbid_restart(self._paths)
+            else:
+                proxy_supervisor.forbid_restart(self._paths)
         except PoolNotFound:
             log.info("manager_stopped pool=%s reason=ended", self._identity.name)
         finally:
-            self._scrape.close()
-            self._records.close()
-            self._lease.release()
+            self._close()
         log.info("manager_stopped pool=%s", self._identity.name)
+
+    def _close(self) -> None:
+        self._scrape.close()
+        self._records.close()
+        self._lease.release()
+
+    def _let_go(self) -> bool:
+        """Leave a pool that has ended; return false where an `up` has just given it more hours.
+
+        An `up` comes before, or finds nobody who manages the pool: it would rely on us.
+        """
+        lock = disk.Lock(self._paths.intent_lock)
+        if not lock.acquire(wait=False):
+            return False  # somebody changes the pool: look again
+        try:
+            is_over = lifetime.is_over(self._store.spec(), self._begun_at(), time.time())
+            if is_over:
+                proxy_supervisor.forbid_restart(self._paths)
+                self._close()
+            return is_over
+        finally:
+            lock.release()
 
     def _work(self) -> bool:
         """Do one round, each step again in the next if it fails; return whether the pool ended."""

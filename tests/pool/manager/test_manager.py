@@ -6,7 +6,9 @@ import json
 import os
 import signal
 import sys
+import threading
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import pytest
 
@@ -15,7 +17,8 @@ from fogft.errors import PoolBusy
 from fogft.model import intent as intents
 from fogft.pool.commands import startup
 from fogft.pool.folder.lease import TERM, Lease
-from fogft.pool.manager import process_control
+from fogft.pool.manager import process_control, teardown
+from fogft.pool.manager.manager import Manager
 from tests.pool.scene import Scene
 
 
@@ -291,3 +294,32 @@ def test_a_manager_steps_back_from_a_later_import_and_from_no_other(scene: Scene
         scene.store.identity()
     assert len(list(scene.cloud.folder.glob("*.json"))) == 2
     assert scene.start_manager().wait(30) == 1
+
+
+def test_an_up_beside_a_manager_whose_pool_is_just_over_has_a_manager(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It finds one at work and starts none: that one goes on with the hours that it was given."""
+    monkeypatch.setenv("FOGFT_HOME", str(scene.home))
+    scene.write(replicas=1, max_hours=2)
+    scene.let_hours_pass(2)
+    end, ups = teardown.end_machines, list[bool]()
+
+    def ended(*given: Any, **how: Any) -> None:
+        end(*given, **how)
+        if not ups:
+            scene.write(replicas=1, max_hours=2)
+            ups.append(startup.start_manager(scene.store))
+
+    monkeypatch.setattr(teardown, "end_machines", ended)
+    stop = threading.Event()
+    manager = Manager(scene.store, scene.cloud, keeps_proxy=False)
+    running = threading.Thread(target=manager.run, args=(stop,))
+    running.start()
+    try:
+        scene.wait(lambda: scene.running() or not running.is_alive())
+        assert scene.running() == ["0.1"]
+        assert ups == [False]
+    finally:
+        stop.set()
+        running.join()
