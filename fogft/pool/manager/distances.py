@@ -142,10 +142,11 @@ class Latencies:
                 else:
                     failed[region] = result
         if found:
-            kept = {**self.measured(), **found}
-            plain = {r: {"rtt_s": d.rtt_s, "as_of": d.as_of} for r, d in kept.items()}
             disk.make_folder(self._file.parent)
-            disk.write_json(self._file, plain, durable=False)
+            with disk.locked(self._file.with_suffix(".lock")):  # other managers measure, too
+                kept = {**self.measured(), **found}
+                plain = {r: {"rtt_s": d.rtt_s, "as_of": d.as_of} for r, d in kept.items()}
+                disk.write_json(self._file, plain, durable=False)
         return failed
 
     def known(

@@ -100,9 +100,8 @@ class Tally:
             ("failed_launches", "Launches that failed, by cause.", "cause", self._failed),
             ("lost_replicas", "Machines lost without being ended by fogft.", "kind", self._lost),
         ):
-            yield counter(
-                f"fogft_pool_{name}_total", help, [(n, {label: key}) for key, n in counts.items()]
-            )
+            told = [(n, {label: key}) for key, n in list(counts.items())]  # while more are counted
+            yield counter(f"fogft_pool_{name}_total", help, told)
         yield histogram(
             "fogft_pool_launch_duration_seconds",
             "Time from the order to a running machine, from there to ready, and in total.",

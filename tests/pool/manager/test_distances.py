@@ -6,10 +6,13 @@ import contextlib
 import socket
 import threading
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from fogft import disk
 from fogft.model.choices import PlacementSpec
 from fogft.model.replica import (
     LinkReport,
@@ -23,6 +26,7 @@ from fogft.model.replica import (
 from fogft.model.spec import PoolSpec
 from fogft.pool.manager import distances
 from fogft.pool.manager.distances import Distances, Latencies, connect_time
+from tests.fakes.threads import amid
 
 NEAR, FAR, DEAD = "aws/us-west-1", "aws/eu-central-1", "aws/us-east-1"
 NOW = 1_700_000_000.0
@@ -142,3 +146,23 @@ def test_one_slow_probe_moves_nothing(tmp_path: Path):
     for _ in range(5):
         assert look(0.02) == 0.02
     assert look(3.0) == 0.02
+
+
+def test_of_two_managers_that_measure_at_once_neither_forgets_what_the_other_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Its regions would be without a distance for a quarter of an hour."""
+    known = Latencies(tmp_path / "l.json", connect=lambda host, port: 0.05, clock=lambda: NOW)
+    write, others = disk.write_json, list[Future[object]]()
+
+    def written(*given: Any, **how: Any) -> None:
+        if not others:
+            others.append(threads.submit(object))
+            others[0] = amid(threads, lambda: known.measure([FAR]), tmp_path / "l.lock")
+        write(*given, **how)
+
+    monkeypatch.setattr(disk, "write_json", written)
+    with ThreadPoolExecutor(1) as threads:
+        known.measure([NEAR])
+        others[0].result()
+    assert known.measured().keys() == {NEAR, FAR}

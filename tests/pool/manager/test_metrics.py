@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from fogft.model.reason import Cause, Reason
+from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.manager import tally
 from fogft.pool.manager.tally import Tally
 from tests.fakes.pools import STATUS
+from tests.fakes.threads import at_once
 from tests.metrics.samples import text
 
 
@@ -33,3 +36,19 @@ def test_the_end_of_credentials_and_the_cost_are_told_where_they_are_known():
     said = text(tally.of_pool(known, Tally()), {"pool": STATUS.pool})
     assert f'fogft_credentials_left_seconds{{pool="{STATUS.pool}"}} 90.0' in said
     assert f'fogft_pool_usd_total{{pool="{STATUS.pool}"}} 1.5' in said
+
+
+def test_events_are_counted_while_metrics_are_told():
+    for _ in range(20):
+        counting, done = Tally(), list[str]()
+
+        def count(counting=counting, done=done) -> None:
+            for cause in Cause:
+                counting.heard(Event(0.0, EventKind.REFUSED, 0, 1, reason=Reason(cause)))
+            done.append("counted")
+
+        def tell(counting=counting, done=done) -> None:
+            while not done:
+                list(counting.metrics())
+
+        at_once(count, tell)
