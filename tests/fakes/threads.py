@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier
 
 from tests.fakes.waiting import wait_for
+
+
+@contextlib.contextmanager
+def often() -> Iterator[None]:
+    """Let each thread run for but a microsecond at a time."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(interval)
 
 
 def at_once(*steps: Callable[[], object]) -> None:
@@ -19,14 +31,18 @@ def at_once(*steps: Callable[[], object]) -> None:
         together.wait()
         step()
 
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with ThreadPoolExecutor(len(steps)) as threads:
-            for done in [threads.submit(run, step) for step in steps]:
-                done.result()
-    finally:
-        sys.setswitchinterval(interval)
+    with often(), ThreadPoolExecutor(len(steps)) as threads:
+        for done in [threads.submit(run, step) for step in steps]:
+            done.result()
+
+
+def meanwhile(changes: Callable[[], object], look: Callable[[], object]) -> None:
+    """Have this thread `look` again and again until another one has made its `changes`."""
+    with often(), ThreadPoolExecutor(1) as other:
+        changing = other.submit(changes)
+        while not changing.done():
+            look()
+        changing.result()
 
 
 def waits_for(lock: Path) -> bool:

@@ -47,9 +47,10 @@ class HistoryFile:
         history = self.history()
         with self._lock:
             if self._is_long:
-                kept = compacted(_read_events(self._path), self._clock())
-                disk.write_whole(self._path, "".join(map(_line, kept)))
                 self._is_long = False
+                kept = compacted(_read_events(self._path), self._clock())
+                with contextlib.suppress(StateError):  # no room: it stays as long as it is
+                    disk.write_whole(self._path, "".join(map(_line, kept)))
             try:
                 _append_durably(self._path, _line(event).encode())
             except OSError as error:

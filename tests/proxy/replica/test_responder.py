@@ -11,7 +11,7 @@ from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.responder import EMPTY_REQUEST, Responder
 from fogft.requests.load import Handling, Load
 from tests.fakes.proxy import Clock, FakeClient, FakeIncoming
-from tests.racing import meanwhile
+from tests.fakes.threads import meanwhile
 
 A = b"a" * 16
 B, C, D = b"b" * 16, b"c" * 16, b"d" * 16

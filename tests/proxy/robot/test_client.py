@@ -22,7 +22,7 @@ from fogft.proxy.robot.client import ClientProxy
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.proxied_service import HOLD_S
 from tests.fakes.proxy import UID, Clock, FakeDialer, FakeNode
-from tests.racing import meanwhile
+from tests.fakes.threads import meanwhile
 
 SET_BOOL = "std_srvs/srv/SetBool"
 OURS = {SET_BOOL: Definition(fields={"request": (("data", "boolean"),)})}

@@ -13,7 +13,7 @@ from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.links import best_of, seen_through
 from fogft.requests.load import Handling
 from tests.fakes.proxy import UID, Clock, FakeIncoming, FakeLink
-from tests.racing import meanwhile
+from tests.fakes.threads import meanwhile
 
 READY = frozenset({"/s"})
 
