@@ -94,7 +94,7 @@ class VisibleNode:
                 self._awake = False  # before looking: what comes after that wakes us again
                 self._work()
                 self._log.pass_on()
-                self._executor.spin_once(timeout_sec=_LOOK_EVERY_S)
+                self._executor.spin_once(timeout_sec=0 if self._closing else _LOOK_EVERY_S)
         except Exception:
             log.exception("visible_node_ended")
         finally:

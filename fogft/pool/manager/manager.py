@@ -243,7 +243,7 @@ class Manager:
 
     def _begun_at(self) -> float:
         history = self._store.history()
-        return lifetime.begun_at(self._store.intent(), self._identity.created_at, history)
+        return lifetime.begun_at(self._store.intent(), self._store.identity().created_at, history)
 
     def _discover(self, tick: Tick) -> None:
         if self._discovery.look(tick.spec, tick.observed, tick.plan.wanted):

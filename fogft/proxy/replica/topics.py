@@ -130,7 +130,7 @@ class TopicsOnReplica:
     @property
     def trouble(self) -> str:
         """Why a topic does not get through; empty if all do."""
-        return next(iter(self._trouble.values()), "")
+        return next(iter(tuple(self._trouble.values())), "")  # `use` may add to them meanwhile
 
     def use(self, node: SerialisedNode | None) -> None:
         """Publish and subscribe with this node from now on."""
