@@ -100,6 +100,23 @@ def stop_on_signal() -> threading.Event:
     return stop
 
 
+class Wakeup:
+    """Ends a wait, also from a signal's handler, which may interrupt who holds an Event's lock."""
+
+    def __init__(self) -> None:
+        self._asleep = threading.Lock()
+        self._asleep.acquire()
+
+    def wake(self) -> None:
+        """End the present wait, or the next one. Any thread, and handlers of signals."""
+        with contextlib.suppress(RuntimeError):  # it has been ended already
+            self._asleep.release()
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait to be woken, at most so long. One thread."""
+        self._asleep.acquire(timeout=timeout_s)
+
+
 _THREADS = "OPENBLAS_NUM_THREADS"
 
 

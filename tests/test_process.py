@@ -114,6 +114,37 @@ print(json.dumps({"threads": threads, "said": os.environ.get("OPENBLAS_NUM_THREA
 """
 
 
+_WAITS = """
+import signal
+from fogft.process import Wakeup
+
+woken = Wakeup()
+told = 0
+
+def tell(*_):
+    global told
+    told += 1
+    woken.wake()
+
+signal.signal(signal.SIGALRM, tell)
+signal.setitimer(signal.ITIMER_REAL, 5e-4, 5e-4)
+for _ in range(1500):
+    woken.wait(0.001)
+signal.setitimer(signal.ITIMER_REAL, 0)
+woken.wait(0)
+woken.wake()
+woken.wake()
+woken.wait(60)
+print("ended", told > 0)
+"""
+
+
+def test_a_wait_may_be_ended_by_signals_at_any_point_of_it():
+    """An Event's would hang for good: the handler waits for a lock of whom it interrupts."""
+    ended = subprocess.run([sys.executable, "-c", _WAITS], stdout=-1, timeout=60, check=True)
+    assert ended.stdout == b"ended True\n"
+
+
 def loaded(**environ: str) -> dict:
     said = {k: v for k, v in os.environ.items() if k != "OPENBLAS_NUM_THREADS"} | environ
     ended = subprocess.run([sys.executable, "-c", _LOADED], env=said, stdout=-1, check=True)

@@ -58,10 +58,10 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
         except FogftError:  # written by a version that knew other keys
             before, old_source = spec, ""
         after = intent.file_changed(store.intent(), before, spec)
+        begun_at = lifetime.begun_at(after, identity.created_at, store.history())
         # The file first: the old one with the new intent would be one without its `scale`.
         if old_source != source:
             disk.write_whole(paths.spec, source)
-        begun_at = lifetime.begun_at(after, identity.created_at, store.history())
         store.write_intent(lifetime.revived(before, after, begun_at, time.time()))
 
 

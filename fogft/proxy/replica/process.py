@@ -4,7 +4,6 @@ It ends with status 0 when it was told to or when its lease is over; whoever sta
 job, the local cloud's machine) then ends the machine.
 """
 
-import contextlib
 import logging
 import math
 import os
@@ -23,7 +22,7 @@ from fogft.metrics.scrape import Scrape
 from fogft.metrics.spans import wanted
 from fogft.model.proxy_config import ServerProxyConfig
 from fogft.model.type_definition import Definition
-from fogft.process import begin_start, end_start, start_log, stop_on_signal
+from fogft.process import Wakeup, begin_start, end_start, start_log, stop_on_signal
 from fogft.proxy import middleware
 from fogft.proxy.config import read_server
 from fogft.proxy.replica.announcing import Presence
@@ -81,14 +80,8 @@ def run(
         stop.set()
 
     signal.signal(signal.SIGTERM, end)
-    died = threading.Lock()  # not an Event: the handler may interrupt who holds that one's own lock
-    died.acquire()
-
-    def child_ended(*_: object) -> None:
-        with contextlib.suppress(RuntimeError):  # it is released already
-            died.release()
-
-    signal.signal(signal.SIGCHLD, child_ended)
+    died = Wakeup()
+    signal.signal(signal.SIGCHLD, lambda *_: died.wake())
     middleware.prepare(config.rmw)
     traced = frozenset(service.name for service in config.services if service.trace)
     spans = wanted("fogft-replica", config.pool) if traced else None
@@ -201,13 +194,13 @@ def _loop(
     proxy: ServerProxy,
     presence: Presence,
     stop: threading.Event,
-    died: threading.Lock,
+    died: Wakeup,
     until: float = math.inf,
 ) -> None:
     memory = memory_tuning.Trimmer()
     while time.monotonic() < until and not stop.is_set():
         # A death is told before robots hedge what has caused it at the next replica.
-        died.acquire(timeout=_IDLE_TICK_S if proxy.idle else _TICK_S)
+        died.wait(_IDLE_TICK_S if proxy.idle else _TICK_S)
         proxy.run_once()
         memory.look()
         known = presence.look(proxy.ready, draining=proxy.draining)
