@@ -210,8 +210,12 @@ class DialIn:
         while True:
             try:
                 link, _ = port.accept()
-            except OSError:
-                return  # given back
+            except OSError as error:
+                if port.fileno() < 0:
+                    return  # given back
+                self._count("accept_failed", str(error))  # no descriptor, for a moment
+                time.sleep(0.1)
+                continue
             one = self._take(id)
             if one is None:
                 link.close()  # the link tries again soon

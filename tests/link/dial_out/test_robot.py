@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
+import resource
 import socket
 import threading
 from collections import Counter
@@ -79,6 +80,22 @@ def test_a_relaunched_replica_comes_in_anew_and_the_link_goes_on(
     assert link.offer(SERVICE, request_id(1), b"again", 20.0)
     wait_for(lambda: owner.of(1))
     assert owner.of(1)[0].payload == b"again"
+
+
+@pytest.mark.own_process
+def test_a_loopback_port_outlives_a_moment_without_descriptors(door):
+    """Else its replica would be left out for good, however often the link tries."""
+    host, _, port = door.local(ID).rpartition(":")
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with socket.socket() as caller:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+        try:
+            caller.connect((host, int(port)))
+            wait_for(lambda: door.counters().get("accept_failed"))
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+        caller.settimeout(30)
+        assert caller.recv(1) == b""  # taken, and given up since no replica waits there
 
 
 def test_a_replica_waits_for_a_door_that_is_not_there_yet(authority, dial_out, start_replica, dial):
