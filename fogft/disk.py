@@ -188,12 +188,19 @@ class Lock:
         except BlockingIOError:
             os.close(descriptor)
             return False
-        with contextlib.suppress(FileNotFoundError):
-            if not os.path.samestat(os.fstat(descriptor), self._path.stat()):
-                os.close(descriptor)  # while we waited the file was removed, and made anew
-                return self.take(how)
+        if self._was_replaced(descriptor):
+            os.close(descriptor)
+            return self.take(how)
         self._descriptor = descriptor
         return True
+
+    def _was_replaced(self, descriptor: int) -> bool:
+        """Whether the file was removed, while we waited, and made anew."""
+        ours = os.fstat(descriptor)
+        try:
+            return not ours.st_nlink and not os.path.samestat(ours, self._path.stat())
+        except FileNotFoundError:
+            return False
 
     def release(self) -> None:
         """Give the lock back. Repeatable."""
