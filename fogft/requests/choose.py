@@ -8,7 +8,7 @@ which answer wins (`decide`).
 """
 
 from collections import defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence, Set
 from typing import Any
 
 from fogft.requests.load import NEVER, Load, ReplicaLoad
@@ -75,6 +75,9 @@ class Choose:
     def forget(self, replica: int) -> None:
         """Note that a replica's link is new or gone: attempts in flight end without a report."""
 
+    def keep(self, replicas: Set[int]) -> None:
+        """Note that there are only these replicas: none of the others comes back."""
+
     def needed(self, able: Collection[int], now: float) -> int:
         """Return how many replicas would be enough if there are too few; else 0."""
         return 0
@@ -132,6 +135,11 @@ class Learning(Choose):
     def forget(self, replica: int) -> None:
         """Forget attempts in flight to it."""
         self._replicas[replica].forget()
+
+    def keep(self, replicas: Set[int]) -> None:
+        """Forget what was learned of others."""
+        for replica in self._replicas.keys() - replicas:
+            del self._replicas[replica]
 
 
 class Failover(Learning):

@@ -74,6 +74,8 @@ class Sender:
             added = [key for key, link in routed.items() if self.links.get(key) is not link]
             self._ledger.requests.left(self.links.keys() - routed.keys())
             self.links = routed
+            if versions:
+                self._ledger.requests.choose.keep(routed.keys() | {id.key for id in versions})
             if replication is None or not replication.sends_requests:
                 self.able = tuple(routed)
                 self._ledger.requests.came(added)

@@ -232,6 +232,24 @@ def test_a_request_waits_for_the_first_replica_to_come():
     assert scene.responses == [("caller", b"good")]
 
 
+def test_what_was_learned_of_a_replica_is_kept_while_it_is_a_member_and_no_longer():
+    """One that is away for a moment is known again; of months of replacements nothing piles up."""
+    scene = Scene(links=1, hedging=HedgingMode.AUTO)
+    away = scene.links[0].peer.id
+    scene.dispatcher.submit(b"ask", 0)
+    scene.answer(0, b"answer")
+    for generation in range(1, 30):
+        link = FakeLink(1, generation=generation)
+        scene.links = [link]
+        scene.dispatcher.route([link], {away: "1", link.peer.id: "1"})
+        scene.dispatcher.submit(b"ask", generation)
+        scene.answer(0, b"answer")
+        learned = scene.dispatcher.report()["hedging"]["replicas"]
+        assert set(learned) == {"0.1", link.peer.id.short}
+    scene.dispatcher.route([link], {link.peer.id: "1"})
+    assert set(scene.dispatcher.report()["hedging"]["replicas"]) == {"1.29"}
+
+
 def test_a_reopened_link_gets_what_was_in_flight_under_the_same_id():
     scene = Scene(2)
     scene.dispatcher.submit(b"q", "caller")
