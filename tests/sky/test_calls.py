@@ -7,6 +7,7 @@ import threading
 import pytest
 
 from fogft.cloud.sky.installed import InstalledSky
+from fogft.cloud.sky.kept import Kept
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudError, CloudUnreachable
 
@@ -63,3 +64,19 @@ def test_a_call_without_an_answer_is_given_up_and_not_repeated_while_it_runs():
     assert calls.within(30, "y", lambda: "other") == "other"
     go_on.set()
     assert calls.within(30, "x", lambda: "fresh") == "fresh", "a late answer is thrown away"
+
+
+def test_what_was_asked_before_it_was_to_be_forgotten_is_asked_again():
+    """SkyPilot's list is long under way: a replica that ended meanwhile would be listed again."""
+    machines = ["0.1"]
+
+    def ask() -> list[str]:
+        listed = list(machines)
+        if machines:
+            machines.clear()
+            kept.forget()
+        return listed
+
+    kept = Kept(ask, 5.0, 15.0, lambda: 1000.0, lambda run: run(), failed=lambda _: None)
+    assert kept.get() == ["0.1"]
+    assert kept.get() == []
