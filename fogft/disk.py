@@ -252,13 +252,11 @@ def locked(path: Path) -> Iterator[None]:
 
 def is_locked(path: Path) -> bool:
     """Return whether a living process holds the lock of this file."""
-    if not path.exists():
-        return False
     lock = Lock(path)
     try:
         if not lock.take(fcntl.LOCK_SH | fcntl.LOCK_NB):
             return True
-    except FileNotFoundError:  # its folder has just gone
+    except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:
         raise not_opened(path, error) from error

@@ -101,7 +101,11 @@ def stop_on_signal() -> threading.Event:
 
 
 class Wakeup:
-    """Ends a wait, also from a signal's handler, which may interrupt who holds an Event's lock."""
+    """Ends a wait, also from a signal's handler, which may interrupt who holds an Event's lock.
+
+    Nor is it a queue: before Python 3.13 its `get` waits for ever where a signal is handled as its
+    time ends.
+    """
 
     def __init__(self) -> None:
         self._asleep = threading.Lock()
@@ -109,8 +113,10 @@ class Wakeup:
 
     def wake(self) -> None:
         """End the present wait, or the next one. Any thread, and handlers of signals."""
-        with contextlib.suppress(RuntimeError):  # it has been ended already
+        try:  # noqa: SIM105 - on the way of requests, where a context manager costs thrice
             self._asleep.release()
+        except RuntimeError:
+            pass  # it has been ended already
 
     def wait(self, timeout_s: float) -> None:
         """Wait to be woken, at most so long. One thread."""

@@ -203,7 +203,7 @@ class Forwarder:
             "in_flight": self.in_flight,
             "passed": self.passed,
             "joined": self.joined,
-            "refused": dict(self.refused.snapshot()),
+            "refused": self.refused.snapshot(),
         }
 
     def work(self) -> dict[str, float]:

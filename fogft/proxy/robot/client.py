@@ -19,6 +19,7 @@ from fogft.model import names
 from fogft.model.replica import Membership, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
+from fogft.process import Wakeup
 from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.proxy.robot.links import Define, Links, TypeCheck, best_of, link_report, seen_through
 from fogft.proxy.robot.proxied_service import ProxiedService
@@ -75,10 +76,7 @@ class ClientProxy:
         self._topics = TopicsOnRobot(self._wake, merge, clock)
         # Until when the thread of `run_once` sleeps; it is woken by who wants a look sooner.
         self._sleeps_until = NEVER
-        # Released to wake it. No queue: before Python 3.13 its `get` waits for ever where a signal
-        # is handled as its time ends.
-        self._sooner = threading.Lock()
-        self._sooner.acquire()
+        self._sooner = Wakeup()
         self._look_now = self._changed = False
         self._advertise_at = -NEVER
 
@@ -216,10 +214,7 @@ class ClientProxy:
             self._look_now = True
         if at < self._sleeps_until:
             self._sleeps_until = at  # once is enough
-            try:  # noqa: SIM105 - on the way of requests, where a context manager costs thrice
-                self._sooner.release()
-            except RuntimeError:
-                pass  # another thread has woken it just now
+            self._sooner.wake()
 
     # -- the proxy's own thread -----------------------------------------------------------
 
@@ -263,7 +258,7 @@ class ClientProxy:
             if look_at <= now or self._look_now:
                 break
             self._sleeps_until = sleeps_until
-            self._sooner.acquire(timeout=max(0.0, self._sleeps_until - now))
+            self._sooner.wait(max(0.0, self._sleeps_until - now))
             now = self._clock()
         self._look_now = False
 

@@ -9,7 +9,7 @@ from fogft.planning.observed.history import Event, EventKind
 from fogft.pool.manager import tally
 from fogft.pool.manager.tally import Tally
 from tests.fakes.pools import STATUS
-from tests.fakes.threads import at_once
+from tests.fakes.threads import meanwhile
 from tests.metrics.samples import text
 
 
@@ -40,15 +40,12 @@ def test_the_end_of_credentials_and_the_cost_are_told_where_they_are_known():
 
 def test_events_are_counted_while_metrics_are_told():
     for _ in range(20):
-        counting, done = Tally(), list[str]()
+        counting = Tally()
 
-        def count(counting=counting, done=done) -> None:
+        def count(counting=counting) -> None:
             for cause in Cause:
                 counting.heard(Event(0.0, EventKind.REFUSED, 0, 1, reason=Reason(cause)))
-            done.append("counted")
 
-        def tell(counting=counting, done=done) -> None:
-            while not done:
-                list(counting.metrics())
-
-        at_once(count, tell)
+        meanwhile(count, lambda counting=counting: list(counting.metrics()))
+        (refused,) = [m for m in counting.metrics() if m.name == "fogft_pool_refused_launches"]
+        assert len(refused.samples) == len(Cause)
