@@ -101,9 +101,12 @@ def ci(tree):
     ],
 )
 def test_ci_takes_every_step_and_fails_if_one_failed_or_did_not_run(ci, step, status, must, whole):
-    program(ci / "scripts" / step, f"#!/bin/sh\nexit {status}\n")
+    program(ci / "scripts" / step, f"#!/bin/sh\necho its reason >&2\nexit {status}\n")
     done = run(ci, ".ci/run", more={"FOGFT_MUST_RUN": must})
     assert done.returncode == whole, done.stderr
+    *_, reason, summary = done.stderr.rpartition("its reason")
+    assert bool(reason) is (status not in {0, 77})
+    assert summary.count(" ended with ") >= 8
     assert "reproduce --quick --only planning" in done.stdout
     assert ("not run: scripts/test-sky" in done.stderr) is (status == 77)
     assert "not run: detection, segmentation and picking: " in done.stderr
