@@ -80,7 +80,7 @@ class Responder:
     @property
     def at_work(self) -> int:
         """The number of requests in the services."""
-        return sum(queue.at_work for queue in tuple(self._queues.values()))
+        return sum(queue.at_work for queue in list(self._queues.values()))
 
     @property
     def in_flight(self) -> int:
@@ -115,7 +115,7 @@ class Responder:
     @property
     def limits(self) -> dict[str, int]:
         """How many requests each service may have concurrently."""
-        return {name: self._queues[name].limit.limit for name in tuple(self._queues)}
+        return {name: self._queues[name].limit.limit for name in list(self._queues)}
 
     def use(
         self,
@@ -337,6 +337,9 @@ class Responder:
         with self._lock:
             late = self.known.expired(now)
             abandoned = [job for queue in self._queues.values() for job in queue.abandoned(now)]
+            again = [job for queue in self._queues.values() for job in queue.unheard(now)]
+            for job in again:
+                job.payload = job.waiting[0].payload if job.waiting else b""
             for name, queue in self._queues.items():
                 if queue.held_until <= now:
                     log.warning("cancel_unanswered service=%s waited_s=%.1f", name, HOLD_LIMIT_S)
@@ -345,6 +348,11 @@ class Responder:
             self._end(id, Refusal.EXPIRED)
         for job in abandoned:
             self._forget_ticket(job)
+        for job in again:
+            log.warning(
+                "service_asked_again service=%s after_s=%.1f", job.service, now - job.arrived
+            )
+            self._call(job)
         for service in list(self._queues):
             self._pass_on(service)
 

@@ -25,6 +25,9 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
+# A service that has just begun may not have found us yet when it responds: then rmw drops the
+# response. After so long without any, and so many times what one usually takes, we ask once more.
+_UNHEARD_AFTER_S, _UNHEARD_TIMES = 2.0, 3.0
 # While others wait, a request needs so many times what one usually takes, but no more than that
 # share of the longest time that one was given here: what takes longer than most comes too late.
 _TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
@@ -80,6 +83,9 @@ class ServiceQueue:
         self._quiet_since: float | None = None  # it has work, and has ended none since
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
         self._last_deadline = 0.0
+        self._heard = False  # this process of the service has answered
+        self._unheard: list[Job] = []  # passed on before it had, the oldest first
+        self._ask_at = self._patience_s = 0.0  # when the next of them is passed on once more
         self.held_until = NEVER  # nothing is begun before, or before `release`
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
@@ -162,6 +168,29 @@ class ServiceQueue:
         job.passed_on, job.begun, job.level = True, now, self.at_work
         if self.at_work > self.limit.limit:
             self._next = job
+        if not self._heard:
+            if not self._unheard:
+                self._patience_s = max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * self.limit.takes_s)
+                self._ask_at = now + self._patience_s
+            self._unheard.append(job)
+
+    def unheard(self, now: float) -> list[Job]:
+        """Return what to pass on once more, because its response may be lost.
+
+        One job stands for all, at ever longer intervals, until the service has answered anything.
+        """
+        if not self._unheard or now < self._ask_at:
+            return []
+        running = [
+            job for job in self._unheard if job.passed_on and job.waiting and job.deadline > now
+        ]
+        again = running if self._heard else running[:1]
+        for job in again:
+            job.begun = now
+        self._patience_s *= _UNHEARD_TIMES
+        self._ask_at = now + self._patience_s
+        self._unheard = [] if self._heard else running
+        return again
 
     def remove(self, job: Job) -> bool:
         """Remove a waiting job; return whether it was waiting."""
@@ -173,6 +202,9 @@ class ServiceQueue:
             took_s = now - job.begun
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
+        if not self._heard:
+            self._heard = True
+            self._ask_at = now + max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * self.limit.takes_s)
         self.free(job)
         if self._next is not None:  # only now does the service begin with it
             self._next.begun, self._next.level = now, self.at_work
@@ -230,10 +262,12 @@ class ServiceQueue:
         self.release()
         self._quiet_since, self._unanswered, self._next = None, 0, None
         self._longest_s = self._last_deadline = 0.0
+        self._heard, self._unheard = False, []
 
     def overdue(self, job: Job, now: float) -> None:
         """Note that a running job is past its deadline; it keeps its slot for a while."""
-        self._overdue.append((now + _ABANDONED_AFTER_S, job))
+        patience_s = _ABANDONED_AFTER_S if self._heard else self._patience_s
+        self._overdue.append((now + min(patience_s, _ABANDONED_AFTER_S), job))
 
     def abandoned(self, now: float) -> list[Job]:
         """Return the overdue jobs whose response counts as lost; their slots are free."""

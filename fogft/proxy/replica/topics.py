@@ -130,7 +130,7 @@ class TopicsOnReplica:
     @property
     def trouble(self) -> str:
         """Why a topic does not get through; empty if all do."""
-        return next(iter(tuple(self._trouble.values())), "")  # `use` may add to them meanwhile
+        return next(iter(list(self._trouble.values())), "")  # `use` may add to them meanwhile
 
     def use(self, node: SerialisedNode | None) -> None:
         """Publish and subscribe with this node from now on."""
@@ -162,8 +162,8 @@ class TopicsOnReplica:
 
     def ready(self) -> frozenset[str]:
         """Return the names of the topics that have an endpoint here."""
-        publishers = tuple(self._publishers.items())  # while `use` adds to them
-        heard = {name for name, one in publishers if one.subscribers()}
+        publishers = self._publishers.copy()  # while `use` adds to them
+        heard = {name for name, one in publishers.items() if one.subscribers()}
         return frozenset(self._subscriptions) | heard
 
     def request(self, incoming: Incoming) -> None:

@@ -32,7 +32,7 @@ class Sender:
         """Batch what is sent until the burst ends into few messages."""
         self._in_burst = begins
         if not begins:
-            for link in tuple(self.links.values()):
+            for link in list(self.links.values()):
                 link.send()
 
     def first(
