@@ -204,7 +204,8 @@ class ServiceQueue:
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
         if not self._heard:
             self._heard = True
-            self._ask_at = now + max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * self.limit.takes_s)
+            all_s = self.limit.takes_s * self.at_work
+            self._ask_at = now + max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * all_s)
         self.free(job)
         if self._next is not None:  # only now does the service begin with it
             self._next.begun, self._next.level = now, self.at_work

@@ -200,7 +200,7 @@ def test_a_service_that_has_just_begun_is_asked_again_until_it_has_answered():
     assert asked_after(0.2) == [b"1"]  # one stands for both
     assert asked_after(5.9) == []
     assert asked_after(0.2) == [b"1"]
-    scene.clock.now += 0.5
+    scene.clock.now += 0.1
     scene.answer(3, b"r1")
     assert asked_after(1.0) == []
     assert asked_after(1.1) == [b"2"]
@@ -213,6 +213,18 @@ def test_a_service_that_has_just_begun_is_asked_again_until_it_has_answered():
         scene.answer(number)
     assert third.outcome == [b"r"]
     assert third.load.service_s <= 1.0  # what was lost is not taken for slow
+
+
+def test_a_service_that_begins_with_many_requests_is_given_time_for_them():
+    scene = Scene()
+    asked = [scene.ask(b"%016d" % number, remaining_s=60.0) for number in range(8)]
+    for second in range(8):
+        for _ in range(5):
+            scene.clock.now += 0.3
+            scene.responder.tick()
+        scene.answer(second)
+    assert [one.outcome for one in asked] == [[b"r"]] * 8
+    assert len(scene.client.calls) == 8
 
 
 def test_what_a_service_that_has_just_begun_lost_takes_no_room_for_long():
