@@ -104,7 +104,10 @@ class Unpacker:
         self._waiting: dict[str, deque[tuple[bytes, Done]]] = {}
 
     def put(self, peer: str, packed: bytes, done: Done) -> bool:
-        """Decompress a payload, then call `done`; False where too much of this peer waits."""
+        """Decompress a payload, then call `done`.
+
+        False where too much of this peer waits, or there can be no more threads.
+        """
         with self._lock:
             waiting = self._waiting.get(peer)
             if waiting is not None:
@@ -113,10 +116,13 @@ class Unpacker:
                     return False
                 waiting.append((packed, done))
                 return True
+            try:
+                threading.Thread(
+                    target=self._run, args=(peer,), name=f"fogft-unpack-{peer}", daemon=True
+                ).start()
+            except RuntimeError:
+                return False
             self._waiting[peer] = deque(((packed, done),))
-        threading.Thread(
-            target=self._run, args=(peer,), name=f"fogft-unpack-{peer}", daemon=True
-        ).start()
         return True
 
     def _run(self, peer: str) -> None:

@@ -48,3 +48,15 @@ def test_too_many_of_one_peer_are_declined_and_another_peer_does_not_wait() -> N
     go.set()
     wait_for(lambda: not [t for t in threading.enumerate() if t.name == "fogft-unpack-eve"])
     assert unpacker.put("eve", packed, lambda payload: None)
+
+
+def test_where_there_can_be_no_more_threads_the_next_payload_has_one(monkeypatch):
+    def none(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    unpacker, came = Unpacker(), threading.Event()
+    with monkeypatch.context() as full:
+        full.setattr(threading.Thread, "start", none)
+        assert not unpacker.put("r1", b"packed", lambda _: None)
+    assert unpacker.put("r1", b"packed", lambda _: came.set())
+    assert came.wait(30)

@@ -155,7 +155,7 @@ class GoalsOnce:
                 known = server.open[goal]
                 known.begun_at = now
                 payload, known.payload = known.payload, b""
-            client = self._clients.get(service)
+                client = self._clients.get(service)  # of this life: after a crash it is sent anew
             if client is None:
                 self._drop(service, goal, known, Refusal.NOT_READY)
                 continue

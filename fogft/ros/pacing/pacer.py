@@ -164,8 +164,9 @@ class Pacer:
 
     def _begin(self) -> None:
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="ros-pacer", daemon=True)
-            self._thread.start()
+            thread = threading.Thread(target=self._run, name="ros-pacer", daemon=True)
+            thread.start()  # where that fails, the next response tries it again
+            self._thread = thread
         self._wake.notify()
 
     def _run(self) -> None:

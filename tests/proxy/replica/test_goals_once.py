@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from threading import Thread
+
 import pytest
 
 from fogft.byte_limit import SMALL_BYTES
@@ -69,6 +71,29 @@ def test_an_action_server_that_takes_its_time_is_given_a_goal_once():
     scene.say(ACCEPTED)
     assert impatient[-1].outcome == [ACCEPTED]
     assert len(scene.calls) == 1
+
+
+def test_a_goal_that_is_begun_as_its_action_server_dies_is_not_given_to_the_next():
+    """Its robot is told, and gives it to the next itself."""
+    scene, after = Scene(), FakeClient()
+
+    def die() -> None:
+        scene.goals.crashed()
+        scene.goals.use({SERVICE: after})
+
+    class Dying(dict):
+        def get(self, service: str) -> FakeClient:
+            if death.ident is None:
+                death.start()
+                death.join(0.2)  # or until then, where it has to wait for us
+            return self[service] if death.is_alive() else after
+
+    death = Thread(target=die)
+    scene.goals.use(Dying(scene.clients))
+    given = scene.give(b"a")
+    death.join()
+    assert given.outcome == ["refused crashed"]
+    assert after.calls == []
 
 
 def test_an_acceptance_that_nobody_waits_for_is_remembered():

@@ -453,6 +453,31 @@ def test_a_response_to_a_client_that_is_not_found_yet_is_sent_again():
     assert sorted(sent) == [b"early", b"other"]
 
 
+def test_where_there_can_be_no_more_threads_a_later_response_has_one(monkeypatch):
+    """And what waited until then is sent, too."""
+    sent, both, found = list[bytes](), threading.Event(), False
+
+    def send(handle: bytes, payload: bytes) -> None:
+        if not found:
+            raise NotFoundYet("client will not receive response")
+        sent.append(payload)
+        if len(sent) == 2:
+            both.set()
+
+    def none(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    pacer = Pacer(send, UNKNOWN, "/s")
+    with monkeypatch.context() as full:
+        full.setattr(threading.Thread, "start", none)
+        with pytest.raises(RuntimeError):
+            pacer.respond(bytes(24), b"1")
+    pacer.respond(bytes(24), b"2")
+    found = True
+    assert both.wait(30)
+    pacer.close()
+
+
 def test_a_client_that_is_never_found_is_given_up(caplog):
     """What waited for it goes after a while, each with a line in the log."""
     now, refused = 0.0, threading.Event()
