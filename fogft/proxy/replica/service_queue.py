@@ -26,7 +26,7 @@ _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
 # A service that has just begun may not have found us yet when it responds: then rmw drops the
-# response. After so long without any, and so many times what one usually takes, we ask once more.
+# response. After so long, and so many times what its work usually takes, we ask once more.
 _UNHEARD_AFTER_S, _UNHEARD_TIMES = 2.0, 3.0
 # While others wait, a request needs so many times what one usually takes, but no more than that
 # share of the longest time that one was given here: what takes longer than most comes too late.
@@ -85,7 +85,6 @@ class ServiceQueue:
         self._last_deadline = 0.0
         self._heard = False  # this process of the service has answered
         self._unheard: list[Job] = []  # passed on before it had, the oldest first
-        self._ask_at = self._patience_s = 0.0  # when the next of them is passed on once more
         self.held_until = NEVER  # nothing is begun before, or before `release`
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
@@ -169,9 +168,6 @@ class ServiceQueue:
         if self.at_work > self.limit.limit:
             self._next = job
         if not self._heard:
-            if not self._unheard:
-                self._patience_s = max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * self.limit.takes_s)
-                self._ask_at = now + self._patience_s
             self._unheard.append(job)
 
     def unheard(self, now: float) -> list[Job]:
@@ -179,17 +175,18 @@ class ServiceQueue:
 
         One job stands for all, at ever longer intervals, until the service has answered anything.
         """
-        if not self._unheard or now < self._ask_at:
+        if not self._unheard:
             return []
-        running = [
-            job for job in self._unheard if job.passed_on and job.waiting and job.deadline > now
+        running = [job for job in self._unheard if job.passed_on and job.waiting]
+        usual_s = max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * self.limit.takes_s * self.at_work)
+        again = [
+            job
+            for job in (running if self._heard else running[:1])
+            if now < job.deadline and now - job.begun >= max(usual_s, 0.75 * (now - job.arrived))
         ]
-        again = running if self._heard else running[:1]
         for job in again:
             job.begun = now
-        self._patience_s *= _UNHEARD_TIMES
-        self._ask_at = now + self._patience_s
-        self._unheard = [] if self._heard else running
+        self._unheard = [job for job in running if not self._heard or job not in again]
         return again
 
     def remove(self, job: Job) -> bool:
@@ -202,10 +199,7 @@ class ServiceQueue:
             took_s = now - job.begun
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
-        if not self._heard:
-            self._heard = True
-            all_s = self.limit.takes_s * self.at_work
-            self._ask_at = now + max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * all_s)
+        self._heard = True
         self.free(job)
         if self._next is not None:  # only now does the service begin with it
             self._next.begun, self._next.level = now, self.at_work
@@ -267,8 +261,8 @@ class ServiceQueue:
 
     def overdue(self, job: Job, now: float) -> None:
         """Note that a running job is past its deadline; it keeps its slot for a while."""
-        patience_s = _ABANDONED_AFTER_S if self._heard else self._patience_s
-        self._overdue.append((now + min(patience_s, _ABANDONED_AFTER_S), job))
+        keeps_s = _ABANDONED_AFTER_S if self._heard else _UNHEARD_AFTER_S
+        self._overdue.append((now + keeps_s, job))
 
     def abandoned(self, now: float) -> list[Job]:
         """Return the overdue jobs whose response counts as lost; their slots are free."""
