@@ -7,7 +7,6 @@ the client that was made last vouches for those before it.
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Callable
 
 from fogft.errors import RosError
@@ -24,9 +23,7 @@ class Introduction:
         request: What changes nothing, serialised.
     """
 
-    def __init__(
-        self, client: RosClient, request: bytes, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, client: RosClient, request: bytes, clock: Callable[[], float]) -> None:
         self._client, self._request, self._clock = client, request, clock
         self._answered = False
         self._next_at, self._pause_s = 0.0, _AGAIN_AFTER_S

@@ -175,8 +175,6 @@ class ServiceQueue:
 
         One job stands for all, at ever longer intervals, until the service has answered anything.
         """
-        if not self._unheard:
-            return []
         running = [job for job in self._unheard if job.passed_on and job.waiting]
         usual_s = max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * self.limit.takes_s * self.at_work)
         again = [
