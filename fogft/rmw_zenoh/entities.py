@@ -177,6 +177,10 @@ class Client:
         """Whether any node offers this service."""
         return self.servers() > 0
 
+    def is_known(self) -> bool:
+        """Return True: a reply goes where its query came from."""
+        return True
+
     def mismatch(self) -> str:
         """Return nothing: only nodes of one middleware are in Zenoh's graph."""
         return ""

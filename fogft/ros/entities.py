@@ -13,18 +13,20 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
 from fogft.counters import Counters
 from fogft.errors import RosError
-from fogft.ros.pacing.pacer import NodeProbes, Pacer
-from fogft.ros.port import OnBurst
+from fogft.ros.pacing.pacer import EMPTY_LIST, NodeProbes, Pacer
+from fogft.ros.port import OnBurst, RosClient
 from fogft.ros.serialised import ClientEnd, ServiceEnd
 
 log = logging.getLogger(__name__)
 
 BURST = 128  # messages taken from one entity before the others get their turn
+_ASK_EVERY_S, _ASK_LIMIT_S = 0.5, 5.0
 
 
 class Server:
@@ -126,6 +128,56 @@ class Server:
             node.destroy_service(self._service)
 
 
+class ReadinessProbe:
+    """Whether the server of a service has discovered a client; if not, rmw drops its responses.
+
+    A process tells of its readers in the order of their making. So the server's node answers a
+    client that was made later only if it knows of the earlier one, too.
+
+    Args:
+        find: Returns the name of a service of that node that changes nothing and takes an empty
+            list: None while it is not discovered, empty where there is none to ask.
+        make: Creates a client of it.
+    """
+
+    def __init__(
+        self,
+        find: Callable[[], str | None],
+        make: Callable[[str], RosClient],
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._find, self._make, self._clock = find, make, clock
+        self._servers, self._passed = 0, True
+        self._ask_at = self._ends_at = 0.0
+        self._client: RosClient | None = None
+
+    def passed(self, servers: int) -> bool:
+        """Return whether it has, or cannot be known; `servers` are listed. Call at about 10 Hz."""
+        now = self._clock()
+        if servers > self._servers:  # one more than before is another one
+            self._passed, self._ask_at, self._ends_at = False, now, now + _ASK_LIMIT_S
+        self._servers = servers
+        if not self._passed and now >= self._ask_at:
+            self._ask(now)
+        if self._passed and self._client is not None:
+            self._client.close()
+            self._client = None
+        return self._passed
+
+    def _ask(self, now: float) -> None:
+        name = self._find() if self._client is None else None
+        if name == "" or now >= self._ends_at:
+            self._passed = True
+        elif name:
+            self._client = self._make(name)
+        if self._client is not None:
+            self._ask_at = now + _ASK_EVERY_S
+            self._client.call(EMPTY_LIST, self._heard)
+
+    def _heard(self, answer: bytes) -> None:
+        self._passed = True
+
+
 class Client:
     """A client of a node (`fogft.ros.port.RosClient`)."""
 
@@ -135,9 +187,12 @@ class Client:
         end: ClientEnd,
         withdraw: Callable[[Client], None],
         count: Callable[[str], int],
+        *,
         mismatch: Callable[[], str] = str,
+        probe: ReadinessProbe | None = None,
     ) -> None:
         self.handle = client.handle
+        self._probe = probe
         self._mismatch = mismatch
         self._trouble: tuple[int, str] = 0, ""  # with so many servers
         self._count = count
@@ -153,6 +208,12 @@ class Client:
         """Whether discovery has found a server."""
         with contextlib.suppress(Exception):  # rclpy's InvalidHandle: withdrawn meanwhile
             return bool(self._client.service_is_ready())
+        return False
+
+    def is_known(self) -> bool:
+        """Return whether the server has discovered this client, if that can be known."""
+        with contextlib.suppress(RosError):  # it is closed, or cannot be asked now
+            return self._probe is None or self._probe.passed(self.servers())
         return False
 
     def servers(self) -> int:

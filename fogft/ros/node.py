@@ -21,9 +21,9 @@ from fogft.errors import RosError
 from fogft.model import ros_names
 from fogft.model.topic import TopicSpec
 from fogft.ros import cyclone, spdp, topic_ends, vendors
-from fogft.ros.entities import Client, Server
+from fogft.ros.entities import Client, ReadinessProbe, Server
 from fogft.ros.joining import EarlyJoin, Timers, bare_node, new_context
-from fogft.ros.pacing.pacer import NodeProbes
+from fogft.ros.pacing.pacer import PROBED, PROBED_TYPE, NodeProbes
 from fogft.ros.port import OnBurst
 from fogft.ros.serialised import ClientEnd, ServiceEnd, self_test
 from fogft.ros.shared_memory import PortWatch
@@ -144,8 +144,12 @@ class SerialisedNode:
 
         def create() -> Client:
             client: Any = self._node.create_client(service_type, name, qos_profile=self._quality)
-            end, mismatch = ClientEnd(client, service_type), self._servers_mismatch
-            return Client(client, end, self._withdraw, self._count_servers, partial(mismatch, name))
+            find = partial(self._beside_server, PROBED, client.srv_name)
+            return Client(
+                *(client, ClientEnd(client, service_type), self._withdraw, self._count_servers),
+                mismatch=partial(self._servers_mismatch, name),
+                probe=ReadinessProbe(find, lambda asked: self.client(asked, PROBED_TYPE)),
+            )
 
         return self._add(name, create)
 
@@ -225,17 +229,25 @@ class SerialisedNode:
         else:
             find, topic = self._node.get_subscriptions_info_by_topic, f"rr{service}Reply"
         for end in self._endpoints(find, topic):
-            if bytes(end.endpoint_gid)[:16] != client:
-                continue
-            if end.node_name.startswith("_"):  # not known yet
-                topics = self._request_topics(what)
-            else:
-                topics = [f"rq{end.node_namespace.rstrip('/')}/{end.node_name}/{what}Request"]
-            found = [topic for topic in topics if self._reads(client[: spdp.PREFIX_BYTES], topic)]
-            if len(found) > 1:
-                return None
-            return found[0][len("rq") : -len("Request")] if found else ""
+            if bytes(end.endpoint_gid)[:16] == client:
+                return self._same_node(what, end)
         return None
+
+    def _beside_server(self, what: str, service: str) -> str | None:
+        """Return the same of the newest node that offers a service."""
+        readers = self._endpoints(self._node.get_subscriptions_info_by_topic, f"rq{service}Request")
+        return self._same_node(what, readers[-1]) if readers else None
+
+    def _same_node(self, what: str, end: Any) -> str | None:
+        process = bytes(end.endpoint_gid)[: spdp.PREFIX_BYTES]
+        if end.node_name.startswith("_"):  # not known yet
+            topics = self._request_topics(what)
+        else:
+            topics = [f"rq{end.node_namespace.rstrip('/')}/{end.node_name}/{what}Request"]
+        found = [topic for topic in topics if self._reads(process, topic)]
+        if len(found) > 1:
+            return None
+        return found[0][len("rq") : -len("Request")] if found else ""
 
     def _request_topics(self, what: str) -> list[str]:
         """Return the topics of requests to services of this last name, of all nodes."""

@@ -44,6 +44,12 @@ class RosClient(Protocol):
     def available(self) -> bool:
         """Whether discovery has found a server. Cheap; never blocks."""
 
+    def is_known(self) -> bool:
+        """Whether the server has discovered this client too; until then its responses are lost.
+
+        True where that cannot be known. Call it at about 10 Hz.
+        """
+
     def mismatch(self) -> str:
         """Return why none of the servers can be called; empty if one can. Cheap."""
 

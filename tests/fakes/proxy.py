@@ -11,7 +11,6 @@ from fogft.link.port import Answer, LinkStatus, Peer, Probe, ProbeAnswer
 from fogft.model.plain import to_plain
 from fogft.model.refusal import Refusal
 from fogft.model.replica import LinkState, ReplicaId
-from fogft.proxy.replica.introduction import Introduction
 from fogft.records.record import Record, RecordKind
 from fogft.records.roster import ServingLease
 from fogft.requests.load import Handling, Load
@@ -160,14 +159,16 @@ class FakeClient:
     """A client of a local service; the test answers."""
 
     def __init__(self) -> None:
-        self.there = True
+        self.there = self.known = True
         self.stranger = ""
         self.count = 1
         self.broken: RosError | None = None
-        self.found_us = True  # in discovery: what only asks for that is answered at once
         self.calls: list[tuple[bytes, Callable[[bytes], None]]] = []
         self.forgotten: list[int] = []
         self.closed = False
+
+    def is_known(self) -> bool:
+        return self.known
 
     def available(self) -> bool:
         return self.there
@@ -181,9 +182,6 @@ class FakeClient:
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         if self.broken is not None:
             raise self.broken
-        if self.found_us and isinstance(getattr(on_response, "__self__", None), Introduction):
-            on_response(b"")
-            return 0
         self.calls.append((payload, on_response))
         return len(self.calls)
 

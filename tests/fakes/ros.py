@@ -159,6 +159,9 @@ class MemoryClient:
         """How many responses are awaited."""
         return len(self._pending)
 
+    def is_known(self) -> bool:
+        return True
+
     def available(self) -> bool:
         """Whether somebody serves this name with this type."""
         return self.servers() > 0

@@ -52,6 +52,9 @@ class EchoNode:
     def offered(self) -> Mapping[str, str]:
         return {}
 
+    def is_known(self) -> bool:
+        return True
+
     def available(self) -> bool:
         return True
 

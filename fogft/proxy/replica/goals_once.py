@@ -9,7 +9,6 @@ has. Not here: the action's other services (`responder`).
 
 import logging
 import math
-import secrets
 import threading
 import time
 from collections import OrderedDict
@@ -21,7 +20,6 @@ from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.model.spec import Part, ServiceSpec
-from fogft.proxy.replica.introduction import Introduction
 from fogft.proxy.replica.responder import OUTSTANDING
 from fogft.ros.port import RosClient
 from fogft.topics import goals
@@ -61,7 +59,6 @@ class _ActionServer:
         self.death = "", -math.inf  # what part was seen to be gone, and when
         self.open: dict[bytes, _Open] = {}  # oldest first
         self.accepted: OrderedDict[bytes, bytes] = OrderedDict()
-        self.introduction: Introduction | None = None
 
     @property
     def queue(self) -> list[bytes]:
@@ -104,15 +101,6 @@ class GoalsOnce:
     def use(self, clients: Mapping[str, RosClient]) -> None:
         """Set the clients of the local services."""
         self._clients = clients
-        nobodys = goals.cancel_request(secrets.token_bytes(16))
-        for name, server in self._servers.items():
-            cancel = clients.get(f"{name.rpartition('/')[0]}/cancel_goal")
-            server.introduction = Introduction(cancel, nobodys, self._clock) if cancel else None
-
-    def introduced(self, service: str) -> bool:
-        """Whether an action server has found us, so that its answer to a goal will arrive."""
-        server = self._servers.get(service)
-        return server is None or server.introduction is None or server.introduction.done()
 
     # -- from the wire --------------------------------------------------------------------
 
@@ -250,7 +238,6 @@ class GoalsOnce:
                     server.death = service, now
                     server.accepted.clear()
                     ended, server.open = server.open, {}
-                    server.introduction = server.introduction and server.introduction.anew()
                 self._refuse(name, ended.values(), Refusal.CRASHED)
 
     def left_ros(self) -> None:

@@ -16,7 +16,6 @@ from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.orders import Op, OrderError
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
-from fogft.proxy.replica.introduction import Introduction
 from fogft.ros.port import RosClient
 from fogft.ros.state_bytes import StateBytes
 
@@ -48,7 +47,6 @@ class OrderedResponder:
         self._lock = threading.Lock()
         self._machine: OrderedReplica[Incoming] = OrderedReplica()
         self._clients: Clients | None = None
-        self._introduction: Introduction | None = None
         self._begun: Begin | None = None
         self._begun_at = 0.0
         self._again: Begin | None = None  # ROS did not take it: it is tried again
@@ -65,9 +63,7 @@ class OrderedResponder:
         return self._machine.in_flight
 
     def use(self, clients: Clients | None) -> None:
-        """Set the clients of the local services, the snapshot's made last; None without a node."""
-        request = self._state.snapshot_request()
-        self._introduction = clients and Introduction(clients.snapshot, request, self._clock)
+        """Set the clients of the local services; None without a ROS node."""
         with self._lock:
             self._clients = clients
             self._machine.serving = False
@@ -161,10 +157,10 @@ class OrderedResponder:
 
     def tick(self, alive: bool) -> None:
         """Look for the services, and retry calls that ROS rejected. Call at about 10 Hz."""
-        introduced = self._introduction is not None and self._introduction.done()
+        clients = self._clients
+        known = [client.is_known() for client in clients or ()]  # all are asked at once
+        there = clients is not None and all(known) and all(c.available() for c in clients)
         with self._lock:
-            clients = self._clients
-            there = introduced and all(client.available() for client in clients or ())
             self._machine.serving = alive and there
             again, self._again = self._again, None
             begun = self._begun

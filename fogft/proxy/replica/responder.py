@@ -337,9 +337,6 @@ class Responder:
         with self._lock:
             late = self.known.expired(now)
             abandoned = [job for queue in self._queues.values() for job in queue.abandoned(now)]
-            again = [job for queue in self._queues.values() for job in queue.unheard(now)]
-            for job in again:
-                job.payload = job.waiting[0].payload if job.waiting else b""
             for name, queue in self._queues.items():
                 if queue.held_until <= now:
                     log.warning("cancel_unanswered service=%s waited_s=%.1f", name, HOLD_LIMIT_S)
@@ -348,11 +345,6 @@ class Responder:
             self._end(id, Refusal.EXPIRED)
         for job in abandoned:
             self._forget_ticket(job)
-        for job in again:
-            log.warning(
-                "service_asked_again service=%s after_s=%.1f", job.service, now - job.arrived
-            )
-            self._call(job)
         for service in list(self._queues):
             self._pass_on(service)
 

@@ -203,10 +203,11 @@ class ServerProxy:
                 self.responder.crashed(name)
 
     def _can_call(self, name: str, client: RosClient) -> bool:
+        known = client.is_known()  # asked of each server, so before they are there
         if not client.available():
             return False
         self._note(name, client.mismatch())
-        return name not in self._not_usable and self._goals.introduced(name)
+        return known and name not in self._not_usable
 
     def _note(self, name: str, trouble: str) -> None:
         """Keep, and log once, why a service cannot be called here; empty for nothing."""
@@ -300,9 +301,8 @@ class ServerProxy:
         for service in services:
             made = service.name in self._clients and service.name in self._ordered
             if made and service.state is not None:
-                ends = (service.state.restore, service.state.snapshot)
-                # The snapshot's is the last: see `Introduction`.
-                restore, snapshot = (node.client(end.name, end.type) for end in ends)
+                ends = (service.state.snapshot, service.state.restore)
+                snapshot, restore = (node.client(end.name, end.type) for end in ends)
                 clients = Clients(self._clients[service.name], snapshot, restore)
                 self._ordered[service.name].use(clients)
 

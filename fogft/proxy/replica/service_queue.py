@@ -25,9 +25,6 @@ _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
-# A service that has just begun may not have found us yet when it responds: then rmw drops the
-# response. After so long, and so many times what its work usually takes, we ask once more.
-_UNHEARD_AFTER_S, _UNHEARD_TIMES = 2.0, 3.0
 # While others wait, a request needs so many times what one usually takes, but no more than that
 # share of the longest time that one was given here: what takes longer than most comes too late.
 _TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
@@ -83,8 +80,6 @@ class ServiceQueue:
         self._quiet_since: float | None = None  # it has work, and has ended none since
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
         self._last_deadline = 0.0
-        self._heard = False  # this process of the service has answered
-        self._unheard: list[Job] = []  # passed on before it had, the oldest first
         self.held_until = NEVER  # nothing is begun before, or before `release`
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
@@ -167,25 +162,6 @@ class ServiceQueue:
         job.passed_on, job.begun, job.level = True, now, self.at_work
         if self.at_work > self.limit.limit:
             self._next = job
-        if not self._heard:
-            self._unheard.append(job)
-
-    def unheard(self, now: float) -> list[Job]:
-        """Return what to pass on once more, because its response may be lost.
-
-        One job stands for all, at ever longer intervals, until the service has answered anything.
-        """
-        running = [job for job in self._unheard if job.passed_on and job.waiting]
-        usual_s = max(_UNHEARD_AFTER_S, _UNHEARD_TIMES * self.limit.takes_s * self.at_work)
-        again = [
-            job
-            for job in (running if self._heard else running[:1])
-            if now < job.deadline and now - job.begun >= max(usual_s, 0.75 * (now - job.arrived))
-        ]
-        for job in again:
-            job.begun = now
-        self._unheard = [job for job in running if not self._heard or job not in again]
-        return again
 
     def remove(self, job: Job) -> bool:
         """Remove a waiting job; return whether it was waiting."""
@@ -197,7 +173,6 @@ class ServiceQueue:
             took_s = now - job.begun
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
-        self._heard = True
         self.free(job)
         if self._next is not None:  # only now does the service begin with it
             self._next.begun, self._next.level = now, self.at_work
@@ -255,12 +230,10 @@ class ServiceQueue:
         self.release()
         self._quiet_since, self._unanswered, self._next = None, 0, None
         self._longest_s = self._last_deadline = 0.0
-        self._heard, self._unheard = False, []
 
     def overdue(self, job: Job, now: float) -> None:
         """Note that a running job is past its deadline; it keeps its slot for a while."""
-        keeps_s = _ABANDONED_AFTER_S if self._heard else _UNHEARD_AFTER_S
-        self._overdue.append((now + keeps_s, job))
+        self._overdue.append((now + _ABANDONED_AFTER_S, job))
 
     def abandoned(self, now: float) -> list[Job]:
         """Return the overdue jobs whose response counts as lost; their slots are free."""

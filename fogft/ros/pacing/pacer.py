@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 _ASK_EVERY_S, _ASK_LIMIT_S, _ASK_AGAIN_S = 0.02, 2.0, 10.0
 _LOOK_EVERY_S = 0.2
 _GUID_BYTES = 16
-_SERVICE, _TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTypes"
-_OF_NO_PARAMETER = b"\x00\x01\x00\x00" + bytes(4)  # a list of names, which is empty
+PROBED, PROBED_TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTypes"
+EMPTY_LIST = b"\x00\x01\x00\x00" + bytes(4)  # of names of parameters
 KEPT = 64
 
 
@@ -56,7 +56,7 @@ class NodeProbes:
 
     def answers(self, service: str, client: bytes) -> bool | None:
         """Whether the node of a service's client answers probes; None while it is not known."""
-        asked = self._same_node_serves(_SERVICE, service, client)
+        asked = self._same_node_serves(PROBED, service, client)
         if not asked:
             return None if asked is None else False
         with self._lock:
@@ -65,7 +65,7 @@ class NodeProbes:
                 if len(self._by_name) >= KEPT:
                     self._by_name.pop(next(iter(self._by_name))).close()
                 try:
-                    end = self._by_name[asked] = self._make_client(asked, _TYPE)
+                    end = self._by_name[asked] = self._make_client(asked, PROBED_TYPE)
                 except RosError:
                     return False
             if not end.available():
@@ -82,7 +82,7 @@ class NodeProbes:
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
         """Try to send a probe; `on_answer` is called from the take loop, or never."""
         with contextlib.suppress(KeyError, RosError):
-            self._by_client[client].call(_OF_NO_PARAMETER, lambda _: on_answer())
+            self._by_client[client].call(EMPTY_LIST, lambda _: on_answer())
 
 
 class Pacer:

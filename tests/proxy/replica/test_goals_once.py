@@ -9,7 +9,6 @@ import pytest
 from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.goals_once import GoalsOnce
-from fogft.topics.goals import names_one
 from tests.fakes.proxy import Clock, FakeClient, FakeIncoming
 
 SERVICE = "/count/_action/send_goal"
@@ -84,10 +83,10 @@ def test_a_goal_that_is_begun_as_its_action_server_dies_is_not_given_to_the_next
 
     class Dying(dict):
         def get(self, service: str) -> FakeClient:
-            if service == SERVICE and death.ident is None:
+            if death.ident is None:
                 death.start()
                 death.join(0.2)  # or until then, where it has to wait for us
-            return super().get(service) if death.is_alive() else after
+            return self[service] if death.is_alive() else after
 
     death = Thread(target=die)
     scene.goals.use(Dying(scene.clients))
@@ -95,29 +94,6 @@ def test_a_goal_that_is_begun_as_its_action_server_dies_is_not_given_to_the_next
     death.join()
     assert given.outcome == ["refused crashed"]
     assert after.calls == []
-
-
-def test_an_action_server_is_given_goals_once_it_has_found_us_and_each_life_anew():
-    """Until then its answer to a goal would be lost. It is asked to cancel a goal of nobody's."""
-    scene, cancel = Scene(), FakeClient()
-    cancel.found_us = False
-    scene.goals.use({**scene.clients, "/count/_action/cancel_goal": cancel})
-
-    def introduced_after(seconds: float) -> tuple[bool, int]:
-        scene.clock.now += seconds
-        return scene.goals.introduced(SERVICE), len(cancel.calls)
-
-    assert [introduced_after(s) for s in (0.0, 0.9, 0.2, 2.0)] == [(False, n) for n in (1, 1, 2, 2)]
-    assert names_one(cancel.calls[0][0])
-    assert scene.goals.introduced(OTHER)  # without a cancel service there is nothing to ask
-    cancel.calls[0][1](b"")
-    assert introduced_after(0.0) == (True, 2)
-    scene.goals.crashed(OTHER)
-    assert introduced_after(9.0) == (True, 2)
-    scene.goals.crashed(SERVICE)
-    assert introduced_after(0.0) == (False, 3)
-    cancel.calls[1][1](b"")  # said by the one before
-    assert introduced_after(0.0) == (False, 3)
 
 
 def test_an_acceptance_that_nobody_waits_for_is_remembered():

@@ -132,16 +132,14 @@ def test_the_first_answer_is_returned_and_the_others_apply_all_the_same(scene):
 
 def test_a_service_is_given_nothing_until_it_has_found_us(scene):
     """Its response would be lost, and the replica would wait for it for ever."""
-    scene.clients[1].snapshot.found_us = False
-    scene.responders[1].use(scene.clients[1])
+    scene.clients[1].restore.known = False
     scene.responders[1].tick(alive=True)
     scene.run()
     scene.dispatcher.submit(b"q1", "h1")
     scene.run()
     assert [len(clients.service.calls) for clients in scene.clients] == [1, 0]
     assert not scene.responders[1].ready
-    (_, on_response), *_ = scene.clients[1].snapshot.calls
-    on_response(b"")
+    scene.clients[1].restore.known = True
     scene.responders[1].tick(alive=True)
     scene.run()
     assert scene.serve(1, b"a1") == b"q1"

@@ -184,60 +184,6 @@ def test_few_copies_of_one_request_are_held():
     assert copies[-1].outcome == [b"r"]
 
 
-def test_a_service_that_has_just_begun_is_asked_again_until_it_has_answered():
-    """It may find us later than we find it, and its responses until then are lost."""
-    scene = Scene(limits={"/s": 2})
-
-    def asked_after(seconds: float) -> list[bytes]:
-        before = len(scene.client.calls)
-        scene.clock.now += seconds
-        scene.responder.tick()
-        return [payload for payload, _ in scene.client.calls[before:]]
-
-    first = scene.ask(A, payload=b"1", remaining_s=60.0)
-    second = scene.ask(B, payload=b"2", remaining_s=60.0)
-    assert asked_after(1.9) == []
-    assert asked_after(0.2) == [b"1"]  # one stands for both
-    assert asked_after(5.9) == []
-    assert asked_after(1.0) == [b"1"]
-    scene.clock.now += 0.1
-    scene.answer(3, b"r1")
-    assert asked_after(0.1) == [b"2"]
-    scene.answer(4, b"r2")
-    scene.answer(0, b"late")
-    assert (first.outcome, second.outcome) == ([b"r1"], [b"r2"])
-    for number in (5, 6):
-        third = scene.ask(b"%016d" % number, remaining_s=900.0)
-        assert asked_after(1.0 if number == 5 else 800.0) == []
-        scene.answer(number)
-    assert third.outcome == [b"r"]
-    assert third.load.service_s <= 1.0  # what was lost is not taken for slow
-
-
-def test_a_service_that_begins_with_many_requests_is_given_time_for_them():
-    scene = Scene()
-    asked = [scene.ask(b"%016d" % number, remaining_s=60.0) for number in range(8)]
-    for second in range(8):
-        for _ in range(5):
-            scene.clock.now += 0.3
-            scene.responder.tick()
-        scene.answer(second)
-    assert [one.outcome for one in asked] == [[b"r"]] * 8
-    assert len(scene.client.calls) == 8
-
-
-def test_what_a_service_that_has_just_begun_lost_takes_no_room_for_long():
-    """Where callers give up before it is asked again: else it would get nothing for a minute."""
-    scene = Scene(limits={"/s": 1})
-    first, second = scene.ask(A, remaining_s=1.0), scene.ask(B, remaining_s=60.0)
-    for _ in range(35):
-        scene.clock.now += 0.1
-        scene.responder.tick()
-    assert first.outcome == ["refused expired"]
-    scene.answer(1)
-    assert second.outcome == [b"r"]
-
-
 def test_a_reply_that_cannot_be_sent_keeps_no_room():
     """What waits for it goes on, and the next requests too."""
     scene = Scene(limits={"/s": 1})

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from fogft.link.port import Probe
 from fogft.model.plain import from_plain, to_plain
 from fogft.model.replica import ReplicaId
@@ -58,9 +60,10 @@ def test_ready_when_the_command_lives_and_the_service_is_discovered():
     assert scene.probe().ready == {"/s"}
 
 
-def test_not_ready_while_discovery_does_not_find_the_service():
+@pytest.mark.parametrize("what", ["there", "known"])
+def test_not_ready_while_discovery_does_not_find_the_service_or_it_us(what):
     scene = Scene()
-    scene.client().there = False
+    setattr(scene.client(), what, False)
     scene.proxy.run_once()
     answer = scene.probe()
     assert answer.ready == frozenset()
