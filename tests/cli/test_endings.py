@@ -126,8 +126,11 @@ def test_a_reader_that_left_gets_no_trace():
 def test_control_c_while_it_waits_is_one_line(tmp_path):
     """A real SIGINT to a real process: one line, status 130, no trace."""
     code = (
-        "import signal; from fogft.cli import main; from fogft.pool.commands import composition\n"
-        "composition.store_of = lambda name: (print('waiting', flush=True), signal.pause())\n"
+        "import time; from fogft.cli import main; from fogft.pool.commands import composition\n"
+        "def wait(name):\n"
+        "    print('waiting', flush=True)\n"
+        "    while True: time.sleep(0.1)\n"
+        "composition.store_of = wait\n"
         "main.main(['drain', '0'])"
     )
     with subprocess.Popen(

@@ -313,9 +313,9 @@ def test_a_node_leaves_the_process_as_it_was(ros_domain: int, tmp_path: Path) ->
 def test_a_process_that_forgets_to_close_still_ends(ros_domain: int) -> None:
     """An interrupted process ends: the take loop holds nobody back."""
     child = (
-        "import signal; from fogft.ros.node import SerialisedNode\n"
+        "import time; from fogft.ros.node import SerialisedNode\n"
         f"node = SerialisedNode('child', {ros_domain}); print('up', flush=True)\n"
-        "signal.pause()"
+        "while True: time.sleep(0.1)"
     )
     process = subprocess.Popen(
         [sys.executable, "-c", child], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

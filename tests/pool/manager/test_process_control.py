@@ -33,7 +33,7 @@ if "lingering" in sys.argv:
     signal.signal(signal.SIGTERM, lambda number, frame: lock.release())
 print("held", flush=True)
 while True:
-    signal.pause()
+    time.sleep(0.1)
 """
 
 

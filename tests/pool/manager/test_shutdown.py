@@ -213,7 +213,7 @@ def test_a_standby_that_is_only_starting_is_ended_too(scene: Scene) -> None:
 
 
 HAND_OVER = """
-import signal, sys
+import signal, sys, time
 from pathlib import Path
 from fogft import disk
 
@@ -225,7 +225,8 @@ signal.signal(signal.SIGTERM, told)
 lock = disk.Lock(Path(sys.argv[1]))
 lock.acquire(wait=True)
 print("works", flush=True)
-signal.pause()
+while True:
+    time.sleep(0.1)
 """
 
 
