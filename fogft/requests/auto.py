@@ -13,13 +13,13 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import NEW, Demand, Load
+from fogft.requests.load import Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
 _DOUBTED_TRIAL_EVERY_S = 1.0
-# More often while it is new: a first call may take seconds, and would bar all others.
-_NEW_TRIAL_EVERY_S = 0.1
+# More often at first: a first call may take seconds, and would bar all others.
+_FIRST_TRIALS, _FIRST_TRIAL_EVERY_S = 5, 0.1
 # Of spare copies, in service times:
 _REMEMBERED = 1000.0  # for how long it counts what they saved and cost
 _REMEMBERED_MOST = 10.0  # how much more they saved than they cost counts at most
@@ -129,7 +129,7 @@ class Auto(Learning):
         stale = []
         for replica in able:
             known = self._replicas[replica]
-            every_s = _NEW_TRIAL_EVERY_S if known.told < NEW else TRIAL_EVERY_S
+            every_s = _FIRST_TRIAL_EVERY_S if known.told < _FIRST_TRIALS else TRIAL_EVERY_S
             if known.doubted or known.asked_at <= now - every_s:
                 stale.append(replica)
         return stale
