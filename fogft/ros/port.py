@@ -47,7 +47,7 @@ class RosClient(Protocol):
     def is_known(self) -> bool:
         """Whether the server has discovered this client too; until then its responses are lost.
 
-        True where that cannot be known. Call it at about 10 Hz.
+        True where that cannot be known. One thread calls it, at about 10 Hz.
         """
 
     def mismatch(self) -> str:
