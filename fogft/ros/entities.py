@@ -165,11 +165,13 @@ class ReadinessProbe:
         return self._passed
 
     def _ask(self, now: float) -> None:
-        name = self._find() if self._client is None else None
-        if name == "" or now >= self._ends_at:
+        if now >= self._ends_at:
             self._passed = True
-        elif name:
-            self._client = self._make(name)
+            return
+        if self._client is None:
+            name = self._find()
+            self._passed = name == ""
+            self._client = self._make(name) if name else None
         if self._client is not None:
             self._ask_at = now + _ASK_EVERY_S
             self._client.call(EMPTY_LIST, self._heard)

@@ -234,7 +234,7 @@ class SerialisedNode:
         return None
 
     def _beside_server(self, what: str, service: str) -> str | None:
-        """Return the same of the newest node that offers a service."""
+        """Return the same of a node that offers a service: of the last that discovery lists."""
         readers = self._endpoints(self._node.get_subscriptions_info_by_topic, f"rq{service}Request")
         return self._same_node(what, readers[-1]) if readers else None
 

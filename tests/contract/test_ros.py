@@ -242,6 +242,7 @@ def test_available_follows_the_service(world: World) -> None:
     assert not client.available()
     server = server_node.serve("/comes", SET_BOOL, lambda *_: None)
     world.wait_for(client.available, "the service to be found")
+    world.wait_for(client.is_known, "the service to find its client")
     server.close()
     world.wait_for(lambda: not client.available(), "the service to be gone")
 

@@ -27,9 +27,6 @@ class End:
         self.closed = False
         self.asked: list[Callable[[bytes], None]] = []
 
-    def is_known(self) -> bool:
-        return True
-
     def available(self) -> bool:
         return self.found
 
