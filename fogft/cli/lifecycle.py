@@ -214,8 +214,7 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
         told(f"{len(swept)} shared-memory files of dead processes")
     if elsewhere:
-        left = f"nothing of `{store.name}` remains on this machine"
-        output.done(f"{left}; another machine manages it")
+        output.done(f"`{store.name}` is removed here; another machine manages it")
         return
     output.done(f"`{store.name}` is shut down; nothing is left")
     if paid and not composition.pools():

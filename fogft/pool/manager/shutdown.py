@@ -45,8 +45,7 @@ def end(
     """
     paths = store.paths
     if paths.exported.exists():
-        with without_client_proxy(paths, told):
-            shutil.rmtree(paths.folder)
+        _end_exported(paths, told)
         return
     store.identity()
     with disk.locked(paths.intent_lock), contextlib.ExitStack() as kept:
@@ -71,7 +70,23 @@ def end(
         # The identity first: from here on there is no such pool.
         with contextlib.suppress(OSError):  # what stands in its place is no file
             paths.identity.unlink()
-        shutil.rmtree(paths.folder, ignore_errors=True)
+        _remove(paths.folder)
+
+
+def _end_exported(paths: PoolPaths, told: Callable[[str], None]) -> None:
+    with disk.locked(paths.intent_lock):
+        if not paths.exported.exists():
+            raise FogftError(f"`{paths.folder}` has just changed", "run `fogft down` again")
+        # A manager that has just stepped back may still be running, and writing.
+        with without_manager(paths, told), without_client_proxy(paths, told):
+            _remove(paths.folder)
+
+
+def _remove(folder: Path) -> None:
+    for _ in range(_TRIES):  # a command may be writing to it
+        shutil.rmtree(folder, ignore_errors=True)
+    if folder.exists():
+        raise FogftError(f"`{folder}` cannot be removed", "it contains the pool's keys: remove it")
 
 
 def without_manager(

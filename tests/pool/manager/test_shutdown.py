@@ -245,3 +245,47 @@ def test_a_proxy_that_is_ended_finds_nobody_to_hand_over_to(scene: Scene) -> Non
     finally:
         proxy.kill()
         proxy.communicate()
+
+
+WRITE = """
+import itertools, sys
+from pathlib import Path
+from fogft import disk
+
+lock = disk.Lock(Path(sys.argv[1]))
+lock.acquire(wait=True)
+for number in itertools.count():
+    path = Path(sys.argv[1]).parent / f"file.{number % 100}"
+    try:
+        path.touch()
+    except OSError:  # no folder
+        break
+    if number == 100:
+        print("writes", flush=True)
+"""
+
+
+def test_a_manager_that_has_just_stepped_back_leaves_no_file(scene: Scene) -> None:
+    """It finds that another machine manages the pool, and still writes as it ends."""
+    scene.write()
+    scene.paths.identity.rename(scene.paths.exported)
+    manager = subprocess.Popen(
+        [sys.executable, "-c", WRITE, scene.paths.manager_lock], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert manager.stdout is not None
+        assert manager.stdout.readline() == "writes\n"
+        assert scene.end() == [f"manager (pid {manager.pid})"]
+        assert not scene.paths.folder.exists()
+        assert manager.wait(30) == -signal.SIGTERM
+    finally:
+        manager.kill()
+        manager.communicate()
+
+
+def test_files_that_stay_are_told(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """There may be keys among them."""
+    scene.write()
+    monkeypatch.setattr(shutdown.shutil, "rmtree", lambda *_, **__: None)
+    with pytest.raises(FogftError, match="cannot be removed"):
+        scene.end()
