@@ -7,7 +7,6 @@ import contextlib
 import errno
 import json
 import os
-import select
 import sys
 import tempfile
 import time
@@ -15,6 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
+from fogft import poll
 from fogft.errors import StateError
 from fogft.model.plain import stored
 
@@ -218,10 +218,9 @@ def _wait_for_end(descriptor: int) -> None:
     with contextlib.suppress(OSError, ValueError, AttributeError), contextlib.ExitStack() as stack:
         pid = int(os.pread(descriptor, _PID_BYTES, 0))
         if not is_running(pid):
-            process, ended = os.pidfd_open(pid), select.poll()
+            process = os.pidfd_open(pid)
             stack.callback(os.close, process)
-            ended.register(process, select.POLLIN)
-            ended.poll(_ENDING_S * 1000)
+            poll.is_ready(process, _ENDING_S)
 
 
 def is_running(pid: int) -> bool:

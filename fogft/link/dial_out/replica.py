@@ -5,12 +5,12 @@ place. Not here: the door (`robot`), the listener (`listener`).
 """
 
 import logging
-import select
 import socket
 import threading
 import time
 from collections.abc import Iterable, Mapping
 
+from fogft import poll
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
 from fogft.link.dial_out.tunnel import GREETING_TIMEOUT_S, Tunnels, hang_up, keep_alive
@@ -99,7 +99,7 @@ class DialOut:
         """Wait until the connection is taken into use; return False where we are to leave."""
         heard_at = time.monotonic()
         while not stop.is_set():
-            if select.select([link], [], [], SIGN_EVERY_S)[0]:
+            if poll.is_ready(link, SIGN_EVERY_S):
                 data = link.recv(1)
                 if data == GO:
                     link.sendall(GO)

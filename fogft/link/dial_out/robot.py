@@ -8,13 +8,13 @@ the TLS server, end to end, so the door can neither read nor change what passes.
 import contextlib
 import logging
 import secrets
-import select
 import socket
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 
+from fogft import poll
 from fogft.counters import Counters
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.tunnel import (
@@ -163,7 +163,7 @@ class DialIn:
         """Exchange signs of life; return why it ended, empty where it was taken into use."""
         heard_at = time.monotonic()
         while True:
-            readable = select.select([one.link], [], [], SIGN_EVERY_S)[0]
+            readable = poll.is_ready(one.link, SIGN_EVERY_S)
             with one.lock:
                 if one.taken:
                     return ""

@@ -17,6 +17,7 @@ import time
 from collections.abc import Iterator
 from itertools import chain
 
+from fogft import poll
 from fogft.link.socket_progress import Flow
 
 Address = tuple[str, int]
@@ -160,9 +161,7 @@ def flow(connection: socket.socket) -> Flow | None:
 
 def takes_more(connection: socket.socket) -> bool:
     """Whether the kernel's send buffer has room."""
-    waiting = select.poll()
-    waiting.register(connection, select.POLLOUT)
-    return bool(waiting.poll(0))
+    return poll.is_ready(connection, event=select.POLLOUT)
 
 
 def keep_short(connection: socket.socket) -> None:

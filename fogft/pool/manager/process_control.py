@@ -6,14 +6,13 @@ signalled.
 
 import contextlib
 import os
-import select
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from fogft import disk
+from fogft import disk, poll
 
 POLL_S = 0.05
 
@@ -61,9 +60,7 @@ def call_at_end(pid: int, call: Callable[[], None]) -> None:
     def wait() -> None:
         with _opened(pid) as descriptor:
             if descriptor is not None:
-                ended = select.poll()
-                ended.register(descriptor, select.POLLIN)
-                ended.poll()
+                poll.is_ready(descriptor, None)
             elif Path("/proc", str(pid)).exists():
                 return
             call()
@@ -73,7 +70,7 @@ def call_at_end(pid: int, call: Callable[[], None]) -> None:
 
 def _is_alive(descriptor: int | None) -> bool:
     """Whether a process has not ended; a zombie has. False where the kernel cannot tell."""
-    return descriptor is not None and not select.select([descriptor], [], [], 0)[0]
+    return descriptor is not None and not poll.is_ready(descriptor)
 
 
 def _send(pid: int, descriptor: int | None, number: signal.Signals) -> None:

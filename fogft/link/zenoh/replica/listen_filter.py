@@ -9,12 +9,12 @@ in `door`.
 import contextlib
 import ctypes
 import ipaddress
-import select
 import socket
 import struct
 import time
 from collections.abc import Iterable
 
+from fogft import poll
 from fogft.link.zenoh import sockets
 
 HOSTS_LIMIT = 32  # where more are to be kept out, all are
@@ -45,9 +45,7 @@ class ListenFilter:
         if self._listening is None:
             time.sleep(timeout_s)
             return False
-        waiting = select.poll()
-        waiting.register(self._listening, select.POLLIN)
-        return bool(waiting.poll(timeout_s * 1e3))
+        return poll.is_ready(self._listening, timeout_s)
 
     def turn_away(self) -> None:
         """Close the connections that Zenoh has not accepted yet."""

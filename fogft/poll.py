@@ -1,0 +1,23 @@
+"""Wait for a file descriptor of any number: `select.select` takes none above 1023."""
+
+import select
+from typing import Protocol
+
+
+class _Open(Protocol):
+    def fileno(self) -> int: ...
+
+
+def is_ready(
+    file: int | _Open, timeout_s: float | None = 0.0, *, event: int = select.POLLIN
+) -> bool:
+    """Wait until a file, socket or pidfd can be read without waiting; return whether it can.
+
+    Also true where that would fail, as of one that is closed. None: no time limit.
+    """
+    waiting = select.poll()
+    try:
+        waiting.register(file, event)
+    except ValueError:
+        return True
+    return bool(waiting.poll(None if timeout_s is None else timeout_s * 1e3))
