@@ -202,6 +202,11 @@ class Lock:
         except FileNotFoundError:
             return False
 
+    @property
+    def lost(self) -> bool:
+        """Whether its file was removed while we hold it: another may hold that of a new one."""
+        return self._descriptor is not None and not os.fstat(self._descriptor).st_nlink
+
     def release(self) -> None:
         """Give the lock back. Repeatable."""
         descriptor, self._descriptor = self._descriptor, None
@@ -301,7 +306,10 @@ def said_holder(lock: Path) -> int | None:
 
 def unwritable(folder: Path) -> str:
     """Say why a folder's disk takes nothing more, `full` or `read-only`; else empty."""
-    seen = os.statvfs(folder)
+    try:
+        seen = os.statvfs(folder)
+    except OSError:
+        return ""  # it has just been removed
     if seen.f_flag & os.ST_RDONLY:
         return "read-only"
     no_room = seen.f_bavail * seen.f_frsize < _ROOM_BYTES or (seen.f_files and not seen.f_favail)

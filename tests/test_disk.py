@@ -280,3 +280,21 @@ def test_a_disk_that_takes_nothing_more_is_known_and_a_report_is_written_on_a_fu
         [why, reported, "free", "True", "False"]
         for why, reported in (("", "free"), ("full", "full"), ("", "free"), ("read-only", "free"))
     ], done.stderr
+
+
+def test_a_lock_whose_file_was_removed_is_lost(tmp_path):
+    """Another may hold that of a new file in its place."""
+    lock = disk.Lock(tmp_path / "lock")
+    assert not lock.lost
+    assert lock.acquire(wait=False)
+    assert not lock.lost
+    (tmp_path / "lock").unlink()
+    assert lock.lost
+    (tmp_path / "lock").touch()
+    assert lock.lost
+    lock.release()
+    assert not lock.lost
+
+
+def test_a_folder_that_has_just_been_removed_is_not_full(tmp_path):
+    assert disk.unwritable(tmp_path / "gone") == ""

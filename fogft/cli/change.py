@@ -116,9 +116,9 @@ def _scale(pool: str | None, by: int, *, wait: bool) -> None:
     from fogft.pool.commands.outcome import Settled
 
     store = composition.store_of(pool)
-    spec = store.spec()
-    wishes = change(store, lambda now: intent.scale(now, spec, by))
+    wishes = change(store, lambda now: intent.scale(now, store.spec(), by))
     since = time.time()  # what was seen before says nothing of it
+    spec = store.spec()
     before, after = (one.wanted(spec) for one in wishes)
     if wait:
         progress.settle(store, Settled(since), f"does not have {after} replicas")

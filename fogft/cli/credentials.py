@@ -216,14 +216,14 @@ def export(
 
     passphrase, is_new = _chosen_passphrase(passphrase_file)
     store = composition.store_of(pool)
+    if is_new:  # before the file is all that is left
+        output.say(f"passphrase: {passphrase}")
     identity = moving.export(
         *(store, home(), file, passphrase, time.time()),
         open_for_s=hours * 3600,
         told=lambda what: output.say(f"ended {what}"),
     )
     output.data(str(file))
-    if is_new:
-        output.say(f"passphrase: {passphrase}")
     output.done(f"`{pool}` is exported; this machine no longer manages it")
     if identity.cloud != composition.LOCAL:
         output.warn(
@@ -248,12 +248,13 @@ def import_(
     Starts its manager here, and deletes the file. If copies are imported on several machines, all
     but one stop once a replica tells them, within a minute.
     """
-    from fogft.pool.commands import moving, startup
+    from fogft.pool.commands import joining, moving, startup
 
     passphrase = _read_passphrase(passphrase_file)
     disk.make_folder(home())
     store = moving.import_(file, passphrase, home(), time.time(), pool_file=pool_file)
     startup.start_manager(store)
+    joining.destroy(file)
     output.done(f"this machine manages `{store.name}`")
     output.hint(f"`fogft credentials rotate robot --pool {store.name}` locks the old machine out")
 
@@ -299,4 +300,7 @@ def _read_passphrase(file: Path | None) -> str:
         )
     import getpass
 
-    return getpass.getpass("passphrase: ").strip()
+    try:
+        return getpass.getpass("passphrase: ").strip()
+    except EOFError:
+        raise FogftError("no passphrase was given") from None

@@ -94,6 +94,11 @@ def _run(args: Sequence[str]) -> int:
     except usage_error as problem:
         _explain_usage(problem)
         return 2
+    except OSError as problem:
+        if problem.filename is None:  # a connection's, not a file's
+            raise
+        output.error(f"`{problem.filename}`: {problem.strerror}", "check its owner, and the disk")
+        return 1
     return 0
 
 

@@ -193,9 +193,7 @@ def install(
     where = units.services(system=system)
     wanted = _units(pool, gateway, rendezvous, system=system)
     paths = None if gateway or rendezvous else composition.paths_of(pool)
-    if paths is not None:
-        units.yield_to(paths)
-    refused = units.install(where, wanted)
+    refused = units.install(where, wanted, paths)
     for unit in wanted:
         output.data(str(where.folder / unit.name))
     if refused:

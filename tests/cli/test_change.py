@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -28,6 +29,21 @@ def test_scale_counts_from_what_is_wanted_now(home, capsys):
     said = capsys.readouterr()
     assert (said.out, said.err) == ("", "done: `planner` is scaling from 5 to 4 replicas\n")
     assert wish(paths)["target"] == 4
+
+
+def test_scale_counts_from_what_an_up_meanwhile_has_asked_for(home, capsys):
+    """`scale` waits while `up` writes its file."""
+    paths = lay_down(home)
+    with disk.locked(paths.manager_lock), ThreadPoolExecutor() as threads:
+        with disk.locked(paths.intent_lock):
+            scaled = threads.submit(main.run, ["scale", "up", "1"])
+            time.sleep(0.3)
+            text = paths.spec.read_text()
+            paths.spec.write_text(text.replace("replicas: 3", "replicas: 4"))
+            assert paths.spec.read_text() != text
+        assert scaled.result() == 0
+    assert wish(paths)["target"] == 5
+    assert "from 4 to 5 replicas" in capsys.readouterr().err
 
 
 def test_the_last_replica_stays(home, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 import os
@@ -13,7 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cli import main
+from fogft.cli import main, output
+from fogft.errors import FogftError, StateError
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.pool.commands import composition
 from fogft.pool.credentials import authority, bundle
@@ -85,6 +87,57 @@ def test_without_a_terminal_it_says_how_to_give_the_passphrase(paths, capsys, mo
     monkeypatch.setattr("sys.stdin", io.StringIO(""))
     assert run("join", "ada.join") == 1
     assert "--passphrase-file" in capsys.readouterr().err
+
+
+def test_a_passphrase_that_is_not_typed_is_an_error(paths, capsys, monkeypatch):
+    """Ctrl-D at the prompt."""
+    issue_ada(capsys)
+
+    def ended(_prompt):
+        raise EOFError
+
+    monkeypatch.setattr("getpass.getpass", ended)
+    monkeypatch.setattr(output, "is_terminal", lambda _: True)
+    assert run("join", "ada.join") == 1
+    assert capsys.readouterr().err.endswith("error: no passphrase was given\n")
+
+
+def test_an_exports_new_passphrase_is_shown_before_only_the_file_is_left(
+    paths, capsys, monkeypatch
+):
+    def failing(*_, **__):
+        raise FogftError("it failed")
+
+    monkeypatch.setattr("fogft.pool.commands.moving.export", failing)
+    assert run("export", "planner", "planner.pool") == 1
+    assert "passphrase: " in capsys.readouterr().err
+
+
+def test_an_imported_pool_is_managed_though_its_file_cannot_be_deleted(
+    paths, tmp_path, capsys, monkeypatch
+):
+    (tmp_path / "p.yaml").write_text(POOL_FILE)
+    assert run("export", "planner", "planner.pool") == 0
+    passphrase = capsys.readouterr().err.partition("passphrase: ")[2].splitlines()[0]
+    (tmp_path / "told").write_text(passphrase)
+    started = []
+    monkeypatch.setattr("fogft.pool.commands.startup.start_manager", started.append)
+
+    def refused(file):
+        raise StateError(f"`{file}` cannot be removed")
+
+    monkeypatch.setattr("fogft.pool.commands.joining.destroy", refused)
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "other"))
+    assert run("import", "planner.pool", "--passphrase-file", "told") == 1
+    assert len(started) == 1
+    assert "cannot be removed" in capsys.readouterr().err
+    monkeypatch.setattr("fogft.pool.commands.joining.used_once", nothing_used)
+    assert run("import", "planner.pool", "--passphrase-file", "told") == 1
+    assert "`fogft up` manages it" in capsys.readouterr().err
+
+
+def nothing_used(_root, _label):
+    return contextlib.nullcontext()
 
 
 def test_the_list_shows_states_and_no_key(paths, capsys):

@@ -44,6 +44,15 @@ def test_a_defect_of_ours_keeps_its_trace(monkeypatch):
         run_failing(monkeypatch, ZeroDivisionError("defect"))
 
 
+def test_a_file_that_is_not_ours_is_an_error_and_no_trace(tmp_path, monkeypatch, capsys):
+    home = tmp_path / "home"
+    home.write_text("no folder")
+    monkeypatch.setenv("FOGFT_HOME", str(home))
+    assert main.run(["list"]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(f"error: `{home / 'pools'}`: Not a directory\n")
+
+
 def test_a_broken_pipe_that_is_not_stdout_is_a_defect_of_ours(monkeypatch):
     """Only a closed stdout is excused: a socket that breaks must not end us in silence."""
     with pytest.raises(BrokenPipeError):

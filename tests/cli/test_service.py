@@ -22,11 +22,12 @@ from tests.needs import needs
 class Systemd:
     """Stands in for systemctl: notes what it is asked, and answers as told."""
 
-    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch, refused: str = "") -> None:
         self.asked = folder / "asked"
         folder.mkdir()
         program = folder / "systemctl"
-        program.write_text(f'#!/bin/sh\necho "$@" >> {self.asked}\necho active\n')
+        refuses = f'case "$*" in {refused}) echo no >&2; exit 1 ;; esac\n' if refused else ""
+        program.write_text(f'#!/bin/sh\necho "$@" >> {self.asked}\n{refuses}echo active\n')
         program.chmod(0o755)
         monkeypatch.setenv("PATH", f"{folder}:/usr/bin:/bin")
 
@@ -69,6 +70,42 @@ def test_units_are_written_started_shown_and_removed(home, units, tmp_path, monk
     assert list(units.iterdir()) == []
     assert main.run(["service", "status"]) == 0
     assert capsys.readouterr().out == ""
+
+
+@pytest.mark.parametrize("refused", ["", "*enable*"])
+def test_the_manager_yields_to_units_that_systemd_starts_and_to_no_others(
+    home, units, tmp_path, monkeypatch, refused
+):
+    systemd = Systemd(tmp_path / "bin", monkeypatch, refused)
+    order = []
+    monkeypatch.setattr(
+        service.process_control,
+        "end_holder",
+        lambda lock: order.append((lock, systemd.asked.read_text().count("restart"))),
+    )
+    assert main.run(["service", "install"]) == 0
+    paths = PoolPaths.of("planner", home)
+    ended = [] if refused else [paths.manager_lock, paths.spare_lock, paths.standby_lock]
+    assert [name for name, _ in order] == ended
+    assert not any(restarted for _, restarted in order)
+
+
+def test_what_cannot_be_removed_keeps_its_environment(home, units, tmp_path, monkeypatch, capsys):
+    """Without it the units that stay could not start at the next boot."""
+    Systemd(tmp_path / "bin", monkeypatch)
+    assert main.run(["service", "install"]) == 0
+    unit = units / "fogft-planner-manager.service"
+    text = unit.read_text()
+
+    def refused(path, **_):
+        raise PermissionError(1, "Operation not permitted", str(path))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", refused)
+        assert main.run(["service", "remove"]) == 1
+    assert f"error: `{unit}`: Operation not permitted" in capsys.readouterr().err
+    assert unit.read_text() == text
+    assert (home / "pools" / "planner" / "service.env").exists()
 
 
 def test_a_home_in_which_no_unit_can_be_written_is_one_clear_error(

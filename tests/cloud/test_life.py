@@ -242,6 +242,7 @@ def test_garbage_in_one_folder_does_not_hide_the_others(local, caplog, content):
     bad = local.folder(ReplicaId(local.uid, 1, 1))
     bad.mkdir()
     (bad / "machine.json").write_text(content)
+    (bad / "replica.key").write_text("secret")
     (bad.parent / "README").write_text("not a machine")
     assert [m.id for m in local.cloud.machines(local.uid)] == [good]
     assert local.cloud.machines("1" * 16) == []
@@ -249,6 +250,7 @@ def test_garbage_in_one_folder_does_not_hide_the_others(local, caplog, content):
     assert len(warned) == 2, "each is told once"
     local.cloud.machines(local.uid)
     assert len([r for r in caplog.records if "machine_ignored" in r.message]) == 2
+    assert not bad.exists(), "no key stays of what a power cut left"
 
 
 def test_a_living_machine_with_a_damaged_record_is_listed_so_that_it_can_be_ended(local):

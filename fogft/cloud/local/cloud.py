@@ -147,11 +147,10 @@ class LocalCloud:
             if not folder.exists:  # it was ended while we looked
                 return None
             self._warn_once(folder.path.name, error.message)
-            if not folder.locked:
-                return None
-            # Its files cannot be read, but it lives: listed, it can be ended.
-            failure = Reason(Cause.ERROR, words=error.message)
-            return Machine(folder.id, _UNKNOWN, MachinePhase.FAILED, now, failure=failure)
+            if folder.locked:
+                # Its files cannot be read, but it lives: listed, it can be ended.
+                failure = Reason(Cause.ERROR, words=error.message)
+                return Machine(folder.id, _UNKNOWN, MachinePhase.FAILED, now, failure=failure)
         # Later, if the cloud is busy: a list never waits.
         with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
             ending.bury(self.root, folder)

@@ -87,10 +87,11 @@ def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Ho
 
     A replica that is revoked is replaced, too.
     """
-    store.identity()
     ledger = Ledger(store.paths.credentials)
-    holders = ledger.named(role, name)
-    ledger.revoke(holders)
+    with disk.locked(store.paths.intent_lock):  # no export may read it meanwhile
+        store.identity()
+        holders = ledger.named(role, name)
+        ledger.revoke(holders)
     for holder in holders if role is Role.REPLICA else ():
         drained = partial(intent.drain, slot=int(holder.name), generation=holder.generation)
         change(store, drained)
@@ -102,8 +103,11 @@ def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:
     ones are in use; return the new holder, the old ones, and whether that has happened.
     """
     ledger = Ledger(store.paths.credentials)
-    holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
-    old = [h for h in ledger.named(Role.ROBOT, holder.name) if h != holder]
+    with disk.locked(store.paths.intent_lock):
+        holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
+    old = [
+        one for one in ledger.named(Role.ROBOT, holder.name) if one.generation < holder.generation
+    ]
     in_use = wait_for(lambda: _in_use(store.paths, holder), PUBLISH_LIMIT_S)
     if in_use and old:
         ledger.revoke(old)

@@ -11,7 +11,7 @@ Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`
 import contextlib
 import re
 import secrets
-import tempfile
+import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -73,9 +73,11 @@ def issue(
         )
     _check_found(spec, role, name)
     bundle.check_passphrase(passphrase)  # before a generation is used up
-    holder, credential = Ledger(store.paths.credentials).issue_next(
-        role, name, identity.uid, days=configuration.certificate_days(spec)
-    )
+    with disk.locked(store.paths.intent_lock):
+        store.identity()  # it was not exported meanwhile
+        holder, credential = Ledger(store.paths.credentials).issue_next(
+            role, name, identity.uid, days=configuration.certificate_days(spec)
+        )
     label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, now + open_for_s)
     content = {"files": _files(store, holder, credential), "rendezvous": list(spec.rendezvous)}
     return holder, bundle.seal(label, content, passphrase)
@@ -192,11 +194,16 @@ def used_once(root: Path, label: Label) -> Iterator[None]:
 def _on_disk(folder: Path, files: Mapping[str, str], holder: Holder) -> Iterator[CredentialPaths]:
     """Have credentials in files of their own before they are put where a proxy sees them."""
     named = {PurePosixPath(name).name: text for name, text in files.items()}
-    with tempfile.TemporaryDirectory(dir=folder) as made:
-        place = CredentialPaths.of(Path(made), holder.role.value)
+    made = folder / "claiming"
+    shutil.rmtree(made, ignore_errors=True)  # of one that was killed
+    disk.make_folder(made)
+    try:
+        place = CredentialPaths.of(made, holder.role.value)
         for path in (place.ca, place.certificate, place.key):
             disk.write_whole(path, named.get(path.name, ""))
         yield place
+    finally:
+        shutil.rmtree(made)
 
 
 def read(file: Path) -> bytes:

@@ -75,9 +75,11 @@ def export(
                 moved = _Moved(identity, files, lease.read_epoch(paths))
                 disk.write_whole(unfinished, bundle.seal(label, to_plain(moved), passphrase))
                 os.replace(paths.identity, paths.exported)
-        except (FogftError, OSError) as error:
-            unfinished.unlink(missing_ok=True)
-            startup.start_manager(store)
+        except BaseException as error:
+            if paths.identity.exists():  # else the file is all that is left
+                with contextlib.suppress(OSError):
+                    unfinished.unlink()
+                startup.start_manager(store)
             if isinstance(error, OSError):
                 raise FogftError(f"`{error.filename}` is needed: {error.strerror}") from None
             raise
@@ -115,7 +117,7 @@ def _files(paths: PoolPaths, identity: Identity, root: Path) -> Iterator[tuple[s
 def import_(
     file: Path, passphrase: str, root: Path, now: float, *, pool_file: Path | None = None
 ) -> PoolStore:
-    """Take over a pool from its file, and delete the file; return it, still without a manager.
+    """Take over a pool from its file; return it, still without a manager.
 
     Relative paths in `pool_file`, the pool file on this machine, start at its folder.
     """
@@ -144,7 +146,7 @@ def import_(
         else:
             raise FogftError(
                 f"this machine has a pool `{was.name}`",
-                f"shut it down with `fogft down {was.name}`",
+                f"`fogft up` manages it, and `fogft down {was.name}` shuts it down",
             )
         shutil.rmtree(paths.credentials, ignore_errors=True)
         folders = {_POOL: paths.folder, _COSTS: paths.costs, _CLOUD: root / was.cloud}
@@ -155,7 +157,6 @@ def import_(
                 disk.write_whole(folders[folder] / rest, text.encode("latin-1"))
         before = max(brought.epoch, label.holder.generation, lease.read_epoch(paths))
         here = replace(was, file=str(place), first_epoch=lease.next_term(before))
+        paths.exported.unlink(missing_ok=True)  # with both there, `down` would ask no cloud
         write_identity(paths, here)
-        paths.exported.unlink(missing_ok=True)
-    joining.destroy(file)
     return make_store(was.name)

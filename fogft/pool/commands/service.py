@@ -142,8 +142,11 @@ def environment(environ: Mapping[str, str] = os.environ) -> str:
     return "\n".join(lines) + "\n"
 
 
-def install(where: Services, units: Sequence[Unit]) -> list[str]:
-    """Have units started now and at each boot; return what systemd said against it."""
+def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = None) -> list[str]:
+    """Have units started now and at each boot; return what systemd said against it.
+
+    A pool's replace the processes, if any, that run it now.
+    """
     disk.write_whole(units[0].environment, environment())
     if not where.folder.is_dir():
         disk.make_folder(where.folder)
@@ -153,11 +156,13 @@ def install(where: Services, units: Sequence[Unit]) -> list[str]:
     names = [unit.name for unit in units]
     said = [where.systemctl("daemon-reload"), where.systemctl("enable", *names)]
     if not any(one.returncode for one in said):
+        if paths is not None:
+            _yield_to(paths)
         said.append(where.systemctl("restart", "--no-block", *names))
     return [one.stderr.strip() for one in said if one.returncode]
 
 
-def yield_to(paths: PoolPaths) -> None:
+def _yield_to(paths: PoolPaths) -> None:
     """End the manager, the spare and the standby not started by systemd; its own replace them."""
     for lock in (paths.manager_lock, paths.spare_lock, paths.standby_lock):
         process_control.end_holder(lock)
@@ -205,9 +210,10 @@ def remove(where: Services, names: Sequence[str]) -> None:
     if runs and names:
         where.systemctl("disable", "--now", *names)
     for unit in (where.folder / name for name in names):
-        for path in re.findall("^EnvironmentFile=(.*)$", unit.read_text(), re.MULTILINE):
+        text = unit.read_text()
+        unit.unlink()  # first: it may not be ours to remove
+        for path in re.findall("^EnvironmentFile=(.*)$", text, re.MULTILINE):
             Path(path.replace("%%", "%")).unlink(missing_ok=True)
-        unit.unlink()
     if runs and names:
         where.systemctl("daemon-reload")
         where.systemctl("reset-failed", *names)

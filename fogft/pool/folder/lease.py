@@ -46,7 +46,7 @@ class Lease:
 
     def beat(self) -> None:
         """Write the heartbeat. Raises PoolBusy where a later manager has it: stop at once."""
-        if read_epoch(self._paths) > self.epoch:
+        if self._lock.lost or read_epoch(self._paths) > self.epoch:
             raise PoolBusy(f"a later manager has taken over pool `{self._paths.folder.name}`")
         self._beat += 1
         self._write()

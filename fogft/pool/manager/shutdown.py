@@ -67,7 +67,8 @@ def end(
             warned=warned,
             limit_s=limit_s,
         )
-        # The identity first: from here on there is no such pool.
+        # The identity before the rest, but after the keys: from here on there is no such pool.
+        shutil.rmtree(paths.credentials, ignore_errors=True)
         with contextlib.suppress(OSError):  # what stands in its place is no file
             paths.identity.unlink()
         _remove(paths.folder)

@@ -292,7 +292,7 @@ class _Running:
                 try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
             if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
                 reported, changed = now, False
-                if not folder.exists():  # the pool's: its end is the pool's
+                if self.lock.lost or not folder.exists():  # the pool's: its end is the pool's
                     log.warning("folder_gone path=%s", folder)
                     return False
                 # The id of this process in DDS, once it offers a service.

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fogft.errors import CredentialError
-from fogft.model.credentials import Role
+from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.membership import from_dict
 from fogft.model.proxy_config import RendezvousConfig
 from fogft.model.replica import Member, Membership, ReplicaId
@@ -273,3 +273,25 @@ def test_any_damage_is_told(data: st.DataObject) -> None:
 def test_garbage_is_no_bundle(data: bytes) -> None:
     with pytest.raises(CredentialError, match="not a join bundle"):
         bundle.read_label(data)
+
+
+def test_a_join_that_is_killed_leaves_no_key_for_long(tmp_path: Path) -> None:
+    """Neither a key of its own, nor that of one before it that was killed."""
+    store = store_of(replace(SPEC, rendezvous=("10.0.0.9:7450",)), tmp_path)
+    file = tmp_path / "ada.join"
+    file.write_bytes(issued(store, Role.ROBOT, "ada"))
+    left = tmp_path / "home" / "joined" / "claiming"
+    left.mkdir(parents=True)
+    (left / "robot.key").write_text("of one that was killed")
+    seen = []
+
+    def claim(*told: object) -> None:
+        place = told[-1]
+        assert isinstance(place, CredentialPaths)
+        seen.append((place.key.parent, place.key.read_text()))
+
+    joining.join(file, PASSPHRASE, tmp_path / "home", NOW, claim=claim)
+    [(folder, key)] = seen
+    assert folder == left
+    assert "PRIVATE KEY" in key
+    assert not left.exists()

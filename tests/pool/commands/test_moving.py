@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
+
 import pytest
 
+from fogft import disk
 from fogft.errors import CredentialError, FogftError, PoolBusy
 from fogft.model.credentials import Role
-from fogft.pool.commands import joining, moving
+from fogft.pool.commands import change, joining, moving
 from fogft.pool.commands.composition import make_store
 from fogft.pool.credentials import bundle
 from fogft.pool.credentials.authority import create_authority
@@ -51,7 +55,6 @@ def test_what_is_moved_is_the_same_pool_under_a_later_epoch(made, tmp_path):
         assert (paths.credentials / name).stat().st_mode & 0o777 == 0o600
     assert paths.spec.read_bytes() == store.paths.spec.read_bytes()
     assert read_identity(paths).first_epoch > read_epoch(store.paths)
-    assert not file.exists()
 
 
 def test_an_export_comes_back_where_it_was_made(made, tmp_path):
@@ -130,3 +133,88 @@ def test_a_pool_without_its_credentials_stays(made, monkeypatch):
     assert started == [store]
     assert not file.exists()
     assert store.identity()
+
+
+@pytest.mark.parametrize("where", ["interrupted", "no folder", "exported"])
+def test_an_export_that_ends_early_starts_the_manager_again_or_keeps_the_file(
+    made, tmp_path, monkeypatch, where
+):
+    """Until the pool is exported it is managed here; from then on the file is all that is left."""
+    store, file = made
+    started = []
+    monkeypatch.setattr(moving.startup, "start_manager", started.append)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    if where == "interrupted":
+        monkeypatch.setattr(moving.bundle, "seal", interrupted)
+    elif where == "no folder":
+        file.write_text("a file")
+        file = file / "planner.pool"
+    else:
+        monkeypatch.setattr(moving.shutdown, "without_orders", interrupting_at_its_end)
+    with pytest.raises((KeyboardInterrupt, FogftError)):
+        export(store, file)
+    unfinished = file.with_name("planner.pool.unfinished")
+    if where == "exported":
+        assert started == []
+        assert b"planner" in unfinished.read_bytes()
+    else:
+        assert started == [store]
+        assert store.identity().name == "planner"
+        with contextlib.suppress(NotADirectoryError):
+            assert not unfinished.exists()
+
+
+@contextlib.contextmanager
+def interrupting_at_its_end(*_):
+    yield
+    raise KeyboardInterrupt
+
+
+def test_an_import_that_is_killed_can_be_repeated(made, tmp_path, monkeypatch):
+    """Never are both files there: `down` would remove the keys, and ask no cloud."""
+    store, file = made
+    (tmp_path / "pool.yaml").write_text("")
+    export(store, file)
+
+    def killed(paths, identity):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(moving, "write_identity", killed)
+    with pytest.raises(KeyboardInterrupt):
+        moving.import_(file, SECRET, tmp_path / "home", NOW, pool_file=tmp_path / "pool.yaml")
+    assert not store.paths.exported.exists()
+    assert not store.paths.identity.exists()
+    monkeypatch.undo()
+    moving.import_(file, SECRET, tmp_path / "home", NOW, pool_file=tmp_path / "pool.yaml")
+
+
+@pytest.mark.parametrize("what", ["revoke", "rotate", "issue"])
+def test_certificates_do_not_change_while_the_pool_is_exported(made, what):
+    """What the file was sealed with would be the older word, for ever."""
+    store, _ = made
+    before = store.paths.credentials.joinpath("issued.json").read_bytes()
+    failures = []
+
+    def asked():
+        try:
+            if what == "revoke":
+                change.revoke_credentials(store, Role.ROBOT, "ada")
+            elif what == "rotate":
+                change.rotate_robot(store)
+            else:
+                joining.issue(store, Role.GATEWAY, "edge", SECRET, NOW, open_for_s=60)
+        except FogftError as error:
+            failures.append(error)
+
+    with disk.locked(store.paths.intent_lock):
+        thread = threading.Thread(target=asked)
+        thread.start()
+        thread.join(0.3)
+        store.paths.identity.rename(store.paths.exported)
+    thread.join(30)
+    assert not thread.is_alive()
+    assert [type(failure) for failure in failures] == [PoolBusy]
+    assert store.paths.credentials.joinpath("issued.json").read_bytes() == before

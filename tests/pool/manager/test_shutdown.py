@@ -289,3 +289,19 @@ def test_files_that_stay_are_told(scene: Scene, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(shutdown.shutil, "rmtree", lambda *_, **__: None)
     with pytest.raises(FogftError, match="cannot be removed"):
         scene.end()
+
+
+def test_a_down_that_is_killed_leaves_no_key_of_a_pool_that_is_not_listed(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene.write()
+    assert list(scene.paths.credentials.glob("*.key"))
+
+    def killed(_folder: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shutdown, "_remove", killed)
+    with pytest.raises(KeyboardInterrupt):
+        scene.end()
+    assert not scene.paths.identity.exists()
+    assert not scene.paths.credentials.exists()
