@@ -175,7 +175,7 @@ def test_a_check_asks_each_link_anew(home, capsys, monkeypatch):
         while not checked.wait(0.05):
             report(paths, age_s=-0.3)
 
-    monkeypatch.setattr(status, "CHECK_LIMIT_S", 5.0)
+    monkeypatch.setattr(status, "CHECK_LIMIT_S", 30.0)
     checked, thread = threading.Event(), threading.Thread(target=proxy)
     with alive(paths):
         thread.start()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cloud.local import faults, processes
+from fogft.cloud.local import chaos, faults, processes
 from fogft.errors import CloudError, NoCapacity
 from fogft.model.replica import MachinePhase, ReplicaId
 from tests.fakes.waiting import wait_for
@@ -63,11 +63,12 @@ def call():
 
 def test_a_preempted_machine_has_a_notice_then_is_gone(local):
     machine = local.running()
-    local.chaos.preempt(machine.id, notice_s=1.0)
+    local.chaos.preempt(machine.id, notice_s=60.0)
     assert local.machine(machine.id).notice
     notice = json.loads((local.folder(machine.id) / "notice.json").read_text())
     assert notice["action"] == "terminate"
-    assert abs(notice["at"] - time.time()) < 30
+    assert abs(notice["at"] - time.time() - 60) < 30
+    local.chaos.preempt(machine.id, notice_s=0.0)
     local.wait_gone(machine.id)
     assert "reason='preempted'" in Path(local.cloud.log(machine.id)).read_text()
 
@@ -144,7 +145,7 @@ def test_a_blackhole_ends_by_itself_though_its_author_is_gone(local, call):
     code = (
         "import sys; from pathlib import Path; from fogft.model.replica import ReplicaId\n"
         "from fogft.cloud.local.chaos import Chaos\n"
-        "Chaos(Path(sys.argv[1])).blackhole(ReplicaId(sys.argv[2], 0, 1), for_s=1.5)"
+        "Chaos(Path(sys.argv[1])).blackhole(ReplicaId(sys.argv[2], 0, 1), for_s=6)"
     )
     subprocess.run(
         [sys.executable, "-c", code, str(local.root), local.uid], cwd=CHECKOUT, check=True
@@ -185,7 +186,8 @@ def test_what_is_not_there_cannot_be_hurt(local):
 # -- locations
 
 
-def test_an_outage_cuts_off_then_ends_all_machines_there_and_refuses_new_ones(local):
+def test_an_outage_cuts_off_then_ends_all_machines_there_and_refuses_new_ones(local, monkeypatch):
+    monkeypatch.setattr(chaos, "OUTAGE_KILL_AFTER_S", 5.0)
     hit = local.running(0, where="us-west-1/a").id
     booting = local.launch(1, where="slow-1/a")
     spared = local.running(2, where="us-west-2/a").id

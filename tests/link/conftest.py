@@ -45,6 +45,7 @@ def dial(authority: Authority, owner: Owner) -> Iterator[Callable[..., ZenohLink
 
     def start(endpoint: str, slot: int = 0, generation: int = 1, **options: Any) -> ZenohLink:
         options.setdefault("robot", "robot")
+        options.setdefault("suspect_after_s", 10.0)  # a replica that is held up is not frozen
         files = options.pop("files", None) or authority.robot(options["robot"])
         to = options.pop("owner", owner)
         dialers.append(ZenohDialer(files, pool_uid=POOL_UID, **options))

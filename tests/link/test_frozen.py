@@ -61,11 +61,12 @@ def test_a_frozen_replica_is_suspected_and_comes_back(
     start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
 ) -> None:
     """What was in flight ends as lost, so that it can be sent again; thawed, it is up again."""
-    replica = start_replica()
+    replica = start_replica(delay_s=3600.0)
     link = dial(replica.endpoint, suspect_after_s=0.5)
     wait_for(lambda: link.usable)
-    replica.signal(signal.SIGSTOP)
     assert link.offer(SERVICE, request_id(1), b"anybody there", 60.0)
+    wait_for(lambda: replica.count("requests") == 1)
+    replica.signal(signal.SIGSTOP)
     wait_for(lambda: not link.usable)
     wait_for(lambda: owner.of(1))
     assert owner.of(1)[0].refusal == Refusal.LOST
@@ -73,6 +74,7 @@ def test_a_frozen_replica_is_suspected_and_comes_back(
     assert link.status().state is LinkState.SUSPECT
     replica.signal(signal.SIGCONT)
     wait_for(lambda: link.usable)
+    replica.ask(delay_s=0.0)
     assert link.offer(SERVICE, request_id(1), b"once more", 60.0)
     wait_for(lambda: len(owner.of(1)) == 2)
     assert owner.of(1)[1].payload == b"once more"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,7 @@ class FolderCloud:
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         self._reach()
-        found = [self._read(path) for path in self.folder.glob(f"{pool_uid}-*.json")]
-        return sorted(found, key=lambda m: m.id)
+        return self._listed(self.folder.glob(f"{pool_uid}-*.json"))
 
     def launch(self, order: Launch) -> None:
         self._reach()
@@ -50,7 +50,14 @@ class FolderCloud:
         self._reach()
         paths = [*self.folder.glob(f"{pool_uid}*.json"), *self.folder.glob(f"{pool_uid}*.lost")]
         asked = frozenset() if (self.folder / "mute").exists() else frozenset({"folder"})
-        return Audit(tuple(sorted((self._read(p) for p in paths), key=lambda m: m.id)), asked)
+        return Audit(tuple(self._listed(paths)), asked)
+
+    def _listed(self, paths: Iterable[Path]) -> list[Machine]:
+        found = []
+        for path in paths:
+            with contextlib.suppress(FileNotFoundError):  # it has just been ended
+                found.append(self._read(path))
+        return sorted(found, key=lambda m: m.id)
 
     def forget(self, id: ReplicaId) -> None:
         """Lose a machine that runs on, as SkyPilot does with its database."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
@@ -123,6 +124,7 @@ class Scene:
             if process.poll() is None:
                 process.kill()
             process.wait()
-        report = disk.read_json(self.paths.proxy_status) or {}
-        if disk.is_locked(self.paths.proxy_lock) and "pid" in report:
-            os.kill(report["pid"], signal.SIGKILL)
+        pid = disk.holder(self.paths.proxy_lock)
+        if pid is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)

@@ -61,7 +61,7 @@ def read_only(folder: Path, pids: Sequence[int]) -> Iterator[None]:
         subprocess.run(command, check=True)
     aside.rmdir()
     yield
-    subprocess.run(["umount", folder], check=True)
+    subprocess.run(["umount", "--lazy", folder], check=True)
 
 
 @contextlib.contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -145,11 +146,12 @@ class Replica:
     def run_pids(self) -> list[int]:
         """Return the process ids of the user's command, which is started."""
         children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children")
-        return [
-            int(pid)
-            for pid in children.read_text().split()
-            if self._node.name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes()
-        ]
+        found = []
+        for pid in children.read_text().split():
+            with contextlib.suppress(OSError):  # it has just ended
+                if self._node.name.encode() in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    found.append(int(pid))
+        return found
 
 
 class Robot:

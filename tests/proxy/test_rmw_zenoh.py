@@ -61,7 +61,7 @@ def test_a_robot_of_rmw_zenoh_is_answered_by_the_first_of_its_replicas(parts: Pa
     One replica answers late. All of a burst are answered, each its own, by the other; when that
     one is killed the late one answers. With nobody left the service is not there any more.
     """
-    late, quick = replica(parts, 0, "late 3"), replica(parts, 1, "quick 0")
+    late, quick = replica(parts, 0, "late 8"), replica(parts, 1, "quick 0")
     robot = Robot(parts, "arm", (late, quick), "rmw: zenoh\n")
     wait_for(lambda: robot.ready() == [0, 1], "both replicas")
     asyncio.run(_session(robot, late, quick))

@@ -160,8 +160,10 @@ def test_a_robot_passes_the_managers_revocation_on_and_no_other(
     start_replica: Callable[..., ReplicaProcess],
     dial: Callable[..., ZenohLink],
     owner: Owner,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A record that a robot or a replica signed revokes nobody, whoever brings it."""
+    monkeypatch.setattr("fogft.link.zenoh.robot.link._TELL_AGAIN_S", 3600.0)
     replica = start_replica()
     eve = dial(replica.endpoint, robot="eve")
     dialer = ZenohDialer(authority.robot("ada"), robot="ada", pool_uid=POOL_UID)

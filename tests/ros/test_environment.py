@@ -68,7 +68,9 @@ def test_the_profile_goes_to_the_variable_that_the_sourced_fast_dds_reads(
 @pytest.mark.ros
 @needs("fastdds")
 @pytest.mark.parametrize("prepared", [True, False])
-def test_a_node_maps_a_segment_as_large_as_its_profile_says(prepared: bool) -> None:
+def test_a_node_maps_a_segment_as_large_as_its_profile_says(
+    prepared: bool, ros_domain: int
+) -> None:
     """What is in force is seen in the memory of a process, whatever its variables say."""
     program = (
         "import json, os; from fogft.ros import environment, self_test\n"
@@ -76,6 +78,7 @@ def test_a_node_maps_a_segment_as_large_as_its_profile_says(prepared: bool) -> N
         "print(json.dumps(self_test.segment()))\n"
     )
     clean = {k: v for k, v in os.environ.items() if not k.endswith("_DEFAULT_PROFILES_FILE")}
+    clean["ROS_DOMAIN_ID"] = str(ros_domain)  # it also maps those of whom it hears
     out = subprocess.run(
         [sys.executable, "-c", program], env=clean, capture_output=True, check=True, timeout=100
     )

@@ -77,6 +77,7 @@ def test_our_client_calls_an_ordinary_service(
     assert service.stdout.readline() == "ready\n"
     client = make_node(ros_domain).client("/map", SET_MAP)
     wait_for(client.available, "discovery")
+    wait_for(client.is_known, "its discovery of us: an ordinary service would drop the response")
     answers: list[bytes] = []
     client.call(_map_request(CELLS), answers.append)
     wait_for(lambda: answers, "the response")

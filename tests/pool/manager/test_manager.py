@@ -83,7 +83,12 @@ def test_manager_of_an_older_epoch_steps_down(scene: Scene) -> None:
     scene.write(replicas=1)
     process = scene.start_manager()
     scene.wait(lambda: scene.whole(1))
-    disk.write_json(scene.paths.lease, {"epoch": 99, "pid": 1, "beat": 0})
+
+    def ended() -> bool:  # a beat that has just looked may write over it
+        disk.write_json(scene.paths.lease, {"epoch": 99, "pid": 1, "beat": 0})
+        return process.poll() is not None
+
+    scene.wait(ended)
     assert process.wait(20) == 1
     assert "a later manager has taken over" in scene.output()
 

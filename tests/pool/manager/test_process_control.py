@@ -18,7 +18,7 @@ from fogft.model.reason import Cause
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
 from fogft.pool.manager.proxy_supervisor import BACKOFF_LIMIT_S, STEADY_S, ProxySupervisor
-from tests.fakes.waiting import paced
+from tests.fakes.waiting import paced, wait_for
 from tests.needs import needs
 
 HOLD = """
@@ -110,9 +110,10 @@ def test_the_holder_is_ended(lock: Path, holders: list[subprocess.Popen[bytes]],
     pid = hold(lock, holders, kind)
     if kind == "stopped":
         os.kill(pid, signal.SIGSTOP)
-    ended = process_control.end_holder(lock, patience_s=0.5)
-    assert ended == pid
     expected = signal.SIGTERM if kind in ("willing", "stopped") else signal.SIGKILL
+    patience_s = 10.0 if expected is signal.SIGTERM else 0.5
+    ended = process_control.end_holder(lock, patience_s=patience_s)
+    assert ended == pid
     assert holders[0].wait(10) == -expected
 
 
@@ -216,6 +217,12 @@ def test_a_proxy_that_was_replaced_is_counted(tmp_path: Path) -> None:
         proxy.supervisor.look()
 
 
+def switches(pid: int) -> int:
+    """Return how often a process has gone to sleep."""
+    told = Path(f"/proc/{pid}/status").read_text()
+    return int(told.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
+
+
 @pytest.mark.parametrize("which", ["proxy_lock", "standby_lock", "spare_lock"])
 def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
     """Stopped, it holds its place for ever, and nobody can take over; one that works is let be."""
@@ -228,9 +235,14 @@ def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
         for number in (signal.SIGCONT, signal.SIGSTOP):
             os.kill(works.pid, number)
             for _ in itertools.islice(paced(0.05), 15):
+                if number == signal.SIGCONT:
+                    before = switches(works.pid)
+                    wait_for(lambda before=before: switches(works.pid) > before)
                 proxy.supervisor.look()
                 proxy.now += 1.0
-            assert works.poll() == (-signal.SIGKILL if number == signal.SIGSTOP else None)
+            if number == signal.SIGCONT:
+                assert works.poll() is None
+        assert works.wait(20) == -signal.SIGKILL
     finally:
         works.kill()
         works.communicate()
