@@ -79,7 +79,10 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
 
     Raises RosError: The installation is incomplete.
     """
-    if _chosen(environ) or _shared_memory_free_bytes() < _ROOM_NEEDED_BYTES:
+    chosen = any(map(environ.get, _CHOSEN_BY_USER)) or any(
+        Path(n).is_file() for n in _LOCAL_PROFILES
+    )
+    if chosen or _shared_memory_free_bytes() < _ROOM_NEEDED_BYTES:
         return False
     environ[profile_variable(environ)] = str(profile_path())
     return True
@@ -114,13 +117,7 @@ def _added_by_wheels(folder: Path) -> bool:
 
 
 def describe(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Describe the ROS 2 installation and settings, for people. Imports rclpy; never raises."""
-    found = {
-        "domain": environ.get("ROS_DOMAIN_ID") or "0",
-        "discovery": _discovery(environ),
-        "profile": _chosen(environ) or "none: Fast DDS's default transports, slow above 0.5 MB",
-        "shared_memory_free_mb": str(_shared_memory_free_bytes() // 1_000_000),
-    }
+    """Describe the ROS 2 installation, for people. Imports rclpy; never raises."""
     try:
         import rclpy
         from rclpy.utilities import get_rmw_implementation_identifier
@@ -128,30 +125,13 @@ def describe(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
         place = Path(rclpy.__file__).parent
         version = _rclpy_version(place)
         release = ".".join(version.split(".")[:2])
-        found |= {
+        return {
             "rclpy": f"{version} in {place}",
             "rmw": get_rmw_implementation_identifier(),
             "distribution": environ.get("ROS_DISTRO") or _DISTRIBUTIONS.get(release, "unknown"),
-            "source": _source(place),
         }
     except Exception as error:  # a half-installed ROS fails in its own ways
-        found |= {"rclpy": f"not usable: {error}", "rmw": "", "distribution": "", "source": ""}
-    return found
-
-
-def _discovery(environ: Mapping[str, str]) -> str:
-    if environ.get("ROS_LOCALHOST_ONLY") == "1":
-        return "LOCALHOST (ROS_LOCALHOST_ONLY=1)"
-    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "SUBNET"
-    peers = environ.get("ROS_STATIC_PEERS")
-    return f"{reach}, peers {peers}" if peers else reach
-
-
-def _chosen(environ: Mapping[str, str]) -> str:
-    for name in _CHOSEN_BY_USER:
-        if environ.get(name):
-            return f"{name}={environ[name]}"
-    return next((str(Path(n).resolve()) for n in _LOCAL_PROFILES if Path(n).is_file()), "")
+        return {"rclpy": f"not usable: {error}", "rmw": ""}
 
 
 def _shared_memory_free_bytes() -> int:
@@ -168,9 +148,3 @@ def _rclpy_version(place: Path) -> str:
         for distribution in metadata.distributions(name=name, path=[str(place.parent)]):
             return distribution.version
     return "unknown"
-
-
-def _source(place: Path) -> str:
-    if "site-packages" in place.parts and Path(sys.prefix) in place.parents:
-        return f"wheels in {sys.prefix}"
-    return f"ROS installation {place.parents[3] if len(place.parents) > 3 else place}"

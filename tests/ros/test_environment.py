@@ -152,27 +152,10 @@ def test_a_child_in_this_environment_can_use_ros() -> None:
 
 @pytest.mark.ros
 def test_describe_tells_what_is_there() -> None:
-    found = environment.describe({"ROS_DOMAIN_ID": "42", "ROS_STATIC_PEERS": "10.0.0.1"})
-    assert found["domain"] == "42"
-    assert found["discovery"] == "SUBNET, peers 10.0.0.1"
-    assert found["profile"].startswith("none")
+    found = environment.describe({})
     assert found["rmw"].startswith("rmw_")
     assert found["distribution"] != "unknown"
-    assert int(found["shared_memory_free_mb"]) >= 0
     assert all(isinstance(value, str) and value for value in found.values())
-
-
-@pytest.mark.parametrize(
-    ("environ", "expected"),
-    [
-        ({}, "SUBNET"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, "LOCALHOST"),
-        ({"ROS_LOCALHOST_ONLY": "1"}, "LOCALHOST (ROS_LOCALHOST_ONLY=1)"),
-        ({"ROS_LOCALHOST_ONLY": "0"}, "SUBNET"),
-    ],
-)
-def test_describe_tells_how_far_discovery_reaches(environ: dict[str, str], expected: str) -> None:
-    assert environment.describe(environ)["discovery"] == expected
 
 
 def test_describe_tells_when_ros_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,4 +163,3 @@ def test_describe_tells_when_ros_is_missing(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setitem(sys.modules, "rclpy", None)
     found: dict[str, Any] = environment.describe({})
     assert found["rclpy"].startswith("not usable: ")
-    assert found["domain"] == "0"
