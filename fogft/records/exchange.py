@@ -6,6 +6,7 @@ Not here: making connections (`server`, `dialling`).
 """
 
 import asyncio
+import itertools
 import logging
 from collections import Counter
 from collections.abc import Callable
@@ -114,13 +115,9 @@ class Exchange:
             connection.abort()
 
     async def _ping(self, connection: Connection) -> None:
-        count = 0
-        while True:
-            if count % HAVE_EVERY == 0:
-                connection.send(frames.have(self.records.digest()))
-            else:
-                connection.send(frames.ping())
-            count += 1
+        for count in itertools.count():
+            due = frames.ping() if count % HAVE_EVERY else frames.have(self.records.digest())
+            connection.send(due)
             await asyncio.sleep(PING_EVERY_S)
 
     def _heard(self, connection: Connection, message: dict[str, Any]) -> None:

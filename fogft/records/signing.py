@@ -9,7 +9,6 @@ Not here: what may be signed by whom (`fogft.records.record`), making keys (`fog
 from __future__ import annotations
 
 import datetime
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -96,13 +95,11 @@ class Verifier:
         self,
         ca: Path,
         *,
-        now: Callable[[], datetime.datetime] = lambda: datetime.datetime.now(datetime.timezone.utc),
         any_time: bool = False,
         lazy: bool = False,
     ) -> None:
         self._ca = ca
         self._authorities = [] if lazy else _read_authorities(ca)
-        self._now = now
         self._any_time = any_time
         self._known: dict[bytes, x509.Certificate] = {}
 
@@ -146,7 +143,7 @@ class Verifier:
         return certificate
 
     def _check_time(self, certificate: x509.Certificate) -> None:
-        now = self._now()
+        now = datetime.datetime.now(datetime.timezone.utc)
         name = _attribute(certificate, "CN")
         if now < certificate.not_valid_before_utc:
             raise RecordError("expired", f"the certificate of `{name}` is not valid yet")
