@@ -15,7 +15,6 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Mapping
 
 PREFIX_BYTES = 12
 _FAST_DDS, _CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # who else keeps to this is not known
@@ -79,8 +78,8 @@ def first_port(domain_id: int) -> int:
     return BASE_PORT + DOMAIN_GAIN * domain_id + _UNICAST_OFFSET
 
 
-def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.environ) -> None:
-    peers = re.split(r"[;\s]+", environ.get("ROS_STATIC_PEERS", ""))
+def _send(message: bytes, domain_id: int) -> None:
+    peers = re.split(r"[;\s]+", os.environ.get("ROS_STATIC_PEERS", ""))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
         for host in filter(None, [_LOOPBACK, *peers]):
             for id in range(_IDS):
@@ -94,19 +93,11 @@ def _send(message: bytes, domain_id: int, environ: Mapping[str, str] = os.enviro
                     sending.sendto(message, (_GROUP, BASE_PORT + DOMAIN_GAIN * domain_id))
 
 
-def declare_gone(
-    prefix: bytes, domain_id: int | None, environ: Mapping[str, str] = os.environ
-) -> bool:
-    """Send a killed participant's disposal message, by its id's prefix; return whether it was sent.
-
-    A `domain_id` of None stands for ``ROS_DOMAIN_ID``, else 0.
-    """
+def declare_gone(prefix: bytes, domain_id: int) -> bool:
+    """Send a killed participant's disposal message, by its id's prefix; return whether it was."""
     if not is_known(prefix):
         return False
-    if domain_id is None:
-        written = environ.get("ROS_DOMAIN_ID") or "0"
-        domain_id = int(written) if written.isdecimal() else 0
-    _send(gone(prefix), domain_id, environ)
+    _send(gone(prefix), domain_id)
     return True
 
 

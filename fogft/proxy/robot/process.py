@@ -46,6 +46,7 @@ from fogft.proxy.robot.service_order import ServiceOrder
 from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning, spdp
 from fogft.ros.joining import EarlyJoin, Pauses
+from fogft.ros.reservations import own_domain
 from fogft.ros.visible import VisibleNode
 
 if TYPE_CHECKING:
@@ -379,7 +380,8 @@ def _bury(config: ClientProxyConfig) -> None:
     with contextlib.suppress(StateError, ValueError):  # what a file says
         left = disk.read_json(config.status)
         if isinstance(left, dict) and isinstance(said := left.get("participant"), str):
-            spdp.declare_gone(bytes.fromhex(said), config.domain_id)
+            domain = own_domain() if config.domain_id is None else config.domain_id
+            spdp.declare_gone(bytes.fromhex(said), domain)
 
 
 def _tell(path: Path, proxy: ClientProxy) -> None:
