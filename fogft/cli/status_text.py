@@ -47,11 +47,13 @@ def rendered(seen: Seen, *, width: int | None) -> Group:
 
     status, links_known = seen.status, seen.links_known
     rows = [*status.replicas, *status.by_hand]
+    services = [_of_service(row, links_known) for row in status.services]
+    topics = [_of_topic(row, links_known) for row in status.topics]
     parts: list[Sequence[RenderableType]] = [
         [_headline(seen, width)],
         _replicas(rows, REPLICA_COLUMNS, width, links_known),
-        _services(status.services, width, links_known),
-        _topics(status.topics, width, links_known),
+        _counted(SERVICE_COLUMNS, services, width, RARE),
+        _counted(TOPIC_COLUMNS, topics, width, ("REFUSED",)),
         topology(status.topology),
         notes(status),
     ]
@@ -199,57 +201,44 @@ def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
     }
 
 
-def _services(
-    rows: Sequence[ServiceStatus], width: int | None, links_known: bool
+def _counted(
+    names: Sequence[str], rows: list[list[str | Text]], width: int | None, optional: Sequence[str]
 ) -> list[RenderableType]:
+    """Return the table of what passes, whose first column is folded."""
     from fogft.cli.table import table
 
     if not rows:
         return []
-    cells: list[list[str | Text]] = []
-    for row in rows:
-        count = row.counters
-        ready = number(row.ready_replicas) if links_known else UNKNOWN
-        unanswered = sum(count.get(key, 0) for key in ("silent", "empty", "turned_away", "poison"))
-        cells.append(
-            [
-                row.name,
-                cell(ready, "" if row.ready_replicas else "bold red"),
-                number(count.get("received", 0)),
-                number(count.get("answered", 0)),
-                number(count.get("fallback", 0)),
-                cell(number(unanswered), "bold red" if unanswered else ""),
-                number(count.get("late", 0)),
-                number(count.get("pending", 0)),
-                milliseconds(count.get("p50_s")),
-                milliseconds(count.get("p99_s")),
-            ]
-        )
-    names, folds = SERVICE_COLUMNS, ("SERVICE",)
-    return [table(names, cells, width=width, right=NUMBERS, folds=folds, optional=RARE)]
+    return [table(names, rows, width=width, right=NUMBERS, folds=names[:1], optional=optional)]
 
 
-def _topics(
-    rows: Sequence[TopicStatus], width: int | None, links_known: bool
-) -> list[RenderableType]:
-    from fogft.cli.table import table
+def _of_service(row: ServiceStatus, links_known: bool) -> list[str | Text]:
+    count = row.counters
+    ready = number(row.ready_replicas) if links_known else UNKNOWN
+    unanswered = sum(count.get(key, 0) for key in ("silent", "empty", "turned_away", "poison"))
+    return [
+        row.name,
+        cell(ready, "" if row.ready_replicas else "bold red"),
+        number(count.get("received", 0)),
+        number(count.get("answered", 0)),
+        number(count.get("fallback", 0)),
+        cell(number(unanswered), "bold red" if unanswered else ""),
+        number(count.get("late", 0)),
+        number(count.get("pending", 0)),
+        milliseconds(count.get("p50_s")),
+        milliseconds(count.get("p99_s")),
+    ]
 
-    if not rows:
-        return []
-    cells: list[list[str | Text]] = []
-    for row in rows:
-        count, heard = row.counters, ", ".join(row.heard_by)
-        cells.append(
-            [
-                row.name,
-                row.origin,
-                (heard or cell("nobody", "bold red")) if links_known else UNKNOWN,
-                f"{count.rate_hz:.3g} Hz",
-                *map(number, (count.messages, count.passed, count.dropped, count.refused)),
-            ]
-        )
-    names, folds = TOPIC_COLUMNS, ("TOPIC",)
-    return [table(names, cells, width=width, right=NUMBERS, folds=folds, optional=("REFUSED",))]
+
+def _of_topic(row: TopicStatus, links_known: bool) -> list[str | Text]:
+    count, heard = row.counters, ", ".join(row.heard_by)
+    return [
+        row.name,
+        row.origin,
+        (heard or cell("nobody", "bold red")) if links_known else UNKNOWN,
+        f"{count.rate_hz:.3g} Hz",
+        *map(number, (count.messages, count.passed, count.dropped, count.refused)),
+    ]
 
 
 def topology(drawn: Mapping[str, Any]) -> list[RenderableType]:
