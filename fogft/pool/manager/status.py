@@ -339,12 +339,16 @@ def of_tick(
 
     health, observed, plan = tick.plan.health, tick.observed, tick.plan
     judged = health.replicas if health is not None else ()
-    said = [*plan.notes, *_without_certificate(tick), *notes]
     draining = set(plan.draining) | {end.id for end in plan.terminations} | observed.ending
     replicas = [_replica(one, draining, history, observed.now) for one in judged]
     members = tick.membership.members if tick.membership is not None else ()
     by_hand = [member.id for member in members if member.id.slot >= FIRST_BY_HAND]
-    starting = Phase.STARTING.value
+    gateways = tick.membership.topology.gateways if tick.membership is not None else ()
+    bare = [Reason(Cause.NO_CERTIFICATE, name=g.name) for g in gateways if not g.generations]
+    said = [*plan.notes, *bare, *notes]
+    starting, update = Phase.STARTING.value, None
+    if (one := tick.update) is not None:
+        update = UpdateStatus(one.state.value, one.done, one.of, words(one.fault), one.fault)
     return PoolStatus(
         pool=tick.identity.name,
         uid=tick.identity.uid,
@@ -371,15 +375,8 @@ def of_tick(
         topology=_topology(tick),
         applied=tick.file,
         manager_version=__version__,
-        update=_update(tick),
+        update=update,
     )
-
-
-def _update(tick: Tick) -> UpdateStatus | None:
-    one = tick.update
-    if one is None:
-        return None
-    return UpdateStatus(one.state.value, one.done, one.of, words(one.fault), one.fault)
 
 
 def _topology(tick: Tick) -> dict[str, Any]:
@@ -393,16 +390,6 @@ def _topology(tick: Tick) -> dict[str, Any]:
         "through": here.through,
         "links": [],
     }
-
-
-def _without_certificate(tick: Tick) -> list[Reason]:
-    if tick.membership is None:
-        return []
-    return [
-        Reason(Cause.NO_CERTIFICATE, name=gateway.name)
-        for gateway in tick.membership.topology.gateways
-        if not gateway.generations
-    ]
 
 
 def _replica(
