@@ -10,7 +10,6 @@ has. Not here: the action's other services (`responder`).
 import logging
 import math
 import threading
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
@@ -78,7 +77,7 @@ class GoalsOnce:
         self,
         services: Collection[str],
         is_ready: Callable[[str], bool],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float],
     ) -> None:
         self._servers = {service: _ActionServer() for service in services}
         self._is_ready = is_ready
