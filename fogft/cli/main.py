@@ -1,11 +1,12 @@
 """The ``fogft`` command: runs a command and turns its outcome into an exit status.
 
-Exit status: 0 done; 1 a `FogftError`, told without a stack trace; 2 wrong usage; 130 interrupted;
+Exit status: 0 done; 1 a `FogftError` or a file that fails, without a stack trace; 2 wrong usage; 130 interrupted;
 141 nobody reads stdout any more. Anything else is a defect of ours and keeps its trace.
 
 Imports that take long are made inside the command that needs them (tests/cli/test_elsewhere).
 """
 
+import errno
 import os
 import sys
 from collections.abc import Sequence
@@ -95,9 +96,10 @@ def _run(args: Sequence[str]) -> int:
         _explain_usage(problem)
         return 2
     except OSError as problem:
-        if problem.filename is None:  # a connection's, not a file's
-            raise
-        output.error(f"`{problem.filename}`: {problem.strerror}", "check its owner, and the disk")
+        if problem.filename is None and problem.errno != errno.ENOSPC:
+            raise  # a connection's, not a file's
+        where = "an open file" if problem.filename is None else f"`{problem.filename}`"
+        output.error(f"{where}: {problem.strerror}", "check its owner, and the disk")
         return 1
     return 0
 

@@ -53,6 +53,16 @@ def test_a_file_that_is_not_ours_is_an_error_and_no_trace(tmp_path, monkeypatch,
     assert said.startswith(f"error: `{home / 'pools'}`: Not a directory\n")
 
 
+def test_a_full_disk_behind_stdout_is_an_error_and_no_trace(home, tmp_path):
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -m fogft --help > /dev/full"],
+        env={**os.environ, "FOGFT_HOME": str(home)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode != 0
+    assert "No space left on device" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_broken_pipe_that_is_not_stdout_is_a_defect_of_ours(monkeypatch):
     """Only a closed stdout is excused: a socket that breaks must not end us in silence."""
     with pytest.raises(BrokenPipeError):
