@@ -1,7 +1,8 @@
 """The ``fogft`` command: runs a command and turns its outcome into an exit status.
 
-Exit status: 0 done; 1 a `FogftError` or a file that fails, without a stack trace; 2 wrong usage; 130 interrupted;
-141 nobody reads stdout any more. Anything else is a defect of ours and keeps its trace.
+Exit status: 0 done; 1 a `FogftError`, or a file that fails, told without a stack trace; 2 wrong
+usage; 130 interrupted; 141 nobody reads stdout any more. Anything else is a defect of ours and
+keeps its trace.
 
 Imports that take long are made inside the command that needs them (tests/cli/test_elsewhere).
 """
