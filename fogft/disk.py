@@ -205,7 +205,9 @@ class Lock:
     @property
     def lost(self) -> bool:
         """Whether its file was removed while we hold it: another may hold that of a new one."""
-        return self._descriptor is not None and not os.fstat(self._descriptor).st_nlink
+        if self._descriptor is None or os.fstat(self._descriptor).st_nlink:
+            return False
+        return not self._path.exists() or self._was_replaced(self._descriptor)
 
     def release(self) -> None:
         """Give the lock back. Repeatable."""
