@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import signal
 import subprocess
 import sys
@@ -297,10 +298,14 @@ def test_a_down_that_is_killed_leaves_no_key_of_a_pool_that_is_not_listed(
     scene.write()
     assert list(scene.paths.credentials.glob("*.key"))
 
-    def killed(_folder: Path) -> None:
-        raise KeyboardInterrupt
+    rmtree = shutil.rmtree
 
-    monkeypatch.setattr(shutdown, "_remove", killed)
+    def killed(folder: Path, **options: bool) -> None:
+        if folder == scene.paths.folder:
+            raise KeyboardInterrupt
+        rmtree(folder, **options)
+
+    monkeypatch.setattr(shutdown.shutil, "rmtree", killed)
     with pytest.raises(KeyboardInterrupt):
         scene.end()
     assert not scene.paths.identity.exists()
