@@ -6,6 +6,7 @@ Not here: which of them the robot proxies (`fogft.pool.folder.discovered`).
 """
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from fogft.model.names import NAMES_BYTES_LIMIT
 from fogft.model.spec import ServiceSpec
@@ -17,19 +18,16 @@ SETTLED_S = 1.0  # unchanged for so long: what starts is not told piece by piece
 _TOLD = 8  # names in a sentence
 
 
+@dataclass(eq=False)
 class Offering:
     """The services of one replica: those of the configuration, or what is found out."""
 
-    def __init__(
-        self,
-        services: tuple[ServiceSpec, ...],
-        define: Callable[[str], Definition] | None,
-        clock: Callable[[], float],
-    ) -> None:
-        self.services = services
-        self._finds_out = not services
-        self._define = define
-        self._clock = clock
+    services: tuple[ServiceSpec, ...]
+    define: Callable[[str], Definition] | None
+    clock: Callable[[], float]
+
+    def __post_init__(self) -> None:
+        self._finds_out = not self.services
         self._definitions: dict[str, Definition] = {}
         self._seen: Mapping[str, str] = {}
         self._left_out = 0
@@ -37,7 +35,7 @@ class Offering:
 
     def look(self, node: RosNode, *, complete: bool) -> tuple[ServiceSpec, ...]:
         """Return services that are new in the graph. `complete`: all listed ones answer."""
-        now = self._clock()
+        now = self.clock()
         if complete and not self._finds_out:
             self._seen = {}
             return ()
@@ -58,14 +56,14 @@ class Offering:
 
     def reset(self) -> None:
         """Forget the services seen, because `run` has exited."""
-        self._seen, self._seen_since = {}, self._clock()
+        self._seen, self._seen_since = {}, self.clock()
 
     def told(self, ready: frozenset[str]) -> dict[str, str]:
         """Return name -> type of the services to tell, once stable; else nothing.
 
         All that were discovered, or those listed that `run` offers as another type.
         """
-        if self._clock() < self._seen_since + SETTLED_S:
+        if self.clock() < self._seen_since + SETTLED_S:
             return {}
         return dict(self._seen) if self._finds_out else self._mistyped(ready)
 
@@ -76,11 +74,11 @@ class Offering:
 
     def types(self) -> dict[str, Definition]:
         """Return the definitions of all types here; nothing until each is known."""
-        if self._define is not None:
+        if self.define is not None:
             for service in self.services:
                 found = self._definitions.get(service.type)
                 if found is None or not found.known:
-                    self._definitions[service.type] = self._define(service.type)
+                    self._definitions[service.type] = self.define(service.type)
         told = dict(self._definitions)
         return told if all(definition.known for definition in told.values()) else {}
 

@@ -6,8 +6,8 @@ decision is made, never while something is sent.
 
 import logging
 import threading
-import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from fogft.errors import RosError, Unreadable
@@ -32,18 +32,15 @@ class Clients(NamedTuple):
     restore: RosClient
 
 
+@dataclass(eq=False)
 class OrderedResponder:
     """Applies the requests of one stateful service, in their order."""
 
-    def __init__(
-        self,
-        name: str,
-        state: StateBytes,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._name = name
-        self._state = state
-        self._clock = clock
+    name: str
+    state: StateBytes
+    clock: Callable[[], float]
+
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._machine: OrderedReplica[Incoming] = OrderedReplica()
         self._clients: Clients | None = None
@@ -97,7 +94,7 @@ class OrderedResponder:
         with self._lock:
             if not self._machine.works_on(begin.serial):
                 return  # its service has died since, and another one is not to be given it
-            self._begun, self._begun_at = begin, self._clock()
+            self._begun, self._begun_at = begin, self.clock()
             clients = self._clients
         try:
             if clients is None:
@@ -105,17 +102,17 @@ class OrderedResponder:
             if begin.op is Op.APPLY:
                 clients.service.call(begin.payload, lambda answer: self._done(begin, answer))
             elif begin.op is Op.SNAPSHOT:
-                request = self._state.snapshot_request()
+                request = self.state.snapshot_request()
                 clients.snapshot.call(request, lambda answer: self._answered(begin, answer))
             else:
-                request = self._state.restore_request(begin.payload)
+                request = self.state.restore_request(begin.payload)
                 clients.restore.call(request, lambda answer: self._answered(begin, answer))
         except Unreadable as error:
-            log.warning("request_unreadable service=%s reason=%r", self._name, error.message)
+            log.warning("request_unreadable service=%s reason=%r", self.name, error.message)
             self._done(begin, None)
         except RosError as error:
             if begin.op is Op.APPLY:
-                log.warning("request_not_passed_on service=%s reason=%r", self._name, error.message)
+                log.warning("request_not_passed_on service=%s reason=%r", self.name, error.message)
                 self._again = begin
             else:
                 self._failed(begin, error)
@@ -124,10 +121,10 @@ class OrderedResponder:
         answer = b""
         try:
             if begin.op is Op.SNAPSHOT:
-                answer = self._state.read_snapshot(response)
+                answer = self.state.read_snapshot(response)
             else:
-                self._state.check_restored(response)
-                log.info("state_restored service=%s bytes=%d", self._name, len(begin.payload))
+                self.state.check_restored(response)
+                log.info("state_restored service=%s bytes=%d", self.name, len(begin.payload))
         except RosError as error:
             self._failed(begin, error)
         else:
@@ -135,8 +132,8 @@ class OrderedResponder:
 
     def _failed(self, begin: Begin, error: RosError) -> None:
         what = begin.op.name.lower()
-        self.detail = f"the {what} of `{self._name}` failed: {error.message}"
-        log.error("state_%s_failed service=%s reason=%r", what, self._name, error.message)
+        self.detail = f"the {what} of `{self.name}` failed: {error.message}"
+        log.error("state_%s_failed service=%s reason=%r", what, self.name, error.message)
         self._done(begin, None)
 
     def _done(self, begin: Begin, answer: bytes | None) -> None:
@@ -164,7 +161,7 @@ class OrderedResponder:
             self._machine.serving = alive and there
             again, self._again = self._again, None
             begun = self._begun
-            waited_s = self._clock() - self._begun_at
+            waited_s = self.clock() - self._begun_at
         if again is not None:
             self._begin(again)
         elif begun is not None and begun.op is Op.SNAPSHOT and waited_s > _SNAPSHOT_LIMIT_S:

@@ -11,6 +11,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
 from fogft.child import how_it_ended, tied
@@ -18,6 +19,7 @@ from fogft.child import how_it_ended, tied
 log = logging.getLogger(__name__)
 
 
+@dataclass(eq=False)
 class Supervisor:
     """One command, kept running. All methods are called from the main thread only.
 
@@ -35,24 +37,17 @@ class Supervisor:
     # at work.
     backoff_s = 0.5, 15.0
 
-    def __init__(
-        self,
-        command: str,
-        workdir: Path,
-        environ: Mapping[str, str],
-        *,
-        domain_id: int | None = None,
-        clock: Callable[[], float] = time.monotonic,
-        stdout: int | None = None,
-    ) -> None:
-        self._stdout = stdout
-        self._command = command
-        self._workdir = workdir
-        self.domain_id = domain_id
-        self.environ = dict(environ)
-        if domain_id is not None:
-            self.environ["ROS_DOMAIN_ID"] = str(domain_id)
-        self._clock = clock
+    command: str
+    workdir: Path
+    environ: Mapping[str, str]
+    _: KW_ONLY
+    domain_id: int | None = None
+    clock: Callable[[], float] = time.monotonic
+    stdout: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.domain_id is not None:
+            self.environ = {**self.environ, "ROS_DOMAIN_ID": str(self.domain_id)}
         self._wait_s = 0.0  # the first restart is at once
         self.start_at = 0.0
         self._started_at = 0.0
@@ -77,14 +72,14 @@ class Supervisor:
                 return False
             died = True
             self._note_death(status, at_work=at_work)
-        if self._clock() >= self.start_at:
+        if self.clock() >= self.start_at:
             self._start()
         return died
 
     def _note_death(self, status: int, *, at_work: bool) -> None:
         assert self._child is not None
         self._kill_group(self._child.pid)  # what it left behind in its group
-        ran_s = self._clock() - self._started_at
+        ran_s = self.clock() - self._started_at
         if ran_s > self.backoff_s[1] or at_work:
             self._wait_s = 0.0
         self.last_exit = how_it_ended(status)
@@ -94,19 +89,19 @@ class Supervisor:
 
     def _delay_next_start(self) -> None:
         first_s, longest_s = self.backoff_s
-        self.start_at = self._clock() + self._wait_s
+        self.start_at = self.clock() + self._wait_s
         self._wait_s = min(max(2 * self._wait_s, first_s), longest_s)
 
     def _start(self) -> None:
-        self._started_at = self._clock()
+        self._started_at = self.clock()
         self.restarts += 1
         try:
             self._child = subprocess.Popen(
-                tied(["bash", "-c", self._command]),
-                cwd=self._workdir,
+                tied(["bash", "-c", self.command]),
+                cwd=self.workdir,
                 env=self.environ,
                 stdin=subprocess.DEVNULL,
-                stdout=self._stdout,
+                stdout=self.stdout,
                 start_new_session=True,
             )
         except OSError as error:
@@ -114,7 +109,7 @@ class Supervisor:
             self._delay_next_start()
             log.error("run_not_started reason=%r", str(error))
             return
-        log.info("run_started pid=%d command=%r", self._child.pid, self._command)
+        log.info("run_started pid=%d command=%r", self._child.pid, self.command)
 
     def restart(self) -> None:
         """Kill the command; `poll` notices and restarts it."""
