@@ -10,6 +10,7 @@ import itertools
 import logging
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from fogft.records import frames
@@ -26,44 +27,38 @@ _WAITING_LIMIT = 4 << 20
 _READ_BYTES = 64 << 10
 
 
+@dataclass(eq=False)
 class Connection:
     """One open connection with an authenticated peer."""
 
-    def __init__(
-        self,
-        reader: asyncio.StreamReader,
-        writer: asyncio.StreamWriter,
-        unframer: frames.Unframer,
-        name: str,
-    ) -> None:
-        self.name = name
-        self._reader = reader
-        self._writer = writer
-        self._unframer = unframer
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+    unframer: frames.Unframer
+    name: str
 
     def send(self, data: bytes) -> None:
         """Queue bytes; a peer that stops reading is disconnected."""
-        if self._writer.transport.get_write_buffer_size() > _WAITING_LIMIT:
+        if self.writer.transport.get_write_buffer_size() > _WAITING_LIMIT:
             self.abort()
             return
-        self._writer.write(data)
+        self.writer.write(data)
 
     async def messages(self) -> list[dict[str, Any]]:
         """Return the next messages; an empty list at the end of the stream.
 
         Raises asyncio.TimeoutError if nothing came for `SILENCE_S`.
         """
-        found = list(self._unframer.feed(b""))  # what came along with a greeting
+        found = list(self.unframer.feed(b""))  # what came along with a greeting
         while not found:
-            data = await asyncio.wait_for(self._reader.read(_READ_BYTES), SILENCE_S)
+            data = await asyncio.wait_for(self.reader.read(_READ_BYTES), SILENCE_S)
             if not data:
                 return []
-            found = list(self._unframer.feed(data))
+            found = list(self.unframer.feed(data))
         return found
 
     def abort(self) -> None:
         """Close it at once."""
-        self._writer.transport.abort()
+        self.writer.transport.abort()
 
 
 class Exchange:

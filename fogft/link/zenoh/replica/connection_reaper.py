@@ -16,6 +16,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import KW_ONLY, dataclass
 
 from fogft.counters import Counters
 from fogft.link.socket_progress import SocketProgress
@@ -50,6 +51,7 @@ def surplus(links: Mapping[Address, str]) -> list[Address]:
     return found
 
 
+@dataclass(eq=False)
 class ConnectionReaper:
     """Watches one port until closed; has in `thin` the holders to whom a link is thin.
 
@@ -58,27 +60,19 @@ class ConnectionReaper:
     `stuck_after_s`. `also` is done at each look.
     """
 
-    def __init__(
-        self,
-        port: int,
-        links: Callable[[], Mapping[Address, str]],
-        revoked: Callable[[], Collection[str]],
-        counters: Counters,
-        *,
-        thin: set[str],
-        also: Callable[[], None],
-        stuck_after_s: float,
-    ) -> None:
-        self._port = port
-        self._links = links
-        self._revoked = revoked
-        self._counters = counters
-        self._also = also
-        self._stuck_after_s = stuck_after_s
-        self._thin = thin
+    port: int
+    links: Callable[[], Mapping[Address, str]]
+    revoked: Callable[[], Collection[str]]
+    counters: Counters
+    _: KW_ONLY
+    thin: set[str]
+    also: Callable[[], None]
+    stuck_after_s: float
+
+    def __post_init__(self) -> None:
         self._progress: dict[Address, SocketProgress] = {}
         self._linked: dict[Address, str] = {}  # oldest first
-        self._filter = ListenFilter(port)
+        self._filter = ListenFilter(self.port)
         self._door = Door()
         self._reserve: list[int] = []
         self._fill_reserve()
@@ -98,9 +92,9 @@ class ConnectionReaper:
         while not self._stop.is_set():
             try:
                 self.look(time.monotonic())
-                self._also()
+                self.also()
             except Exception:
-                log.exception("doorkeeper_failed port=%d", self._port)
+                log.exception("doorkeeper_failed port=%d", self.port)
                 self._filter.drop(frozenset())
             self._await_look()
         self._filter.close()
@@ -138,14 +132,14 @@ class ConnectionReaper:
         if short:
             self._filter.drop(None)  # first: what is given back is not for strangers
             self._release_reserve()
-            self._counters.warn(log, "descriptors_short", "descriptors_short port=%d", self._port)
+            self.counters.warn(log, "descriptors_short", "descriptors_short port=%d", self.port)
         with contextlib.ExitStack() as stack:
             found = {
                 peer: stack.enter_context(connection)
-                for peer, connection in sockets.connections(self._port)
+                for peer, connection in sockets.connections(self.port)
             }
-            links = self._links()  # after the sockets: who is in by now is no stranger
-            revoked = self._revoked()
+            links = self.links()  # after the sockets: who is in by now is no stranger
+            revoked = self.revoked()
             for peer, name in links.items():
                 if name in revoked and peer in found:
                     self._end(found[peer], peer, "revoked_links", name)
@@ -168,7 +162,7 @@ class ConnectionReaper:
         self._filter.drop(hosts)
         shut = hosts is None or bool(hosts)
         if shut and not self._shut:
-            self._counters.warn(
+            self.counters.warn(
                 log, "kept_out", "door_shut hosts=%s", "all" if hosts is None else sorted(hosts)
             )
             self._filter.turn_away()
@@ -191,15 +185,15 @@ class ConnectionReaper:
             if rate is not None and rate < THIN_BYTES_PER_S:
                 thin.add(links[peer])
                 sockets.keep_short(found[peer])
-            if one.stuck_s(now) > self._stuck_after_s:
+            if one.stuck_s(now) > self.stuck_after_s:
                 self._end(found[peer], peer, "stuck_links", links[peer])
         self._progress = progress
-        self._thin &= thin
-        self._thin |= thin
+        self.thin &= thin
+        self.thin |= thin
 
     def _end(self, connection: socket.socket, peer: Address, event: str, name: str) -> None:
         sockets.end(connection)
-        self._counters.warn(
+        self.counters.warn(
             log, event, "connection_ended reason=%s peer=%s:%d name=%r", event, *peer, name
         )
 
