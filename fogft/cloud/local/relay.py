@@ -11,6 +11,7 @@ import math
 import socket
 import struct
 import time
+from dataclasses import dataclass
 from functools import partial
 
 from fogft.cloud.local.faults import LinkFaults
@@ -54,34 +55,34 @@ class Shaper:
         return self._free_at + self.delay_s
 
 
+@dataclass(eq=False)
 class _Pipe:
     """Bytes from one socket to another, both non-blocking. An empty chunk is the end."""
 
-    def __init__(
-        self, source: socket.socket, target: socket.socket, shaper: Shaper, passes: asyncio.Event
-    ) -> None:
-        self._source = source
-        self._target = target
-        self._shaper = shaper
-        self._passes = passes
+    source: socket.socket
+    target: socket.socket
+    shaper: Shaper
+    passes: asyncio.Event
+
+    def __post_init__(self) -> None:
         self._chunks: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
         self._has_room = asyncio.Event()
         self.held_bytes = 0
 
     def put(self, chunk: bytes) -> None:
         """Put a chunk on the path."""
-        self._chunks.put_nowait((self._shaper.arrival(len(chunk), time.monotonic()), chunk))
+        self._chunks.put_nowait((self.shaper.arrival(len(chunk), time.monotonic()), chunk))
         self.held_bytes += len(chunk)
 
     async def receive(self) -> None:
         loop = asyncio.get_running_loop()
         chunk = b"-"
         while chunk:
-            await self._passes.wait()
-            chunk = await loop.sock_recv(self._source, self._shaper.chunk_bytes)
-            await self._passes.wait()
+            await self.passes.wait()
+            chunk = await loop.sock_recv(self.source, self.shaper.chunk_bytes)
+            await self.passes.wait()
             self.put(chunk)
-            while self.held_bytes > self._shaper.room_bytes:
+            while self.held_bytes > self.shaper.room_bytes:
                 self._has_room.clear()
                 await self._has_room.wait()
 
@@ -91,11 +92,11 @@ class _Pipe:
             arrives_at, chunk = await self._chunks.get()
             if arrives_at > time.monotonic():
                 await asyncio.sleep(arrives_at - time.monotonic())
-            await self._passes.wait()
+            await self.passes.wait()
             if not chunk:
-                self._target.shutdown(socket.SHUT_WR)
+                self.target.shutdown(socket.SHUT_WR)
                 return
-            await loop.sock_sendall(self._target, chunk)
+            await loop.sock_sendall(self.target, chunk)
             self.held_bytes -= len(chunk)
             self._has_room.set()
 

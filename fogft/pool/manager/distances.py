@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -95,45 +95,42 @@ def connect_time(host: str, port: int) -> float:
     return min(times)
 
 
+@dataclass(eq=False)
 class Latencies:
     """This machine's round trips by ``cloud/region``, cached in a file."""
 
-    def __init__(
-        self,
-        file: Path,
-        *,
-        clock: Callable[[], float] = time.time,
-        endpoint: Callable[[str], tuple[str, int] | None] = endpoint,
-        connect: Callable[[str, int], float] | None = None,
-    ) -> None:
-        self._file = file
-        self._clock = clock
-        self._endpoint = endpoint
-        self._connect = connect or connect_time
+    file: Path
+    _: KW_ONLY
+    clock: Callable[[], float] = time.time
+    endpoint: Callable[[str], tuple[str, int] | None] = endpoint
+    connect: Callable[[str, int], float] | None = None
+
+    def __post_init__(self) -> None:
+        self._connect = self.connect or connect_time
 
     def measured(self) -> Mapping[str, Distance]:
         """Return the measured round trips, whatever their age. A damaged file counts as empty."""
         try:
-            return stored(dict[str, Distance], disk.read_json(self._file) or {}, "")
+            return stored(dict[str, Distance], disk.read_json(self.file) or {}, "")
         except StateError:
             return {}
 
     def stale(self, regions: Collection[str]) -> list[str]:
         """Return the regions to measure: never measured, a day ago, or in the future."""
-        kept, now = self.measured(), self._clock()
+        kept, now = self.measured(), self.clock()
         return sorted(
             region
             for region in regions
-            if self._endpoint(region) is not None
+            if self.endpoint(region) is not None
             and not (region in kept and 0 <= now - kept[region].as_of < FRESH_S)
         )
 
     def measure(self, regions: Iterable[str]) -> Mapping[str, str]:
         """Measure regions in parallel and store the results; return failures with reasons."""
-        wanted = [(r, e) for r in sorted(set(regions)) if (e := self._endpoint(r)) is not None]
+        wanted = [(r, e) for r in sorted(set(regions)) if (e := self.endpoint(r)) is not None]
         if not wanted:
             return {}
-        now, failed = self._clock(), {}
+        now, failed = self.clock(), {}
         found: dict[str, Distance] = {}
         with ThreadPoolExecutor(min(8, len(wanted)), "latency") as pool:
             for (region, _), result in zip(wanted, pool.map(self._try, wanted), strict=True):
@@ -142,11 +139,11 @@ class Latencies:
                 else:
                     failed[region] = result
         if found:
-            disk.make_folder(self._file.parent)
-            with disk.locked(self._file.with_suffix(".lock")):  # other managers measure, too
+            disk.make_folder(self.file.parent)
+            with disk.locked(self.file.with_suffix(".lock")):  # other managers measure, too
                 kept = {**self.measured(), **found}
                 plain = {r: {"rtt_s": d.rtt_s, "as_of": d.as_of} for r, d in kept.items()}
-                disk.write_json(self._file, plain, durable=False)
+                disk.write_json(self.file, plain, durable=False)
         return failed
 
     def known(

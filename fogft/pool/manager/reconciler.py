@@ -10,7 +10,7 @@ import functools
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,6 +97,7 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
     )
 
 
+@dataclass(eq=False)
 class Reconciler:
     """Reconciles one pool with its spec.
 
@@ -104,45 +105,34 @@ class Reconciler:
     good certificates, by name; `gateway` is the one that the pool may launch.
     """
 
-    def __init__(
-        self,
-        cloud: Cloud,
-        store: PoolStore,
-        *,
-        clock: Callable[[], Reading],
-        links: Links,
-        build_order: BuildOrder = bare_order,
-        submit: Submit = lambda run: run(),
-        epoch: int = 1,
-        revoked: Callable[[], frozenset[str]] = frozenset,
-        by_hand: Callable[[], frozenset[ReplicaId]] = frozenset,
-        gateways: Callable[[], Mapping[str, tuple[int, ...]]] = dict,
-        gateway: LaunchedGateway | None = None,
-        on_done: Callable[[], None] = lambda: None,
-        distances: Distances = lambda spec, *_: spec.placement.rtt_s,
-    ) -> None:
-        self._cloud = cloud
-        self._refreshing = cloud if isinstance(cloud, Refreshing) else None
-        self._stopping = cloud if isinstance(cloud, RealCloud) else None
-        self._distances = distances
-        self._store = store
-        self._links = links
-        self._build_order = build_order
-        self._epoch = epoch
-        self._revoked = revoked
-        self._by_hand = by_hand
-        self._gateways = gateways
-        self._gateway = gateway
+    cloud: Cloud
+    store: PoolStore
+    _: KW_ONLY
+    clock: Callable[[], Reading]
+    links: Links
+    build_order: BuildOrder = bare_order
+    submit: Submit = lambda run: run()
+    epoch: int = 1
+    revoked: Callable[[], frozenset[str]] = frozenset
+    by_hand: Callable[[], frozenset[ReplicaId]] = frozenset
+    gateways: Callable[[], Mapping[str, tuple[int, ...]]] = dict
+    gateway: LaunchedGateway | None = None
+    on_done: Callable[[], None] = lambda: None
+    distances: Distances = lambda spec, *_: spec.placement.rtt_s
+
+    def __post_init__(self) -> None:
+        self._refreshing = self.cloud if isinstance(self.cloud, Refreshing) else None
+        self._stopping = self.cloud if isinstance(self.cloud, RealCloud) else None
         # The machine that is expected of a launch; None for a termination.
-        self.operations: Operations[Machine | None] = Operations(submit, on_done)
-        self._refreshes: Operations[None] = Operations(submit, on_done)
+        self.operations: Operations[Machine | None] = Operations(self.submit, self.on_done)
+        self._refreshes: Operations[None] = Operations(self.submit, self.on_done)
         self._silent = Silent()
         self._offers: tuple[Offer, ...] = ()
         self._offers_for: tuple[str, float] | None = None
-        self._updating = Updating(store)
-        self._time = Timekeeping(store, self._updating, clock)
-        self._recorder = EventRecorder(store, lambda: self._time.now)
-        self._membership: Membership | None = store.membership()
+        self._updating = Updating(self.store)
+        self._time = Timekeeping(self.store, self._updating, self.clock)
+        self._recorder = EventRecorder(self.store, lambda: self._time.now)
+        self._membership: Membership | None = self.store.membership()
         self._published_for: tuple[Any, ...] | None = None  # what it follows from
         self._log_tail = ""  # of the last replica that was ended because it was never ready
 
@@ -154,8 +144,8 @@ class Reconciler:
         """
         if self._time.look():  # first: who waits for a change trusts what is dated after it
             self._silent = Silent()
-        identity, spec, intent = self._store.identity(), self._store.spec(), self._store.intent()
-        history = self._store.history()
+        identity, spec, intent = self.store.identity(), self.store.spec(), self.store.intent()
+        history = self.store.history()
         self._settle_outcomes()
         observed, trouble = self._observe(identity, spec)
         asked, (spec, trial) = spec, self._updating.look(identity.uid, observed, history)
@@ -220,7 +210,7 @@ class Reconciler:
         now = self._time.now
         machines: tuple[Machine, ...] | None = None
         try:
-            listed = {m.id: m for m in self._cloud.machines(identity.uid)}
+            listed = {m.id: m for m in self.cloud.machines(identity.uid)}
             for id, order in busy.items():
                 if order is not None:
                     found = listed.get(id, order)
@@ -232,8 +222,8 @@ class Reconciler:
             trouble.append(Reason(Cause.NO_ANSWER, words=told(error)))
         sold = self._current_offers(spec, now, trouble) if machines is not None else ()
         ending = frozenset(id for id, order in busy.items() if order is None)
-        links = self._links(identity.uid, now)
-        rtt_s = self._distances(spec, sold, machines or (), links or ())
+        links = self.links(identity.uid, now)
+        rtt_s = self.distances(spec, sold, machines or (), links or ())
         gateway = tuple(m for m in machines or () if m.id.slot == GATEWAY_SLOT)
         stopped = tuple(m for m in machines or () if m.phase is MachinePhase.STOPPED)
         if machines is not None and (gateway or stopped):
@@ -263,7 +253,7 @@ class Reconciler:
         known = self._offers_for
         if known is None or known[0] != key or not 0 <= now - known[1] < OFFERS_EVERY_S:
             try:
-                sold = offers.ask(self._cloud, spec)
+                sold = offers.ask(self.cloud, spec)
                 if sold != self._offers:  # the planner keeps what it worked out of a tuple
                     self._offers = sold
                 self._offers_for = (key, now)
@@ -277,12 +267,12 @@ class Reconciler:
         self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
     ) -> Reason | None:
         """See to the gateway that the pool launches; return why no replica is launched before."""
-        if self._gateway is None or not (spec.gateway.launch or observed.gateway):
+        if self.gateway is None or not (spec.gateway.launch or observed.gateway):
             return None
-        step = self._gateway.look(spec, intent, observed, history)
+        step = self.gateway.look(spec, intent, observed, history)
         cloud = self._refreshing
-        is_seen = self._gateway.up_at == observed.now
-        is_doubted = cloud is not None and self._gateway.is_doubted(observed.now)
+        is_seen = self.gateway.up_at == observed.now
+        is_doubted = cloud is not None and self.gateway.is_doubted(observed.now)
         for machine in observed.gateway:
             record = history.record(machine.id.slot, machine.id.generation)
             was_up = record is not None and record.first_ready_at is not None
@@ -297,7 +287,7 @@ class Reconciler:
             self._terminate(id, reason, history)
         if step.launch is not None:
             generation = history.generations[GATEWAY_SLOT] + 1
-            order = self._gateway.order(spec, step.launch, generation)
+            order = self.gateway.order(spec, step.launch, generation)
             self._order(order, Reason(Cause.NEW_SLOT))
         there = step.host and spec.dial_in == spec.gateway.endpoints(step.host)[2]
         return None if there or not spec.gateway.launch else step.note
@@ -312,7 +302,7 @@ class Reconciler:
         stops = standbys.stopped(spec, plan.terminations, observed) if self._stopping else {}
         for planned in plan.launches:
             started = starts.get(planned.slot)
-            order = self._build_order(identity, spec, started or planned)
+            order = self.build_order(identity, spec, started or planned)
             order = replace(order, is_there=started is not None)
             if slack is not None:
                 order = replace(order, limit_usd_per_hour=order.usd_per_hour + slack)
@@ -337,10 +327,10 @@ class Reconciler:
                 self._recorder.add(EventKind.UNDRAINED, machine.id)
 
     def _publish(self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan) -> None:
-        revoked = self._revoked()
+        revoked = self.revoked()
         found = Found.of(spec)
-        by_hand = self._by_hand() if found is not Found.BY_CLOUD else frozenset()
-        gateways = self._gateways() if spec.topology else {}
+        by_hand = self.by_hand() if found is not Found.BY_CLOUD else frozenset()
+        gateways = self.gateways() if spec.topology else {}
         ending = {end.id for end in plan.terminations} | observed.ending
         machines = observed.machines or ()
         if found is Found.BY_CLOUD:  # others can be found by nobody
@@ -361,13 +351,13 @@ class Reconciler:
             self._membership,
             pool=identity.name,
             pool_uid=identity.uid,
-            epoch=self._epoch,
+            epoch=self.epoch,
             members=members,
             revoked=revoked,
             topology=certified(spec.topology, gateways) if spec.topology else None,
         )
         if membership is not None:
-            self._store.write_membership(membership)
+            self.store.write_membership(membership)
             self._membership = membership
         self._published_for = cause
 
@@ -391,7 +381,7 @@ class Reconciler:
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
         )
-        self.operations.start(order.id, expected, lambda: self._cloud.launch(order))
+        self.operations.start(order.id, expected, lambda: self.cloud.launch(order))
 
     def _terminate(
         self, id: ReplicaId, reason: Reason, history: History, *, stopped: Launch | None = None
@@ -417,15 +407,15 @@ class Reconciler:
             raise
         except CloudError as error:
             log.warning("stop_refused replica=%s reason=%r", order.id.short, error.message)
-            self._cloud.terminate(order.id)
+            self.cloud.terminate(order.id)
 
     def _end(self, id: ReplicaId, *, keep_log: bool) -> None:
         """End a machine, off the loop; keep the end of its log where it says why it goes."""
         if keep_log:
             with contextlib.suppress(CloudError):
-                path = self._cloud.log(id)
+                path = self.cloud.log(id)
                 self._log_tail = logfile.tail(Path(path), lines=LOG_LINES) if path else ""
-        self._cloud.terminate(id)
+        self.cloud.terminate(id)
 
     def _with_log(self, note: Reason) -> Reason:
         """Return a note with the log of what was never ready."""
