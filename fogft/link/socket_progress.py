@@ -157,6 +157,7 @@ class SocketProgress:
 log = logging.getLogger(__name__)
 
 
+@dataclass(eq=False)
 class DeadlineFilter:
     """Judges the requests to `timed` services, of no use after their time. Any thread.
 
@@ -164,18 +165,13 @@ class DeadlineFilter:
     `left` the bytes that have not arrived by then at that rate; `packs` a service's compression.
     """
 
-    def __init__(
-        self,
-        timed: Collection[str],
-        carries: Callable[[float], float | None],
-        left: Callable[[float, float], float],
-        packs: Callable[[str], Compression | None],
-    ) -> None:
+    timed: Collection[str]
+    carries: Callable[[float], float | None]
+    left: Callable[[float, float], float]
+    packs: Callable[[str], Compression | None]
+
+    def __post_init__(self) -> None:
         self._counters = Counters()
-        self._timed = timed
-        self._carries = carries
-        self._left = left
-        self._packs = packs
 
     def may_arrive(
         self,
@@ -185,10 +181,10 @@ class DeadlineFilter:
         before: Callable[[str], Iterable[OpenAttempt]] = lambda service: (),
     ) -> bool:
         """Whether an attempt may arrive in time behind what leaves `before` it."""
-        rate = self._carries(now) if attempt.service in self._timed else None
+        rate = self.carries(now) if attempt.service in self.timed else None
         if rate is None:
             return True
-        size = self._left(now, rate) + sum(
+        size = self.left(now, rate) + sum(
             map(self._on_the_way, (attempt, *before(attempt.service)))
         )
         if size <= rate * remaining_s:
@@ -201,7 +197,7 @@ class DeadlineFilter:
 
     def _on_the_way(self, attempt: OpenAttempt) -> float:
         """Return how many bytes an attempt will be at least; 0 where that is not known."""
-        compression = self._packs(attempt.service)
+        compression = self.packs(attempt.service)
         if compression is None:
             return attempt.size
         ratio = compression.ratio

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from fogft.counters import worth_logging
@@ -258,18 +259,15 @@ class RobotTopic:
             log.warning("message_not_published topic=%s reason=%r", self.topic.name, error.message)
 
 
+@dataclass(eq=False)
 class TopicsOnRobot:
     """The topics of one client proxy."""
 
-    def __init__(
-        self,
-        wake: Callable[[], None],
-        merge: Merge = lambda said: None,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._wake = wake
-        self._merge = merge
-        self._clock = clock
+    wake: Callable[[], None]
+    merge: Merge = lambda said: None
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
         self._topics: dict[str, RobotTopic] = {}
         self._trouble: dict[str, str] = {}
 
@@ -285,7 +283,7 @@ class TopicsOnRobot:
         for name, topic in wanted.items():
             if name in self._topics:
                 continue
-            one = RobotTopic(topic, self._clock, self._wake, self._merge)
+            one = RobotTopic(topic, self.clock, self.wake, self.merge)
             try:
                 one.open(node)
             except RosError as error:

@@ -13,6 +13,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from operator import itemgetter
 from typing import Any
@@ -85,6 +86,7 @@ class NodeProbes:
             self._by_client[client].call(EMPTY_LIST, lambda _: on_answer())
 
 
+@dataclass(eq=False)
 class Pacer:
     """Sends the responses of one service, at each client's pace. Any thread.
 
@@ -93,23 +95,17 @@ class Pacer:
         client_of: Returns who asked, of a request's handle: of its header in DDS, if not given.
     """
 
-    def __init__(
-        self,
-        send: Callable[[Any, bytes], None],
-        probes: NodeProbes,
-        service: str,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        client_of: Callable[[Any], bytes] = itemgetter(slice(_GUID_BYTES)),
-    ) -> None:
-        self._client_of = client_of
-        self._send = send
-        self._probes = probes
-        self._service = service
-        self._clock = clock
+    send: Callable[[Any, bytes], None]
+    probes: NodeProbes
+    service: str
+    _: KW_ONLY
+    clock: Callable[[], float] = time.monotonic
+    client_of: Callable[[Any], bytes] = itemgetter(slice(_GUID_BYTES))
+
+    def __post_init__(self) -> None:
         self._pace = Pace()
         self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
-        self._asked: dict[bytes, float] = {}  # those whose nodes may answer probes: until when
+        self._asked: dict[bytes, float] = {}  # those whose nodes may answer self.probes: until when
         self._lock = threading.Lock()
         self._wake = threading.Condition(self._lock)
         self._thread: threading.Thread | None = None  # made when there is something to wait for
@@ -117,8 +113,8 @@ class Pacer:
 
     def requested(self, handle: Any, *, together: bool = False) -> None:
         """Note a request as it is taken; `together` with the one before it."""
-        now = self._clock()
-        id = self._client_of(handle)
+        now = self.clock()
+        id = self.client_of(handle)
         with self._lock:
             client = self._pace.client(id, now)
             client.requested(now, together=together)
@@ -135,8 +131,8 @@ class Pacer:
 
         Raises RosError: It was sent now, and ROS refused it.
         """
-        now = self._clock()
-        id = self._client_of(handle)
+        now = self.clock()
+        id = self.client_of(handle)
         with self._lock:
             client = self._pace.client(id, now)
             if client.waiting or client.finding_until or not self._pace.take(client, now):
@@ -150,9 +146,9 @@ class Pacer:
     def _try(self, id: bytes, client: ClientPace, handle: Any, payload: bytes) -> None:
         """Send now; have it wait if the client is not found yet. Raises RosError."""
         try:
-            self._send(handle, payload)
+            self.send(handle, payload)
         except NotFoundYet:
-            now = self._clock()
+            now = self.clock()
             with self._wake:
                 if client.finding_until is None or now < client.finding_until:
                     client.not_found(handle, payload, now)
@@ -172,10 +168,10 @@ class Pacer:
     def _run(self) -> None:
         while True:
             with self._wake:
-                due, probed, wait_s = self._step(self._clock())
+                due, probed, wait_s = self._step(self.clock())
                 if not due and not probed and not self._closed:
                     self._wake.wait(wait_s)
-                    due, probed, wait_s = self._step(self._clock())
+                    due, probed, wait_s = self._step(self.clock())
                 asked = list(self._asked)
                 if self._closed:
                     return
@@ -186,7 +182,7 @@ class Pacer:
                     log.warning("response_refused reason=%r", error.message)
             for id, count in probed:
                 for _ in range(count):
-                    self._probes.send(id, partial(self._answered, id))
+                    self.probes.send(id, partial(self._answered, id))
             for id in asked:
                 self._ask(id)
 
@@ -221,8 +217,8 @@ class Pacer:
         return due, probed, _LOOK_EVERY_S if self._held else None
 
     def _ask(self, id: bytes) -> None:
-        answers = self._probes.answers(self._service, id)
-        now = self._clock()
+        answers = self.probes.answers(self.service, id)
+        now = self.clock()
         with self._wake:
             if answers is None and now < self._asked.get(id, now):
                 return
@@ -230,11 +226,11 @@ class Pacer:
             self._pace.client(id, now).probing = Probing.YES if answers else Probing.NO
 
     def _answered(self, id: bytes) -> None:
-        now = self._clock()
+        now = self.clock()
         with self._wake:
             client = self._pace.client(id, now)
             later = self._pace.asked_after(client) if client.silent(now) else ()
-            if any(self._probes.same_node(id, other) for other in later):
+            if any(self.probes.same_node(id, other) for other in later):
                 return  # or what a killed node left open would push out its successor's responses
             client.answered_probe(now)
             self._wake.notify()

@@ -6,7 +6,7 @@ queue behind the replies of their robot. Requests and replies: `listener`, `repl
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import partial
 from typing import TypeVar
 
@@ -33,25 +33,17 @@ T = TypeVar("T")
 _STRANGERS = b""  # in place of a token: replies to whose connection is not known
 
 
+@dataclass(eq=False)
 class ControlQueries:
     """Answers the queries of robots; `records` is what the pool has signed, as known here."""
 
-    def __init__(
-        self,
-        *,
-        sessions: AuthenticatedSessions,
-        records: RecordSet,
-        streams: Streams,
-        queues: ReplyQueues,
-        work: WorkQueue,
-        counters: Counters,
-    ) -> None:
-        self._sessions = sessions
-        self._records = records
-        self._streams = streams
-        self._queues = queues
-        self._work_queue = work
-        self._counters = counters
+    _: KW_ONLY
+    sessions: AuthenticatedSessions
+    records: RecordSet
+    streams: Streams
+    queues: ReplyQueues
+    work: WorkQueue
+    counters: Counters
 
     def open_answers(self, asked: QueryEnd) -> None:
         """Handle an admitted connection's query for its stream of answers."""
@@ -60,12 +52,12 @@ class ControlQueries:
         except FrameError as error:
             self._malformed(error, asked)
             return
-        holder = self._sessions.holder(token)
+        holder = self.sessions.holder(token)
         if not holder:
             self._turn_away(asked, Refusal.NOT_ADMITTED, "it did not greet")
             return
-        for gone, query in self._streams.opened(token, asked.query, holder):
-            self._queues.end(gone, "gone", QueryEnd(query, asked.turns))
+        for gone, query in self.streams.opened(token, asked.query, holder):
+            self.queues.end(gone, "gone", QueryEnd(query, asked.turns))
 
     def probe(self, on_probe: Callable[[Probe], ProbeAnswer], asked: QueryEnd) -> None:
         """Handle a probe, which may carry a greeting."""
@@ -76,7 +68,7 @@ class ControlQueries:
 
         self._handle(asked, "probes", probe_frames.decode_probe, answer)
 
-    def records(self, asked: QueryEnd) -> None:
+    def exchange(self, asked: QueryEnd) -> None:
         """Handle signed records that a robot passes on."""
 
         def answer(offered: Sequence[SignedRecord]) -> bytes:
@@ -88,7 +80,7 @@ class ControlQueries:
     def _handle(
         self, asked: QueryEnd, event: str, read: Callable[[bytes], T], answer: Callable[[T], bytes]
     ) -> None:
-        self._counters.add(event)
+        self.counters.add(event)
         payload = asked.query.payload
         try:
             greeting = _greeting(asked.query)
@@ -101,27 +93,27 @@ class ControlQueries:
 
     def later(self, greeting: frame.Greeting, job: Callable[[], None], asked: QueryEnd) -> None:
         """Run a job on the other thread; if its sender's queue is full, just end the query."""
-        who = greeting.certificate or self._sessions.holder(greeting.token).encode()
-        if not self._work_queue.offer(job, who):
+        who = greeting.certificate or self.sessions.holder(greeting.token).encode()
+        if not self.work.offer(job, who):
             self._end_of_stranger(asked, "")
 
     def _turn_away(self, asked: QueryEnd, refusal: str, why: str) -> None:
-        self._counters.warn(log, "not_admitted", "robot_not_admitted reason=%r", why)
+        self.counters.warn(log, "not_admitted", "robot_not_admitted reason=%r", why)
         self._end_of_stranger(asked, refusal)
 
     def _malformed(self, error: ValueError, asked: QueryEnd) -> None:
-        self._counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
+        self.counters.warn(log, "malformed", "request_malformed reason=%r", str(error))
         self._end_of_stranger(asked, Refusal.MALFORMED)
 
     def _end_of_stranger(self, asked: QueryEnd, refusal: str) -> None:
         asked.refusal = refusal
-        self._queues.end(_STRANGERS, "strangers", asked)
+        self.queues.end(_STRANGERS, "strangers", asked)
 
     def _answer(
         self, greeting: frame.Greeting, asked: QueryEnd, answer: Callable[[], bytes]
     ) -> None:
         try:
-            self._sessions.greet(greeting)
+            self.sessions.greet(greeting)
         except NotAdmittedError as error:
             self._turn_away(asked, error.refusal, str(error))
             return
@@ -129,22 +121,22 @@ class ControlQueries:
             asked.query.reply(asked.query.key_expr, answer(), express=True)
         finally:
             # In its robot's own thread: unlike the answer, the end queues behind replies.
-            self._queues.end(greeting.token, "probe", asked)
+            self.queues.end(greeting.token, "probe", asked)
 
     def take(self, offered: Sequence[SignedRecord]) -> list[SignedRecord]:
         """Apply valid records; return what stands in place of those that are out of date."""
         newer: list[SignedRecord] = []
         for one in offered:
-            verdict = self._records.offer(one)
+            verdict = self.records.offer(one)
             if verdict is Verdict.REFUSED:
-                self._counters.add("records_refused")
-                log.warning("record_refused reason=%r", self._records.last_refusal)
+                self.counters.add("records_refused")
+                log.warning("record_refused reason=%r", self.records.last_refusal)
             elif verdict is Verdict.OLDER:
-                self._counters.add("records_older")
+                self.counters.add("records_older")
                 record = read_body(one)
-                held = self._records.get(record.kind, record.subject)
+                held = self.records.get(record.kind, record.subject)
                 newer += [] if held is None else [held.signed]
-        self._sessions.revoke(self._records.revoked)
+        self.sessions.revoke(self.records.revoked)
         return newer
 
 

@@ -136,7 +136,7 @@ class ZenohListener:
         self._hear(session, key(names.SERVICES), partial(self._request, on_request))
         self._hear(session, key(names.CANCEL), partial(self._cancel, on_cancel))
         self._declare(session, key(names.ANSWERS), self._control.open_answers)
-        self._declare(session, key(names.RECORDS), self._control.records)
+        self._declare(session, key(names.RECORDS), self._control.exchange)
         # Last: who is told that this replica is ready finds every service.
         self._declare(session, key(names.PROBE), partial(self._control.probe, on_probe))
 

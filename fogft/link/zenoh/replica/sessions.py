@@ -10,6 +10,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 
 from fogft.link import frame
 from fogft.link.frame import Greeting
@@ -31,20 +32,16 @@ class NotAdmittedError(Exception):
         self.refusal = refusal
 
 
+@dataclass(eq=False)
 class AuthenticatedSessions:
     """The connections that were authenticated, to the replica of this common name. Any thread."""
 
-    def __init__(
-        self,
-        pool_uid: str,
-        replica: str,
-        verify: Verify,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._clock = clock
-        self._pool_uid = pool_uid
-        self._replica = replica
-        self._verify = verify
+    pool_uid: str
+    replica: str
+    verify: Verify
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._tokens: dict[bytes, Holder] = {}
         self.of = self._tokens.get  # whose connection has a token, if that is let in
@@ -58,9 +55,9 @@ class AuthenticatedSessions:
             if greeting.token not in self._tokens:
                 raise NotAdmittedError("a connection that did not greet")
             return
-        message = frame.greeted_bytes(greeting.token, self._replica)
+        message = frame.greeted_bytes(greeting.token, self.replica)
         try:
-            writer = self._verify(greeting.certificate, greeting.signature, message)
+            writer = self.verify(greeting.certificate, greeting.signature, message)
             holder = holder_of(writer.common_name)
         except ValueError as error:
             expired = isinstance(error, RecordError) and error.reason == "expired"
@@ -68,7 +65,7 @@ class AuthenticatedSessions:
             raise NotAdmittedError(str(error), refusal) from error
         if holder.role.value != writer.role or holder.role not in _MAY_ASK:
             raise NotAdmittedError(f"`{writer.common_name}` may not send requests")
-        if holder.pool_uid != self._pool_uid:
+        if holder.pool_uid != self.pool_uid:
             raise NotAdmittedError(f"`{writer.common_name}` is not a member of this pool")
         self._admit(greeting.token, holder)
 
@@ -81,7 +78,7 @@ class AuthenticatedSessions:
                 raise NotAdmittedError("a token that is another's")
             if name not in self._holders and len(self._holders) >= HOLDERS_LIMIT:
                 self._forget(next(iter(self._holders)))
-            tokens, now = self._holders.setdefault(name, OrderedDict()), self._clock()
+            tokens, now = self._holders.setdefault(name, OrderedDict()), self.clock()
             self._holders.move_to_end(name)
             if token in tokens:
                 return
