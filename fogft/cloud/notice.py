@@ -52,16 +52,13 @@ class Watch:
         self._told: set[NoticeKind] = set()
         self._source: _Source | None = None
         self._closed = threading.Event()
+        self.close = self._closed.set  # then no call is made, but one under way; repeatable
         threading.Thread(target=self._run, name="notice", daemon=True).start()
 
     @property
     def silent(self) -> bool:
         """Whether no source exists on this machine, as far as is known."""
         return self._source is None
-
-    def close(self) -> None:
-        """Stop; no call is made after this has returned, but one under way. Repeatable."""
-        self._closed.set()
 
     def _run(self) -> None:
         failures = 0

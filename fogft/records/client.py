@@ -81,10 +81,7 @@ class RendezvousClient:
         self._main: asyncio.Task[None] | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="fogft-rendezvous", daemon=True)
-
-    def start(self) -> None:
-        """Start dialling; return at once."""
-        self._thread.start()
+        self.start = self._thread.start  # dialling; returns at once
 
     def close(self) -> None:
         """End all connections and write the cache. Repeatable."""

@@ -79,6 +79,7 @@ class SkyCloud:
     sleep: Callable[[float], object] = time.sleep
     make_wheel: Callable[[Path], Path] = wheel.make
     make_lock: Callable[[Path], wheel.Locks] = wheel.lock
+    check_task = staticmethod(refuse_what_cannot_be_honoured)
 
     def __post_init__(self) -> None:
         self._providers = by_name = {provider.cloud: provider for provider in self.providers}
@@ -86,10 +87,14 @@ class SkyCloud:
         self.journal = journal = Journal(self.folder / "launches")
         self._locks = wheel.LockFolder(self.folder / "locks", self.make_lock)
         self._census = Census(by_name, clock, submit)
+        self.unverified = self._census.unverified
         self._presence = seen = Presence(sky, journal, self._census, clock, submit)
+        # The provider is asked where it can be: SkyPilot's own refresh waits.
+        self.refresh = seen.refresh
         self._ending = Ending(sky, journal, self._census, self.sleep, clock)
         self._following = Following(sky, journal, self._ending, clock, seen.clusters.forget)
         self._prices = Prices(sky, by_name, clock, submit)
+        self.left_out = self._prices.left_out
         self._lock = threading.Lock()
         self._followed: set[ReplicaId] = set()
         self._closed = False
@@ -188,17 +193,9 @@ class SkyCloud:
 
     # -- beyond the port --------------------------------------------------------------------
 
-    def refresh(self, id: ReplicaId) -> None:
-        """See `Refreshing`. The provider is asked where it can be: SkyPilot's own refresh waits."""
-        self._presence.refresh(id)
-
     def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
         """See `RealCloud`."""
         return self.sky.check(clouds)
-
-    def check_task(self, task: Mapping[str, Any]) -> None:
-        """See `RealCloud`."""
-        refuse_what_cannot_be_honoured(task)
 
     def credentials_end_at(self) -> float | None:
         """See `RealCloud`. What is known is looked at again after a minute."""
@@ -221,10 +218,6 @@ class SkyCloud:
                     "nothing is launched, replaced or ended until they are renewed"
                 )
         return [one for one in found if one]
-
-    def left_out(self) -> Sequence[str]:
-        """See `RealCloud`."""
-        return self._prices.left_out()
 
     def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
         """See `RealCloud`."""
@@ -271,10 +264,6 @@ class SkyCloud:
         with contextlib.suppress(CloudError):  # then the image resolves, as a VM would
             lock |= self._locks.renew(packed)
         bake.write(folder, task, image, packed, lock)
-
-    def unverified(self, cloud: str) -> str:
-        """See `RealCloud`."""
-        return self._census.unverified(cloud)
 
     def audit(self, pool_uid: str = "") -> Audit:
         """See `Auditing`. Of all pools only those whose machines carry this user's label."""

@@ -170,7 +170,7 @@ class Presence:
         return [found[id] for id in sorted(found)]
 
     def refresh(self, id: ReplicaId) -> None:
-        """See `SkyCloud.refresh`."""
+        """See `Refreshing`."""
         entry = self.journal.get(id)
         alive = None if entry is None else self.census.of(id, entry)
         if entry is not None and alive is not None:

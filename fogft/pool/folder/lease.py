@@ -31,9 +31,10 @@ class Lease:
 
     def __init__(self, paths: PoolPaths, *, at_least: int = 0) -> None:
         self._paths = paths
-        self._lock = disk.Lock(paths.manager_lock)
+        lock = disk.Lock(paths.manager_lock)
+        self.release = lock.release  # gives the lease back; repeatable
         try:
-            taken = self._lock.acquire(wait=False)
+            taken = lock.acquire(wait=False)
         except OSError as error:
             raise disk.not_opened(paths.manager_lock, error) from error
         if not taken:
@@ -54,10 +55,6 @@ class Lease:
     def _write(self) -> None:
         held = _Held(self.epoch, self._beat)
         disk.write_json(self._paths.lease, to_plain(held), durable=self._beat == 0)
-
-    def release(self) -> None:
-        """Give the lease back. Repeatable."""
-        self._lock.release()
 
 
 def read_epoch(paths: PoolPaths) -> int:

@@ -67,15 +67,11 @@ class PoolStore(HistoryFile):
         clock: Callable[[], float],
     ) -> None:
         self.paths = paths
+        self.name = paths.folder.name  # the pool's
         self._parse = parse
         super().__init__(paths.history, clock)
         self._spec: tuple[bytes, PoolSpec] | None = None
         self._good: tuple[bytes, PoolSpec] | None = None
-
-    @property
-    def name(self) -> str:
-        """The pool's name."""
-        return self.paths.folder.name
 
     def identity(self) -> Identity:
         """Return the pool's identity."""

@@ -80,6 +80,7 @@ class ServerProxy:
         self._offering = Offering(services, define, clock)
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
         self._listener, self._make_node = listener, make_node
+        self.endpoint = listener.endpoint  # ``host:port`` at which it listens
         self.command, self._spare = command, spare  # the process at work, and the one that waits
         self._clock, self._look_at = clock, 0.0
         self._pauses = Pauses()
@@ -242,11 +243,6 @@ class ServerProxy:
     def idle(self) -> bool:
         """Whether all services can answer, and none of them needs frequent looks."""
         return self.complete and not (self._topics or self._goals or self._ordered)
-
-    @property
-    def endpoint(self) -> str:
-        """``host:port`` at which it listens."""
-        return self._listener.endpoint
 
     def renew(self, records: Iterable[Record]) -> None:
         """Take signed manager leases; only a newer one has an effect."""
