@@ -6,7 +6,7 @@ is taken down at once: a machine that was made before would cost money.
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from fogft.cloud.sky.ending import Ending
 from fogft.cloud.sky.failures import tail, told_last
@@ -42,9 +42,7 @@ class Following:
     ending: Ending
     clock: Callable[[], float]
     on_move: Callable[[], None]
-
-    def __post_init__(self) -> None:
-        self._job_not_before: dict[ReplicaId, float] = {}
+    _job_not_before: dict[ReplicaId, float] = field(default_factory=dict, init=False)
 
     def step(self, id: ReplicaId) -> bool:
         """Move a launch on; return whether there is more. CloudUnreachable: nothing was learned."""

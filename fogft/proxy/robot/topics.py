@@ -11,7 +11,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from fogft.counters import worth_logging
@@ -266,10 +266,8 @@ class TopicsOnRobot:
     wake: Callable[[], None]
     merge: Merge = lambda said: None
     clock: Callable[[], float] = time.monotonic
-
-    def __post_init__(self) -> None:
-        self._topics: dict[str, RobotTopic] = {}
-        self._trouble: dict[str, str] = {}
+    _topics: dict[str, RobotTopic] = field(default_factory=dict, init=False)
+    _trouble: dict[str, str] = field(default_factory=dict, init=False)
 
     def serve(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> bool:
         """Pass exactly these topics; return whether they have changed."""
