@@ -103,10 +103,7 @@ class Latencies:
     _: KW_ONLY
     clock: Callable[[], float] = time.time
     endpoint: Callable[[str], tuple[str, int] | None] = endpoint
-    connect: Callable[[str, int], float] | None = None
-
-    def __post_init__(self) -> None:
-        self._connect = self.connect or connect_time
+    connect: Callable[[str, int], float] | None = None  # None: `connect_time`
 
     def measured(self) -> Mapping[str, Distance]:
         """Return the measured round trips, whatever their age. A damaged file counts as empty."""
@@ -163,7 +160,7 @@ class Latencies:
 
     def _try(self, wanted: tuple[str, tuple[str, int]]) -> float | str:
         try:
-            return self._connect(*wanted[1])
+            return (self.connect or connect_time)(*wanted[1])
         except OSError as error:
             return str(error)
 
