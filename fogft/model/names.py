@@ -78,6 +78,8 @@ def is_endpoint(text: str) -> bool:
         return False
     if not host.isascii() or not host.isprintable():
         return False
+    if not all(0 < len(label) < 64 for label in host.removesuffix(".").split(".")):
+        return False  # Python raises ValueError for such a name
     return len(port) <= 5 and port.isascii() and port.isdigit() and 0 < int(port) < 65_536
 
 

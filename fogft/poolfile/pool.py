@@ -15,7 +15,7 @@ from fogft.model.state import StateSpec
 from fogft.model.topic import ActionSpec, Origin, Select, TopicSpec
 from fogft.poolfile import rules
 from fogft.poolfile.reader import Reader
-from fogft.poolfile.task import check_task
+from fogft.poolfile.task import check_resources, check_task
 from fogft.poolfile.tree import Mistakes, Node, Section, plain, shown
 
 
@@ -146,6 +146,7 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
     shared: Any = made.task.get("resources") or {}
     for section, group in zip(ours.sections("groups", ""), made.groups, strict=True):
         rules.on_demand(section.section("on_demand"), group.on_demand, group.replicas)
+        check_resources(section.section("resources"))
     if len(made.groups) > MAX_GROUPS:
         raise ours.error("groups", f"has {len(made.groups)} entries; the maximum is {MAX_GROUPS}")
     total = sum(group.replicas for group in made.groups)
@@ -156,6 +157,7 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
 
 def _check_topology(ours: Section, services: tuple[ServiceSpec, ...], spec: PoolSpec) -> None:
     launched = spec.gateway.launch
+    check_resources(ours.section("gateway").section("resources"))
     if not spec.topology and not launched:
         return
     where = "gateway" if launched else "topology"
@@ -191,7 +193,7 @@ def _topics_key(ours: Section) -> str:
 
 def _check_quorum(section: Section, service: ServiceSpec, spec: PoolSpec) -> None:
     windows = spec.schedule.windows if spec.schedule else ()
-    fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas is not None)])
+    fewest = min([spec.replicas, *(w.replicas for w in windows if w.replicas)])
     if service.quorum > fewest:
         where = " in a window of `schedule`" if fewest < spec.replicas else ""
         raise section.error(

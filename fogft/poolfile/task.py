@@ -38,14 +38,14 @@ def check_task(top: Section, mistakes: Mistakes) -> None:
         top.text("run", start)
     with mistakes.step():
         _one_machine(top)
-    for key in ("resources", "file_mounts", "envs", "config", "volumes"):
+    for key in ("resources", "file_mounts", "envs", "secrets", "config", "volumes"):
         with mistakes.step():
             if top.has(key):
                 top.section(key)
     with mistakes.step():
         if top.has("setup"):
             top.text("setup", "write the commands that install what `run` needs, or remove it")
-    for key, check in (("envs", _envs), ("resources", _spot)):
+    for key, check in (("envs", _envs), ("secrets", _envs), ("resources", check_resources)):
         with mistakes.step():
             if top.has(key) and isinstance(top.children[key].value, Mapping):
                 check(top.section(key))
@@ -72,12 +72,14 @@ def _workdir(top: Section) -> None:
     raise top.error("workdir", what, "write `workdir: .`, or `workdir: {url: ..., ref: ...}`")
 
 
-def _spot(resources: Section) -> None:
-    """SkyPilot would take what is no truth value for one."""
+def check_resources(resources: Section) -> None:
+    """Check what is read before SkyPilot reads it, which would take anything for a truth value."""
     for key in ("any_of", "ordered"):
         if resources.has(key):
             for one in resources.sections(key, "write a list of maps"):
-                _spot(one)
+                check_resources(one)
+    if resources.has("labels"):
+        resources.section("labels", "write a map")
     if resources.has("use_spot"):
         resources.flag("use_spot", False)
 

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fogft.errors import StateError, WireError
+from fogft.errors import FogftError, StateError
 from fogft.model.credentials import CredentialPaths
 from fogft.records.cache import restore, write
 from fogft.records.dialling import connect
 from fogft.records.exchange import Exchange
-from fogft.records.record import Record, RecordError, RecordKind, sign_record
+from fogft.records.record import Record, RecordKind, sign_record
 from fogft.records.record_set import RecordSet, Verdict
 from fogft.records.signing import Signer, Verifier
 
@@ -155,8 +155,8 @@ class RendezvousClient:
                 connection, seen_host = await connect(
                     endpoint, self._credentials, self._signer, self._records.pool_uid
                 )
-            except (WireError, RecordError, OSError, EOFError, asyncio.TimeoutError) as error:
-                words = error.message if isinstance(error, WireError) else str(error)
+            except (FogftError, OSError, EOFError, ValueError, asyncio.TimeoutError) as error:
+                words = error.message if isinstance(error, FogftError) else str(error)
                 self._detail(endpoint, words or "it does not answer")
             else:
                 self._seen_host = seen_host

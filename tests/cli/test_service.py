@@ -40,6 +40,9 @@ def units(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "not to be written")
+    monkeypatch.setenv("SKYPILOT_SERVICE_TOKEN", "not to be written")
+    monkeypatch.setenv("SKYPILOT_API_SERVER_ENDPOINT", "http://sky:46580")
+    monkeypatch.setenv("AWS_PROFILE", "fleet")
     return tmp_path / "config" / "systemd" / "user"
 
 
@@ -59,6 +62,8 @@ def test_units_are_written_started_shown_and_removed(home, units, tmp_path, monk
     told = env_file.read_text()
     assert 'RMW_IMPLEMENTATION="rmw_fastrtps_cpp"\n' in told
     assert 'ROS_DOMAIN_ID="7"\n' in told
+    assert 'SKYPILOT_API_SERVER_ENDPOINT="http://sky:46580"\n' in told
+    assert 'AWS_PROFILE="fleet"\n' in told
     assert "not to be written" not in told
     assert env_file.stat().st_mode & 0o777 == 0o600
     manager = (units / names[0]).read_text()

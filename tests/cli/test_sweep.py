@@ -85,7 +85,7 @@ def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys
     file.write_text(SPEC + "resources: {infra: local}\n")
     assert "earlier pool" not in str(preview.order(file).notes), "another name"
     [line], _ = run(capsys)
-    assert line.endswith(f"no pool of this uid in `{home}`")
+    assert line.endswith(f"no pool of this uid (`test`) in `{home}`")
     _, err = run(capsys, "--end", "--yes")
     assert f"ended `{id}` (local/us-west-1/a)\ndone: ended all of them\n" in err
     assert processes.find(machine=str(id)) == []

@@ -98,3 +98,37 @@ def test_a_file_is_right_exactly_where_nothing_is_found(some):
         assert found(text)
     else:
         assert not found(text)
+
+
+SMALL = "run: x\n%s\nfogft:\n  services: [{name: /a, type: std_srvs/srv/Trigger}]\n  %s\n"
+NO_MAP = "any_of[0]: must be a map"
+
+
+@pytest.mark.parametrize(
+    ("task", "keys", "line", "message"),
+    [
+        ("secrets: [HF_TOKEN]", "", 2, "secrets: must be a map"),
+        ("secrets: {HF_TOKEN: null}", "", 2, "secrets.HF_TOKEN: must have a text"),
+        ("resources: {labels: [team-a]}", "", 2, "resources.labels: must be a map"),
+        ("", "gateway: {launch: true, resources: {any_of: [aws]}}", 5, NO_MAP),
+        ("", "groups: [{name: a, replicas: 1, resources: {labels: [b]}}]", 5, "must be a map"),
+    ],
+)
+def test_what_skypilot_would_take_for_something_else_is_told(task, keys, line, message):
+    """In each place in which resources stand, and before anything is launched."""
+    [first, *_] = found(SMALL % (task, keys))
+    assert message in first.message
+    assert first.line == line or first.message.startswith(f"p.yaml:{line}: ")
+
+
+def test_a_schedule_may_ask_for_no_replica_at_night():
+    window = "{from: '20:00', to: '6:00', replicas: 0}"
+    assert found(SMALL % ("", f"schedule: {{time_zone: UTC, windows: [{window}]}}")) == []
+
+
+@pytest.mark.parametrize("host", ["meet..example.org", "x" * 64 + ".org", ".org", ".."])
+def test_a_host_name_that_no_resolver_takes_is_told(host):
+    """Python's own raises an error for it that is none of the network's."""
+    [first] = found(SMALL % ("", f"rendezvous: ['{host}:7450']"))
+    assert "not `host:port`" in first.message
+    assert found(SMALL % ("", "rendezvous: ['example.org.:7450', '[::1]:7450']")) == []

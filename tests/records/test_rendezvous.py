@@ -162,6 +162,21 @@ def test_one_of_two_suffices_and_callers_carry_records_across(authority, rendezv
         wait_for(lambda one=one: one.endpoint(0) == "10.0.0.1:1")
 
 
+def test_an_address_that_no_resolver_takes_stops_no_other_and_no_writer(
+    authority, rendezvous, party
+):
+    """As it may stand in a file that an older version wrote."""
+    place = rendezvous()
+    manager = Party(manager_files(authority), "meet..example.org:7450", place.endpoint)
+    try:
+        robot = party(authority.robot("r1"), place)
+        for version in (1, 2):
+            manager.admit(version, (version, 1))
+            wait_for(lambda version=version: robot.endpoint(version) is not None)
+    finally:
+        manager.client.close()
+
+
 def test_one_that_is_started_elsewhere_is_found_by_its_name_or_in_the_list(
     authority, party, monkeypatch
 ):

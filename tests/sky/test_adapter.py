@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,12 +10,19 @@ from pathlib import Path
 
 import pytest
 
-from fogft.cloud.sky import naming
+from fogft.cloud.sky import adapter, naming
 from fogft.cloud.sky.following import ASK_LIMIT_S, JOB_PAUSE_S, LAUNCH_LIMIT_S
 from fogft.cloud.sky.naming import cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.cloud.sky.wheel import Locks
-from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, SpecError
+from fogft.errors import (
+    CloudError,
+    CloudUnreachable,
+    NoCapacity,
+    QuotaExceeded,
+    SpecError,
+    StateError,
+)
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Placement
@@ -902,6 +910,50 @@ def test_the_links_port_is_the_orders_and_survives_a_lost_journal(scene: Scene):
     assert (scene.machine().endpoint or "").endswith(":9000")
     shutil.rmtree(scene.folder / "state")
     assert (scene.machines(scene.another_process())[0].endpoint or "").endswith(":9000")
+
+
+def test_a_failed_setup_is_seen_soon_though_the_clock_was_set_back(scene: Scene):
+    scene.cloud.launch(scene.order())
+    scene.sky.finish(NAME, JobState.SETTING_UP)
+    scene.work(LOOKED_AT)
+    scene.pass_s(-3600.0)
+    scene.sky.jobs[NAME] = JobState.SETUP_FAILED
+    scene.work(LOOKED_AT)
+    assert scene.machine().failure.cause is Cause.SETUP
+
+
+def test_a_full_disk_keeps_no_machine(scene: Scene, monkeypatch):
+    """Its end cannot be written down, and is asked for all the same."""
+    scene.launched()
+    full = StateError("no space is left")
+
+    def refuse(*_args, **_changes):
+        raise full
+
+    monkeypatch.setattr(scene.cloud.journal, "update", refuse)
+    scene.cloud.terminate(replica())
+    assert scene.sky.asked("down") == [NAME]
+    assert scene.machines() == []
+
+
+def test_whose_machines_they_are_is_known_without_a_users_name_and_by_the_computer(
+    tmp_path, monkeypatch
+):
+    """Robots of one image have one user and one host name; a container's user often has none."""
+
+    def nobody():
+        raise KeyError("getpwuid(): uid not found: 1001")
+
+    monkeypatch.setattr(adapter.getpass, "getuser", nobody)
+    owners = []
+    for id in (b"one\n", b"two\n"):
+        (tmp_path / "id").write_bytes(id)
+        monkeypatch.setattr(adapter, "MACHINE_ID", tmp_path / "id")
+        owners.append(adapter.make(tmp_path, tmp_path).owner)
+    assert owners[0] != owners[1]
+    assert all(owner.startswith(f"uid{os.getuid()}-") for owner in owners)
+    monkeypatch.setattr(adapter, "MACHINE_ID", tmp_path / "none")
+    assert adapter.make(tmp_path, tmp_path).owner not in owners
 
 
 def test_where_a_cloud_maps_ports_skypilot_says_how_a_machine_is_reached(scene: Scene):

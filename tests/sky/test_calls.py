@@ -10,6 +10,7 @@ from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.kept import Kept
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudError, CloudUnreachable
+from tests.fakes.waiting import wait_for
 
 
 class ApiServerConnectionError(RuntimeError):
@@ -64,6 +65,34 @@ def test_a_call_without_an_answer_is_given_up_and_not_repeated_while_it_runs():
     assert calls.within(30, "y", lambda: "other") == "other"
     go_on.set()
     assert calls.within(30, "x", lambda: "fresh") == "fresh", "a late answer is thrown away"
+
+
+def test_a_call_whose_answer_must_have_been_lost_on_the_way_is_made_anew():
+    """SkyPilot's client waits without end on a connection that a router has forgotten."""
+    calls, go_on, asked = InstalledSky(), threading.Event(), []
+
+    def hang() -> str:
+        asked.append("x")
+        go_on.wait(60)
+        return "late"
+
+    def given_up() -> bool:
+        with pytest.raises(CloudUnreachable, match="did not answer"):
+            calls.within(0.02, "x", hang)
+        return len(asked) > 1
+
+    wait_for(given_up)
+    go_on.set()
+
+
+@pytest.mark.parametrize("set_s", [3600.0, -3600.0])
+def test_an_answer_is_old_where_the_clock_was_set(set_s: float):
+    now, asked = [1000.0], []
+    kept = Kept(lambda: asked.append(1), 5.0, 15.0, lambda: now[0], lambda run: run(), failed=print)
+    kept.answer = kept.renew() or ()
+    now[0] += set_s
+    kept.get()
+    assert len(asked) == 2
 
 
 def test_what_was_asked_before_it_was_to_be_forgotten_is_asked_again():

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import getpass
+import hashlib
 import importlib.util
 import logging
 import math
+import os
 import socket
 import threading
 import time
@@ -31,7 +33,7 @@ from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.cloud.sky.settings import GROUP
 from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
-from fogft.disk import write_whole
+from fogft.disk import read_bytes, write_whole
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
 from fogft.model.reason import Cause
 from fogft.model.replica import Machine, Offer, ReplicaId
@@ -40,6 +42,7 @@ log = logging.getLogger(__name__)
 
 SSH_PORT = 22
 _LOG_LINES = 1000
+MACHINE_ID = Path("/etc/machine-id")
 _ENDS_FRESH_S = 60.0
 
 
@@ -57,7 +60,13 @@ def _each_second(step: Callable[[], bool]) -> None:
 
 def make(folder: Path, base: Path) -> SkyCloud:
     """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until it is asked."""
-    owner = f"{getpass.getuser()}-{socket.gethostname()}"
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a container's user often has no name
+        user = f"uid{os.getuid()}"
+    # Robots of one image have one user and one host name.
+    machine = hashlib.sha256(read_bytes(MACHINE_ID) or b"").hexdigest()[:8]
+    owner = f"{user}-{socket.gethostname()}"[:50] + f"-{machine}"
     google = importlib.util.find_spec("google") and importlib.util.find_spec("google.auth")
     providers = [Aws(), Gcp()] if google else [Aws()]
     return SkyCloud(folder, InstalledSky(), providers, owner=owner, base=base)
@@ -164,7 +173,8 @@ class SkyCloud:
 
     def terminate(self, id: ReplicaId) -> None:
         """See `Cloud`. Returns when SkyPilot, and the provider where it can be asked, agree."""
-        self.journal.update(id, stage=Stage.ENDING)
+        with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
+            self.journal.update(id, stage=Stage.ENDING)
         try:
             self._ending.end(id)
         finally:

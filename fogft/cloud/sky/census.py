@@ -70,7 +70,7 @@ class Census:
         now = self.clock()
         with self._lock:
             begun_at = self._begun_at.get(pool_uid)
-            due = begun_at is None or now - begun_at >= EVERY_S
+            due = begun_at is None or not 0 <= now - begun_at < EVERY_S
             if due:
                 self._begun_at[pool_uid] = now
             found = self._found.get(pool_uid, ())

@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 JOB_PAUSE_S = 20.0
 """Shortest pause before and between questions about a job. For each SkyPilot takes some ten seconds
 of processor time, in one of its few workers; the pause grows with the time that an answer takes."""
+_JOB_PAUSE_LIMIT_S = 300.0
 
 _TRIES_LINES = 400  # of a launch's log: what its last tries have come to
 ASK_LIMIT_S = 180.0
@@ -117,7 +118,8 @@ class Following:
 
     def _setting_up(self, entry: Entry) -> None:
         asked_at = self.clock()
-        if asked_at < self._job_not_before.setdefault(entry.id, asked_at + JOB_PAUSE_S):
+        not_before = self._job_not_before.setdefault(entry.id, asked_at + JOB_PAUSE_S)
+        if asked_at < not_before <= asked_at + _JOB_PAUSE_LIMIT_S:  # later: the clock was set back
             return
         self._find_endpoint(entry)
         try:
@@ -128,7 +130,7 @@ class Following:
         finally:
             now = self.clock()
             pause_s = max(JOB_PAUSE_S, 3 * (now - asked_at))
-            self._job_not_before[entry.id] = now + pause_s
+            self._job_not_before[entry.id] = now + min(pause_s, _JOB_PAUSE_LIMIT_S)
         if job is JobState.RUNNING:
             self._move(entry, stage=Stage.RUNNING, set_up_at=self.clock())
         elif job is JobState.SETUP_FAILED:

@@ -46,6 +46,7 @@ CHECK_LIMIT_S = 300.0  # asks every cloud, and may start the API server: minutes
 JOB_LIMIT_S = 120.0  # starts a Python on the machine, over ssh
 LAUNCH_LIMIT_S = 120.0  # uploads `workdir` and `file_mounts`, and may start the API server
 DOWN_LIMIT_S = 300.0
+_FORGOTTEN = 10  # limits: SkyPilot waits without end for an answer that a router lost
 
 
 def _run(call: Callable[[], T], outcome: Future[T]) -> None:
@@ -83,17 +84,20 @@ class InstalledSky:
         self._lock = threading.Lock()
         self.sky: Any = None  # the two modules, once they are used
         self.sdk: Any = None
-        self._given_up: dict[str, Future[Any]] = {}  # calls, by subject
+        self._given_up: dict[str, tuple[Future[Any], float]] = {}  # by subject, with its begin
         self._settings = Settings()
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
         """Run a call on its own thread within a limit, which SkyPilot's client lacks.
 
         One that is given up still runs, here and on the API server. Until it has ended the same
-        question (`subject`) is not asked again; its late answer, old by then, is thrown away.
+        question (`subject`) is not asked again, unless it takes so long that its connection must
+        have been forgotten on the way; its late answer, old by then, is thrown away.
         """
         ends_at = time.monotonic() + limit_s
-        running = self._given_up.get(subject)
+        running, begun_at = self._given_up.get(subject, (None, ends_at - limit_s))
+        if ends_at - limit_s - begun_at > _FORGOTTEN * limit_s:
+            running, begun_at = None, ends_at - limit_s
         if running is not None:
             wait([running], limit_s)
         if running is None or running.done():
@@ -107,7 +111,7 @@ class InstalledSky:
                     raise translated(error, subject) from error
                 answer: T = running.result()
                 return answer
-        self._given_up[subject] = running
+        self._given_up[subject] = running, begun_at
         raise CloudUnreachable(
             f"SkyPilot did not answer within {limit_s:.0f} s about {subject}",
             "`sky api info` and `sky api logs` show the state of its API server",

@@ -99,9 +99,9 @@ class Journal:
         """Forget a replica that is gone, and remove its files. Repeatable."""
         with locked(self._folder / "journal.lock"):
             shutil.rmtree(self.files(id), ignore_errors=True)
-            with contextlib.suppress(OSError):
-                self.provision_log(id).unlink()
-            self._path(id).unlink(missing_ok=True)
+            for path in (self.provision_log(id), self._path(id)):
+                with contextlib.suppress(OSError):
+                    path.unlink()
 
     def get(self, id: ReplicaId) -> Entry | None:
         """Return an entry, or None."""

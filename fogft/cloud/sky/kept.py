@@ -28,7 +28,7 @@ class Kept(Generic[T]):
     def get(self) -> T:
         """Return the answer."""
         age_s = self.clock() - self._at
-        if self.answer is None or age_s >= self.usable_s:
+        if self.answer is None or not 0 <= age_s < self.usable_s:  # a clock may be set back
             return self.renew()
         if age_s >= self.fresh_s and not self._renewing:
             self._renewing = True

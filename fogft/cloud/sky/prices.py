@@ -143,7 +143,7 @@ class Prices:
         cloud, region, code = wanted
         key = f"{cloud}/{region}", code
         at, value = self._quotas.get(key, (-math.inf, None))
-        if self.clock() - at > USABLE_S:
+        if not 0 <= self.clock() - at <= USABLE_S:
             self._unread.pop(cloud, None)
             try:
                 value = self.providers[cloud].quota(region, code)

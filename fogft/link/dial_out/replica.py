@@ -11,12 +11,13 @@ import time
 from collections.abc import Iterable, Mapping
 
 from fogft import poll
+from fogft.errors import FogftError
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
 from fogft.link.dial_out.tunnel import GREETING_TIMEOUT_S, Tunnels, hang_up, keep_alive
 from fogft.model.names import host_and_port
 from fogft.records import frames
-from fogft.records.record import RecordError, Sign
+from fogft.records.record import Sign
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +81,7 @@ class DialOut:
                     self._tunnels.carry(link, own)
                     link = None
                     continue  # at once: another one takes its place
-            except (OSError, EOFError, RecordError) as error:
+            except (OSError, EOFError, ValueError, FogftError) as error:
                 self._say(door, str(error) or type(error).__name__)
             finally:
                 if link is not None:

@@ -49,6 +49,7 @@ class Watch:
     def __init__(self) -> None:
         self._last: Reading | None = None
         self._set: list[tuple[float, float]] = []  # when, and by how much
+        self.set_s = 0.0  # in all
 
     def look(self, reading: Reading) -> Jump | None:
         """Return the jump since the last look, if there was one."""
@@ -61,6 +62,7 @@ class Watch:
         jump = Jump(set_s if abs(set_s) >= LEAST_S else 0.0, slept_s if slept_s >= LEAST_S else 0.0)
         if jump.set_s:
             self._set.append((reading.awake_s, jump.set_s))
+            self.set_s += jump.set_s
         return jump if jump.set_s or jump.slept_s else None
 
     @property

@@ -29,10 +29,12 @@ SYSTEM_FOLDER = Path("/etc/systemd/system")
 STANDBY_LIMIT_S = 60.0
 HANDOVER_LIMIT_S = 180.0
 MARK = "# Written by `fogft service install`"
-# What a sourced ROS 2, its middleware and fogft itself are told by. No credentials: clouds' own
-# tools keep those in files.
+# What a sourced ROS 2, its middleware, fogft itself and clouds are told by. No credentials: clouds'
+# own tools keep those in files.
 _TAKEN = re.compile(
     r"ROS_.*|RMW_IMPLEMENTATION|AMENT_.*|COLCON_.*|CYCLONEDDS_URI|FAST(DDS|RTPS)_.*|ZENOH_.*|"
+    r"SKYPILOT_(?!.*(TOKEN|PASSWORD|SECRET)).*|AWS_(DEFAULT_)?(PROFILE|REGION)|AWS_CONFIG_FILE|"
+    r"AWS_SHARED_CREDENTIALS_FILE|GOOGLE_APPLICATION_CREDENTIALS|CLOUDSDK_CONFIG|KUBECONFIG|"
     r"OTEL_.*|PATH|PYTHONPATH|LD_LIBRARY_PATH|VIRTUAL_ENV|LANG|FOGFT_HOME"
 )
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.cloud.port import Auditing, Cloud
-from fogft.errors import CloudError, FogftError, PoolNotFound
+from fogft.errors import CloudError, FogftError, PoolNotFound, StateError
 from fogft.model.replica import Machine
 from fogft.pool.commands.composition import LOCAL, SKY, make_cloud, pools
 from fogft.pool.folder.paths import PoolPaths, home
@@ -55,7 +55,9 @@ def sweep_cloud(name: str, cloud: Cloud | None = None) -> Swept:
     for machine in audit.machines:
         pool, managed = known.get(machine.id.pool_uid, ("", False))
         if not managed:
-            why = f"pool `{pool}` has no manager" if pool else f"no pool of this uid in `{home()}`"
+            named = f" (`{machine.pool}`)" if machine.pool else ""
+            lost = f"no pool of this uid{named} in `{home()}`"
+            why = f"pool `{pool}` has no manager" if pool else lost
             found.append(Unowned(machine, why, bool(pool)))
     return Swept(name, found, audit.asked)
 
@@ -92,7 +94,7 @@ def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
             continue
         try:
             cloud.terminate(id)
-        except CloudError as error:
+        except (CloudError, StateError) as error:
             problems.append(error)
         else:
             told(f"ended `{id}` ({one.machine.placement.location})")

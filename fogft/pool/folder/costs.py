@@ -72,23 +72,34 @@ class CostBook:
     def __init__(self, folder: Path, pool: str, uid: str) -> None:
         self._path = path_of(folder, pool, uid)
         self._written_at: float | None = None
-        self._looked_at = 0.0
+        self._looked_at = self._set_s = 0.0
         found = _read(self._path)
         self._kept = found if found is not None and found.uid == uid else Costs(pool, uid)
         self._days = {(one.day, one.replica): one for one in self._kept.spent}
         self._running = self._kept.running
 
     def look(
-        self, now: float, machines: Sequence[Machine], offers: Sequence[Offer], alone_s: float
+        self,
+        now: float,
+        machines: Sequence[Machine],
+        offers: Sequence[Offer],
+        alone_s: float,
+        set_s: float = 0.0,
     ) -> None:
         """Charge running machines up to now, and save from time to time.
 
         Args:
             alone_s: For how long a machine runs on of which no manager has heard.
+            set_s: How far the clock was set since this book was opened: nothing runs meanwhile.
 
         Raises:
             StateError: It cannot be written; it is kept, and tried again.
         """
+        if by_s := set_s - self._set_s:
+            moved = {
+                name: replace(one, until=one.until + by_s) for name, one in self._running.items()
+            }
+            self._running, self._set_s = moved, set_s
         same = self._running.keys() == {machine.id.short for machine in machines}
         if same and 0 <= now - self._looked_at < LOOK_EVERY_S:
             return

@@ -31,7 +31,7 @@ class Lease:
 
     def __init__(self, paths: PoolPaths, *, at_least: int = 0) -> None:
         self._paths = paths
-        lock = disk.Lock(paths.manager_lock)
+        self._lock = lock = disk.Lock(paths.manager_lock)
         self.release = lock.release  # gives the lease back; repeatable
         try:
             taken = lock.acquire(wait=False)

@@ -255,7 +255,9 @@ class Manager:
         if seen.machines is not None:
             alone_s = tick.spec.unmanaged_max_hours * lifetime.HOUR_S + RUN_ENDED_S
             machines = (*seen.machines, *seen.gateway, *seen.standbys)
-            self._costs.look(seen.now, machines, seen.offers, alone_s)
+            self._costs.look(
+                seen.now, machines, seen.offers, alone_s, self._reconciler.timekeeping.set_s
+            )
 
     def _leave(self) -> None:
         """See to it that nothing of a pool that ends by itself is left but its folder."""

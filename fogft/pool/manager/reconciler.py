@@ -130,8 +130,8 @@ class Reconciler:
         self._offers: tuple[Offer, ...] = ()
         self._offers_for: tuple[str, float] | None = None
         self._updating = Updating(self.store)
-        self._time = Timekeeping(self.store, self._updating, self.clock)
-        self._recorder = EventRecorder(self.store, lambda: self._time.now)
+        self.timekeeping = Timekeeping(self.store, self._updating, self.clock)
+        self._recorder = EventRecorder(self.store, lambda: self.timekeeping.now)
         self._membership: Membership | None = self.store.membership()
         self._published_for: tuple[Any, ...] | None = None  # what it follows from
         self._log_tail = ""  # of the last replica that was ended because it was never ready
@@ -142,7 +142,7 @@ class Reconciler:
         Raises:
             StateError: Something cannot be read or written; nothing was launched for it.
         """
-        if self._time.look():  # first: who waits for a change trusts what is dated after it
+        if self.timekeeping.look():  # first: who waits for a change trusts what is dated after it
             self._silent = Silent()
         identity, spec, intent = self.store.identity(), self.store.spec(), self.store.intent()
         history = self.store.history()
@@ -207,7 +207,7 @@ class Reconciler:
     def _observe(self, identity: Identity, spec: PoolSpec) -> tuple[Observed, list[Reason]]:
         trouble: list[Reason] = []
         busy = self.operations.busy()  # before the cloud is asked: see `operations`
-        now = self._time.now
+        now = self.timekeeping.now
         machines: tuple[Machine, ...] | None = None
         try:
             listed = {m.id: m for m in self.cloud.machines(identity.uid)}
@@ -228,7 +228,7 @@ class Reconciler:
         stopped = tuple(m for m in machines or () if m.phase is MachinePhase.STOPPED)
         if machines is not None and (gateway or stopped):
             machines = tuple(m for m in machines if m not in (*gateway, *stopped))
-        doubt_s = self._time.doubt_s
+        doubt_s = self.timekeeping.doubt_s
         seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway, stopped)
         return seen, trouble
 
@@ -377,7 +377,7 @@ class Reconciler:
             id=order.id,
             placement=order.placement,
             phase=MachinePhase.PROVISIONING,
-            launched_at=self._time.now,
+            launched_at=self.timekeeping.now,
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
         )

@@ -52,6 +52,11 @@ class Timekeeping:
         """By how much the clock was just set; see `Observed.doubt_s`."""
         return self._watch.doubt_s
 
+    @property
+    def set_s(self) -> float:
+        """How far the clock was set since this manager began."""
+        return self._watch.set_s
+
 
 _QUICK_S = 0.1
 _TRIES = 10

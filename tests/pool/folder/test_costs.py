@@ -79,3 +79,14 @@ def test_a_damaged_file_is_begun_anew_and_old_days_become_one_sum(tmp_path: Path
     kept.look(NOON + 500 * DAY_S, [], [], 0.0)
     [costs] = read_all(tmp_path)
     assert (costs.spent, costs.before_usd) == ((), pytest.approx(0.1))
+
+
+@pytest.mark.parametrize("set_s", [50 * 365 * DAY_S, -365 * DAY_S])
+def test_a_clock_that_is_set_is_no_time_in_which_machines_ran(tmp_path: Path, set_s: float):
+    """A robot whose clock has no battery boots in 1970, until it hears the time."""
+    kept = book(tmp_path)
+    kept.look(NOON + 3600, [machine(0), machine(1)], [], 600.0)
+    kept.look(NOON + 7200 + set_s, [machine(0)], [], 600.0, set_s)
+    assert kept.usd == pytest.approx(0.3 + 600 / 3600 * 0.1)
+    kept.look(NOON + 10_800 + set_s, [machine(0)], [], 600.0, set_s)
+    assert kept.usd == pytest.approx(0.4 + 600 / 3600 * 0.1)
