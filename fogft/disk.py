@@ -339,3 +339,7 @@ class Watched:
         found, before = version(self.path), self._seen
         self._seen = found or before
         return found not in (None, before)
+
+    def forget(self) -> None:
+        """Have the next call return True: what was there could not be used yet."""
+        self._seen = None

@@ -50,7 +50,9 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         return spec
     if spec.part is not Part.NONE:
         timeout_s = news["timeout_s"]
-        if isinstance(timeout_s, (bool, str)) or not 0 < timeout_s <= LONGEST_S:
+        if isinstance(timeout_s, bool) or not isinstance(timeout_s, (int, float)):
+            raise ValueError("timeout_s: must be a number")
+        if not 0 < timeout_s <= LONGEST_S:
             raise ValueError(f"timeout_s: must be a number above 0 and at most {LONGEST_S:g}")
         return replace(spec, timeout_s=float(timeout_s))
     raw: dict[str, Any] = {**to_plain(spec, omit_defaults=True), **news}

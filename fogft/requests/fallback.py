@@ -1,6 +1,7 @@
 """When the fallback service is called, and how long its answer is awaited. Pure.
 
-Law: a request is handed to the fallback, a service on the robot, at most once, and ends once.
+Law: a request is handed to the fallback, a service on the robot, once, and once more at its
+deadline where what it answered before was no good; it ends once.
 """
 
 from fogft.model.choices import FallbackSpec

@@ -345,11 +345,11 @@ class PendingRequests:
             self._take_out(request, pending)
         return pending
 
-    def expire(self, now: float) -> list[tuple[bytes, Pending]]:
-        """Remove and return every request past its deadline, oldest first."""
-        if now < self.soonest_deadline:
+    def expire(self, now: float, *, every: bool = False) -> list[tuple[bytes, Pending]]:
+        """Remove and return every request past its deadline, or all there are, oldest first."""
+        if now < self.soonest_deadline and not every:
             return []
-        expired = [entry for entry in self._pending.items() if entry[1].deadline <= now]
+        expired = [e for e in self._pending.items() if every or e[1].deadline <= now]
         for request, pending in expired:
             self.choose.stopped(request, pending.open, now, expired=True)
             self._take_out(request, pending, over=False)

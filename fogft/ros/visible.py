@@ -62,7 +62,9 @@ class VisibleNode:
 
     def diagnose(self, statuses: Sequence[Status]) -> None:
         """Publish statuses on `/diagnostics`, if possible and heard by anybody."""
-        if self._diagnostics is not None and self._diagnostics.get_subscription_count():
+        if self._diagnostics is None or not self._thread.is_alive():
+            return
+        if self._diagnostics.get_subscription_count():
             self._put(lambda: self._publish(statuses))
 
     def show(self, values: Mapping[str, Any]) -> None:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.errors import RosError
 from fogft.model.choices import FallbackSpec, TrafficSpec
-from fogft.model.spec import Advertise, HedgingMode, OnTimeout, ServiceSpec
+from fogft.model.spec import Advertise, HedgingMode, OnTimeout, Part, ServiceSpec
 from fogft.model.state import StateService, StateSpec
 from fogft.poolfile.policy_parameters import KEYS, Policies, changed, prefix, shown
 
@@ -142,3 +142,16 @@ def test_the_fallback_comes_back_with_its_mode():
     assert policies.services()[0].fallback is None
     policies.set({"arm.plan.on_timeout": "fallback"})
     assert policies.services() == (spec,)
+
+
+@pytest.mark.parametrize("value", [None, [1.0, 2.0], b"x", True, "x", float("nan"), -1, 10**30])
+def test_a_value_of_another_type_is_refused_and_changes_nothing(value):
+    """ROS lets anybody on the robot set any type, or delete a parameter."""
+    goal = ServiceSpec("/move/_action/send_goal", "a/action/M_SendGoal", 5.0, part=Part.GOAL)
+    policies = Policies()
+    policies.follow([goal, PLAN])
+    before = policies.parameters()
+    for name in ("move._action.send_goal.timeout_s", "arm.plan.timeout_s"):
+        with pytest.raises((ValueError, TypeError)):
+            policies.set({name: value})
+    assert policies.parameters() == before

@@ -106,6 +106,13 @@ def test_parameters_are_judged_and_shown(person, make_node, ros_domain):
     assert len(judged) == 2
 
 
+def test_diagnosing_once_its_thread_has_ended_ends_nobody(make_node, ros_domain):
+    """Whatever ended it was logged; the client proxy goes on without."""
+    visible = make_node(ros_domain).make_visible("fogft_arm", lambda _: "")
+    visible.close()
+    visible.diagnose([])
+
+
 def test_the_level_can_be_set_by_ros(person, make_node, ros_domain):
     from rcl_interfaces.msg import LoggerLevel
     from rcl_interfaces.srv import SetLoggerLevels

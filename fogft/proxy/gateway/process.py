@@ -154,8 +154,8 @@ class _Gateway:
             self._proxy.run_once()
             self._forwarder.tick(self._proxy.links.ready)
             try_step(self._follow, self._config.membership)
-            if self._certificate.changed():
-                self._renew()
+            if self._certificate.changed() and not try_step(self._renew, self._certificate.path):
+                self._certificate.forget()
             if time.monotonic() - reported > _REPORT_EVERY_S:
                 reported = time.monotonic()
                 self._report()
@@ -170,14 +170,10 @@ class _Gateway:
 
     def _renew(self) -> None:
         """Go on under a new certificate: links one by one, the listener at once."""
-        try:
-            self._holder = self._own_holder()
-            if self._listener is not None:
-                self._listener.close()
-            self._listen()
-        except FogftError as error:
-            log.error("certificate_not_usable reason=%r", error.message)
-            return
+        self._holder = self._own_holder()
+        if self._listener is not None:
+            self._listener.close()
+        self._listen()
         self._proxy.renew()
         self._following.renew()
 

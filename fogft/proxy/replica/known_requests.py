@@ -49,6 +49,10 @@ class KnownRequests:
 
     def add(self, job: Job) -> None:
         """Add a new job."""
+        if len(self._jobs) >= self._kept_ids:
+            oldest_done = next((job for job in self._jobs.values() if job.waiting is None), None)
+            if oldest_done is not None:
+                self.forget(oldest_done)
         self._jobs[job.id] = job
         heapq.heappush(self._deadlines, (job.deadline, job.id))
         if len(self._deadlines) > 2 * len(self._jobs) + _DEADLINES_KEPT:
@@ -74,10 +78,6 @@ class KnownRequests:
             _, oldest = self._kept.popitem(last=False)
             self._kept_bytes -= len(oldest.answer or b"")
             oldest.answer = None
-        if len(self._jobs) > self._kept_ids:
-            oldest_done = next((job for job in self._jobs.values() if job.waiting is None), None)
-            if oldest_done is not None:
-                self.forget(oldest_done)
 
     def forget(self, job: Job) -> None:
         """Forget a finished job, so that a copy is run again."""

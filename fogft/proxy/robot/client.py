@@ -81,25 +81,42 @@ class ClientProxy:
         self._advertise_at = -NEVER
 
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
-        """Proxy exactly these services. Requests under way continue."""
+        """Proxy exactly these services. Requests under way continue.
+
+        Raises RosError: One of them cannot be proxied: it stays as it was, and all others change.
+        """
+        failure: RosError | None = None
         with self._lock:
             wanted = {spec.name: spec for spec in specs}
             for name in [n for n in self._services if n not in wanted]:
                 self._services.pop(name).close()
             keys_changed = False
             for spec in wanted.values():
-                old = self._services.get(spec.name)
-                if old is not None and _kind(old.spec) == _kind(spec):
-                    old.spec = spec
-                    self._adopt(old)
-                    continue
-                if old is not None:
-                    old.close()
-                self._services[spec.name] = self._new_service(spec)
-                keys_changed = True
+                try:
+                    keys_changed |= self._serve_one(spec)
+                except RosError as error:
+                    failure = failure or error
             if keys_changed:
                 self.links.redial()
         self.look_again()
+        if failure is not None:
+            raise failure
+
+    def _serve_one(self, spec: ServiceSpec) -> bool:
+        """Proxy a service by a policy; return whether replicas know it by another key now."""
+        old = self._services.get(spec.name)
+        if old is not None and _kind(old.spec) == _kind(spec):
+            old.spec = spec
+            self._adopt(old)
+            return False
+        if old is not None and old.spec.state is not None:  # two of them would write one mark
+            old.end()
+            del self._services[spec.name]
+            old = None
+        self._services[spec.name] = self._new_service(spec)
+        if old is not None:
+            old.end()
+        return True
 
     def pass_topics(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> None:
         """Pass exactly these topics; `node` publishes and subscribes on the robot."""

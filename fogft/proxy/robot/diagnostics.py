@@ -233,7 +233,7 @@ class SeenFromRos:
         with self._lock:
             try:
                 self._policies.set(values)
-            except ValueError as error:
+            except (ValueError, TypeError) as error:
                 return str(error)
             self._was_set = True
         log.info("policy_set values=%s", dict(values))

@@ -357,6 +357,14 @@ class Dispatcher:
             self._requests.welcome(replica, about)
         self._wake()
 
+    def expire(self, *, every: bool = False) -> None:
+        """End the requests whose deadline is past, or all there are."""
+        with self._lock:
+            expired = self._requests.expire(self._clock(), every=every)
+        for request, pending in expired:
+            self._delivery.expired(request, pending)
+            self._sender.forget(request, tuple(self._sender.links))
+
     def tick(self) -> float:
         """Expire requests, offer others to more replicas; return when to call again, at latest."""
         now, self._next_look = self._clock(), NEVER
@@ -366,10 +374,7 @@ class Dispatcher:
             if not self._waits:
                 self._requests.choose.news = False  # it concerns nobody
                 return NEVER
-            expired = self._requests.expire(now)
-        for request, pending in expired:
-            self._delivery.expired(request, pending)
-            self._sender.forget(request, tuple(self._sender.links))
+        self.expire()
         look_at = self._sender.offer_more(now)
         self._sender.replicate()
         with self._lock:

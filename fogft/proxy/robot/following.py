@@ -13,6 +13,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.disk import Watched
+from fogft.errors import FogftError
 from fogft.link.dial_out.robot import DialIn
 from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.membership import from_dict, is_newer
@@ -104,6 +105,14 @@ class Following:
 
     def look(self) -> Membership | None:
         """Return the membership if it may have changed. Raises StateError: a damaged file."""
+        try:
+            return self._look()
+        except (FogftError, OSError):
+            self._changed.set()
+            self._file.forget()
+            raise
+
+    def _look(self) -> Membership | None:
         now = self._clock()
         self._looks = min(_LOOKS, self._looks + now - self._looked_at)
         self._looked_at = now

@@ -263,7 +263,7 @@ class _Running:
         announcements = Watched(config.announcements) if config.announcements else None
         started = reported = time.monotonic()
         looked = 0.0
-        changed = False  # since the last report
+        changed = again = False  # since the last report; whether the configuration is tried again
         participant, pauses, renew_at = b"", Pauses(), math.inf
         while not stop.is_set():
             changed = proxy.run_once(_LOOK_EVERY_S) or changed
@@ -282,7 +282,7 @@ class _Running:
             if self.held:
                 try_step(self._take_over, config.lock)
             if watched_config.changed():
-                try_step(self._reconfigure, self.config_path)
+                again = not try_step(self._reconfigure, self.config_path)
             if (services := self.seen.changed()) is not None:
                 try_step(functools.partial(proxy.serve, services), self.config_path)
             try_step(self._follow, config.membership)
@@ -293,6 +293,8 @@ class _Running:
                 try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
             if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
                 reported, changed = now, False
+                if again:
+                    watched_config.forget()
                 if self.lock.lost or not folder.exists():  # the pool's: its end is the pool's
                     log.warning("folder_gone path=%s", folder)
                     return False
@@ -315,10 +317,10 @@ class _Running:
         new = _same(self.config, read_client(path, self.metrics), path)
         if self.dialer.use(new.uplinks, new.services):
             self.proxy.redial()
-        self.proxy.serve(self.seen.follow(new.services))
         self.proxy.pass_topics(new.topics, cast("SerialisedNode", self.joined.node))
         self.following.apply(new)
         self.scrape.at(new.metrics)
+        self.proxy.serve(self.seen.follow(new.services))  # last: one of them may fail
         log.info("config_applied services=%d", len(new.services))
 
     def _follow(self) -> None:
@@ -353,8 +355,11 @@ class _Running:
 _troubles: dict[Path, str] = {}
 
 
-def try_step(step: Callable[[], None], path: Path) -> None:
-    """Run one step; errors such as a bad file or a full disk are logged once and skipped."""
+def try_step(step: Callable[[], None], path: Path) -> bool:
+    """Run one step; errors such as a bad file or a full disk are logged once and skipped.
+
+    Returns whether there was none.
+    """
     try:
         step()
     except (FogftError, OSError) as error:  # of the system: no descriptor, no folder
@@ -362,8 +367,9 @@ def try_step(step: Callable[[], None], path: Path) -> None:
         if _troubles.get(path) != reason:
             _troubles[path] = reason
             log.error("file_failed path=%s reason=%r", path, reason)
-    else:
-        _troubles.pop(path, None)
+        return False
+    _troubles.pop(path, None)
+    return True
 
 
 def _same(old: ClientProxyConfig, new: ClientProxyConfig, path: Path) -> ClientProxyConfig:

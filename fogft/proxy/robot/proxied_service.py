@@ -100,6 +100,11 @@ class ProxiedService:
             log.error("%s service=%s reason=%r", event, self.spec.name, trouble)
         self.trouble = trouble
 
+    def end(self) -> None:
+        """Answer open requests as at their deadlines, and close it: another takes its place."""
+        self.dispatcher.expire(every=True)
+        self.close()
+
     def close(self) -> None:
         """Withdraw it from ROS, and close its dispatcher."""
         for end in (self.server, self._fallback):

@@ -443,10 +443,14 @@ def test_finished_ids_are_forgotten_at_their_deadline():
     assert len(scene.responder.known) == 0
 
 
-def test_the_number_of_ids_is_bounded():
+@pytest.mark.parametrize("wanted", [True, False])
+def test_the_number_of_ids_is_bounded(wanted):
+    """Also of requests that other replicas answered, whose end comes here."""
     scene = Scene(kept_ids=10)
     for n in range(100):
         scene.ask(n.to_bytes(16, "big"))
+        if not wanted:
+            scene.responder.cancel([n.to_bytes(16, "big")])
         scene.answer(n)
     assert len(scene.responder.known) <= 10 + 100
 

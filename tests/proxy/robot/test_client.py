@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import threading
 import time
@@ -15,7 +16,7 @@ from fogft.errors import RosError
 from fogft.link.port import Answer, ProbeAnswer
 from fogft.model.refusal import Refusal
 from fogft.model.replica import Member, Membership, ReplicaId
-from fogft.model.spec import HedgingMode, Part, ServiceSpec
+from fogft.model.spec import HedgingMode, OnTimeout, Part, ServiceSpec
 from fogft.model.topic import Origin, TopicSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.robot.client import ClientProxy
@@ -39,17 +40,24 @@ def membership(*members: Member, version: int = 1, epoch: int = 1, uid: str = UI
 class Scene:
     def __init__(self, *names: str, clock: Any = None) -> None:
         self.clock = clock or Clock()
+        self.unknown: set[str] = set()  # types that cannot be used here
         self.node = FakeNode()
         self.dialer = FakeDialer()
         self.proxy = ClientProxy(
             UID,
             self.node,
             self.dialer,
-            lambda spec, respond, wake: Dispatcher(spec, respond, wake=wake, clock=self.clock),
+            self._dispatcher,
             clock=self.clock,
             define=OURS.__getitem__,
         )
         self.proxy.serve([ServiceSpec(name, SET_BOOL) for name in names or ("/s",)])
+
+    def _dispatcher(self, spec: ServiceSpec, respond: Any, wake: Any) -> Dispatcher:
+        if spec.type in self.unknown:
+            raise RosError(f"no type `{spec.type}`")
+        empty = b"empty" if spec.on_timeout is OnTimeout.EMPTY else None
+        return Dispatcher(spec, respond, wake=wake, clock=self.clock, empty_response=empty)
 
     def follow(self, *members: Member, **options) -> bool:
         return self.proxy.follow(membership(*members, **options))
@@ -421,3 +429,50 @@ def test_topics_are_told_and_answered_while_they_change():
 
     meanwhile(change, look)
     assert scene.proxy.report()["topics"].keys() == {topic.name for topic in topics}
+
+
+def test_a_service_that_cannot_be_proxied_keeps_no_other_from_changing():
+    """A new type that this process cannot load: the rest of the file holds, links included."""
+    scene = Scene()
+    scene.follow(member(0))
+    scene.ready(*scene.dialer.links)
+    scene.unknown = {"x/srv/Missing"}
+    wanted = [ServiceSpec(name, SET_BOOL) for name in ("/s", "/new", "/later")]
+    with pytest.raises(RosError, match="no type `x/srv/Missing`"):
+        scene.proxy.serve([*wanted[:2], ServiceSpec("/bad", "x/srv/Missing"), wanted[2]])
+    assert set(scene.dialer.links[-1].services) == {"/s", "/new", "/later"}
+    scene.ready(scene.dialer.links[-1], service="/new")
+    assert "/new" in scene.node.servers
+    scene.unknown = set()
+    scene.proxy.serve([*wanted, ServiceSpec("/bad", "x/srv/Missing")])
+    assert "/bad" in scene.dialer.links[-1].services
+
+
+def test_a_service_that_cannot_change_stays_as_it_was():
+    """And can be changed back, which changes nothing."""
+    scene = Scene()
+    scene.follow(member(0))
+    scene.ready(*scene.dialer.links)
+    scene.unknown = {"x/srv/Missing"}
+    before = ServiceSpec("/s", SET_BOOL)
+    for specs in ([replace(before, type="x/srv/Missing")], [before]):
+        with contextlib.suppress(RosError):
+            scene.proxy.serve(specs)
+        assert not scene.node.servers["/s"].closed
+        scene.ask()
+        [link] = scene.dialer.links
+        scene.proxy.answered(link, link.reply(b"r"))
+    assert scene.node.servers["/s"].responses == [("caller", b"r")] * 2
+
+
+def test_a_request_whose_service_changes_its_kind_ends_as_at_its_deadline():
+    """Its answers would come for another dispatcher: nobody would hear of it any more."""
+    scene = Scene("/other")
+    base = ServiceSpec("/s", SET_BOOL, on_timeout=OnTimeout.EMPTY)
+    scene.proxy.serve([base])
+    scene.follow(member(0), member(1))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    server = scene.node.servers["/s"]
+    scene.proxy.serve([replace(base, quorum=2)])
+    assert server.responses == [("caller", b"empty")]

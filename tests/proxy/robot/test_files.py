@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import re
 from pathlib import Path
@@ -14,9 +15,11 @@ from hypothesis import strategies as st
 from fogft import disk
 from fogft.errors import FogftError
 from fogft.model import membership
+from fogft.model.credentials import Holder, Role
 from fogft.model.replica import Member, Membership, ReplicaId
 from fogft.proxy.config import read_client, read_server
 from fogft.proxy.robot import process
+from fogft.proxy.robot.following import Following
 from tests.fakes.proxy import UID
 
 CLIENT = f"""\
@@ -157,3 +160,20 @@ def test_a_replica_that_cannot_know_its_address_is_told(tmp_path: Path) -> None:
     assert read_server(path, advertise="vm.example.org:30001").advertise == "vm.example.org:30001"
     with pytest.raises(FogftError, match="not `host:port`"):
         read_server(path, advertise="vm.example.org")
+
+
+def test_a_membership_that_cannot_be_read_for_a_moment_is_read_then(tmp_path, monkeypatch):
+    """Else the robot would keep the old one until the next change."""
+    (tmp_path / "proxy.yaml").write_text(CLIENT)
+    config = read_client(tmp_path / "proxy.yaml")
+    monkeypatch.setattr(Following, "holder", lambda _: Holder(Role.ROBOT, "robot", 1, UID))
+    seen = Following(config)
+    config.membership.write_text(MEMBERS)
+    with monkeypatch.context() as patch:
+        full = OSError(errno.EMFILE, "Too many open files")
+        patch.setattr(disk, "read_json", lambda *_: (_ for _ in ()).throw(full))
+        with pytest.raises(OSError, match="Too many"):
+            seen.look()
+    found = seen.look()
+    assert found is not None
+    assert [one.id.slot for one in found.members] == [0]
