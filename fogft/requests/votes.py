@@ -50,7 +50,7 @@ class Quorum(Decide):
     ) -> Judgement:
         """Take a vote; it is a success if it completes a quorum. Flagged replicas do not count."""
         if id in self._final:
-            self._judge(replica, reading, self._final[id])
+            self._judge(replica, agrees=self._agree(reading, self._final[id]))
             return Means.UNDECIDED
         if pending is None:
             return Means.UNDECIDED  # it has expired
@@ -60,19 +60,19 @@ class Quorum(Decide):
         ballots[replica] = reading
         if replica in self.flagged:
             return Means.UNDECIDED
-        counted = [other for voter, other in ballots.items() if voter not in self.flagged]
-        if sum(self._agree(other, reading) for other in counted) < self._quorum:
+        # Once: of a large answer each comparison holds the receiving thread up.
+        agreeing = {r for r, it in ballots.items() if it is reading or self._agree(it, reading)}
+        if len(agreeing - self.flagged) < self._quorum:
             return Means.UNDECIDED
         del self._open[id]
         self._final[id] = reading
         if len(self._final) > self.kept:
             self._final.popitem(last=False)
-        for voter, other in ballots.items():
-            self._judge(voter, other, reading)
+        for voter in ballots:
+            self._judge(voter, agrees=voter in agreeing)
         return Means.SUCCESS
 
-    def _judge(self, replica: int, answer: Any, final: Any) -> None:
-        agrees = self._agree(answer, final)
+    def _judge(self, replica: int, *, agrees: bool) -> None:
         record = self._record.setdefault(replica, deque(maxlen=WINDOW))
         record.append(agrees)
         if not agrees:

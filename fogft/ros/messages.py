@@ -135,22 +135,25 @@ class Comparison:
         for path in tolerances:
             _check_float(self._response, type_name, path)
 
-    def read(self, payload: bytes) -> Any:
-        """Return the message. Raises Unreadable."""
-        return from_bytes(payload, self._response)
+    def read(self, payload: bytes) -> tuple[bytes, Any]:
+        """Return the message, with its bytes. Raises Unreadable."""
+        return payload, from_bytes(payload, self._response)
 
-    def agree(self, one: Any, other: Any, path: str = "") -> bool:
-        """Whether two messages, or parts at a path, are the same within the tolerances.
+    def agree(self, one: tuple[bytes, Any], other: tuple[bytes, Any]) -> bool:
+        """Whether two messages that were read are the same within the tolerances.
 
         NaN agrees with NaN.
         """
+        return one[0] == other[0] or self._same(one[1], other[1], "")
+
+    def _same(self, one: Any, other: Any, path: str) -> bool:
         if isinstance(one, float):
             close = abs(one - other) <= self._tolerances.get(path, 0.0)
             return one == other or close or (math.isnan(one) and math.isnan(other))
         if hasattr(one, "get_fields_and_field_types"):
             prefix = f"{path}." if path else ""
             return all(
-                self.agree(getattr(one, name), getattr(other, name), prefix + name)
+                self._same(getattr(one, name), getattr(other, name), prefix + name)
                 for name in one.get_fields_and_field_types()
             )
         if isinstance(one, (str, bytes, bool, int)):
@@ -164,7 +167,7 @@ class Comparison:
             kind = getattr(one, "typecode", None) or one.dtype.kind
             if kind not in "fd":
                 return False
-        return all(self.agree(_plain(a), _plain(b), path) for a, b in zip(one, other, strict=True))
+        return all(self._same(_plain(a), _plain(b), path) for a, b in zip(one, other, strict=True))
 
 
 def _plain(value: Any) -> Any:
