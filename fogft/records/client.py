@@ -12,7 +12,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -47,34 +47,30 @@ class Known:
         return [record for record in self.records if record.kind is kind]
 
 
+@dataclass(eq=False)
 class RendezvousClient:
     """The records of one process.
 
     `changed` is called on the client's thread after anything changed; it must not block.
     """
 
-    def __init__(
-        self,
-        endpoints: Sequence[str],
-        credentials: CredentialPaths,
-        pool_uid: str,
-        *,
-        cache: Path | None = None,
-        changed: Callable[[], None] = lambda: None,
-    ) -> None:
-        self._endpoints = tuple(endpoints)
-        self._credentials = credentials
-        self._signer = Signer(credentials.certificate, credentials.key)
-        self._cache = cache
-        self._told = changed
-        self._records = RecordSet(pool_uid, Verifier(credentials.ca))
+    endpoints: Sequence[str]
+    credentials: CredentialPaths
+    pool_uid: str
+    _: KW_ONLY
+    cache: Path | None = None
+    changed: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self._signer = Signer(self.credentials.certificate, self.credentials.key)
+        self._records = RecordSet(self.pool_uid, Verifier(self.credentials.ca))
         self._exchange = Exchange(self._records, self._news)
         self._own: dict[tuple[RecordKind, str], _Own] = {}
-        self._details: dict[str, str] = dict.fromkeys(self._endpoints, "not reached yet")
+        self._details: dict[str, str] = dict.fromkeys(self.endpoints, "not reached yet")
         self._seen_host = ""
         self._cached = False
         self.known = Known()
-        if cache is not None and restore(cache, self._records, credentials.ca):
+        if self.cache is not None and restore(self.cache, self._records, self.credentials.ca):
             self._cached = True
             self._refresh()
         self._loop = asyncio.new_event_loop()
@@ -137,7 +133,7 @@ class RendezvousClient:
             self._main.cancel()
 
     async def _live(self) -> None:
-        steps = [*map(self._call, self._endpoints), self._keep_cache(), self._keep_own()]
+        steps = [*map(self._call, self.endpoints), self._keep_cache(), self._keep_own()]
         tasks = [self._loop.create_task(step) for step in steps]
         try:
             await asyncio.gather(*tasks)
@@ -153,7 +149,7 @@ class RendezvousClient:
             began = time.monotonic()
             try:
                 connection, seen_host = await connect(
-                    endpoint, self._credentials, self._signer, self._records.pool_uid
+                    endpoint, self.credentials, self._signer, self._records.pool_uid
                 )
             except (FogftError, OSError, EOFError, ValueError, asyncio.TimeoutError) as error:
                 words = error.message if isinstance(error, FogftError) else str(error)
@@ -237,7 +233,7 @@ class RendezvousClient:
             seen_host=self._seen_host,
         )
         try:
-            self._told()
+            self.changed()
         except Exception:
             log.exception("change_not_taken")
 
@@ -250,11 +246,11 @@ class RendezvousClient:
                 await asyncio.get_running_loop().run_in_executor(None, self._save)
 
     def _save(self) -> None:
-        if self._cache is None or self._cached:
+        if self.cache is None or self._cached:
             return
         self._cached = True
         try:
-            write(self._cache, self._records.lacking({}))
+            write(self.cache, self._records.lacking({}))
         except StateError as error:
             log.error("cache_not_written reason=%r", error.message)
 

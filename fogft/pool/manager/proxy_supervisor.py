@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +40,7 @@ class _Child(NamedTuple):
     started_at: float
 
 
+@dataclass(eq=False)
 class ProxySupervisor:
     """Supervises a pool's client proxies; `look` is called in each tick.
 
@@ -47,26 +49,22 @@ class ProxySupervisor:
         ended: Called, from any thread, when a proxy has ended: then `look` is due at once.
     """
 
-    def __init__(
-        self,
-        paths: PoolPaths,
-        clock: Callable[[], float],
-        command: Sequence[str] | None = None,
-        ended: Callable[[], None] = lambda: None,
-    ) -> None:
-        self._paths = paths
-        self._clock = clock
-        self._alone = command is not None
-        self._command = command or (
+    paths: PoolPaths
+    clock: Callable[[], float]
+    command: Sequence[str] | None = None
+    ended: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        self._alone = self.command is not None
+        self._command = self.command or (
             *(sys.executable, "-m", "fogft"),
-            *("proxy", "--spare", "--config", str(paths.proxy_config)),
+            *("proxy", "--spare", "--config", str(self.paths.proxy_config)),
         )
-        self._tell_ended = ended
         self._children: list[_Child] = []
         self._watched: set[int] = set()
         self._ending: set[int] = set()
-        locks = paths.proxy_lock, paths.standby_lock, paths.spare_lock
-        self._hanging = {lock: Hanging(HANGS_AFTER_S, clock) for lock in locks}
+        locks = self.paths.proxy_lock, self.paths.standby_lock, self.paths.spare_lock
+        self._hanging = {lock: Hanging(HANGS_AFTER_S, self.clock) for lock in locks}
         self._places = locks[:1] if self._alone else locks
         self._sessions: set[int] = set()  # of what was started, and its copies
         self._complete_at = float("-inf")
@@ -78,7 +76,7 @@ class ProxySupervisor:
 
     def look(self, *, outdated: bool = False) -> bool:
         """Start missing proxies, and replace those of another version; return whether one works."""
-        now = self._clock()
+        now = self.clock()
         for child in [one for one in self._children if one.process.poll() is not None]:
             self._children.remove(child)
             self._ended(child.process.returncode, now - child.started_at)
@@ -99,7 +97,7 @@ class ProxySupervisor:
         moving_up = running and now - self._complete_at <= MOVING_UP_S
         if line[-1] is not None or moving_up or now < self._next_at:
             return running
-        process = detached(self._command, self._paths.proxy_log)
+        process = detached(self._command, self.paths.proxy_log)
         self._children.append(_Child(process, now))
         self._sessions.add(process.pid)
         self._watch(process.pid)
@@ -138,7 +136,7 @@ class ProxySupervisor:
         def gone() -> None:
             self._watched.discard(pid)
             self._ending.discard(pid)
-            self._tell_ended()
+            self.ended()
 
         if pid not in self._watched:
             self._watched.add(pid)
@@ -150,7 +148,7 @@ class ProxySupervisor:
         log.warning("proxy_ended status=%d ran_s=%.1f", status, ran_s)
         if self._failures > 1:
             wait_s = min(BACKOFF_S * 2.0 ** min(self._failures - 2, 16), BACKOFF_LIMIT_S)
-            self._next_at = self._clock() + wait_s
+            self._next_at = self.clock() + wait_s
 
     @property
     def trouble(self) -> Reason | None:
@@ -160,7 +158,7 @@ class ProxySupervisor:
         return Reason(
             Cause.PROXY_KEEPS_ENDING,
             count=self._failures,
-            name=str(self._paths.proxy_log),
+            name=str(self.paths.proxy_log),
             words=self._last_end,
         )
 

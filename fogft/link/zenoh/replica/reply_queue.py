@@ -10,7 +10,7 @@ is closed.
 import logging
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from queue import Empty, SimpleQueue
 from threading import get_ident
@@ -112,6 +112,7 @@ class ReplyQueue:
         return together
 
 
+@dataclass(eq=False)
 class ReplyQueues:
     """All reply queues of a listener.
 
@@ -120,14 +121,11 @@ class ReplyQueues:
 
     idle_s = 5.0  # a thread that had nothing to send for so long ends
 
-    def __init__(
-        self,
-        counters: Counters,
-        *,
-        later: Callable[[Callable[[], None]], None] = lambda job: job(),
-    ) -> None:
-        self.later = later
-        self._counters = counters
+    counters: Counters
+    _: KW_ONLY
+    later: Callable[[Callable[[], None]], None] = lambda job: job()
+
+    def __post_init__(self) -> None:
         self.refusals = Counters()
         self._lock = threading.Lock()
         self._queues: dict[bytes, ReplyQueue] = {}
@@ -151,7 +149,7 @@ class ReplyQueues:
                 self._failed(error)
                 sent = True
             if sent:
-                self._counters.add(counted)
+                self.counters.add(counted)
                 return
         with self._lock:
             if self._closed:
@@ -163,7 +161,7 @@ class ReplyQueues:
             queue.waiting += 1
             queue.large.add(size)
             queue.replies.put(reply)
-        self._counters.add("reply_dropped" if dropped else counted)
+        self.counters.add("reply_dropped" if dropped else counted)
 
     def end(self, token: bytes, robot: str, query: QueryEnd) -> None:
         """Queue a query to be ended. Never blocks."""
@@ -174,7 +172,7 @@ class ReplyQueues:
             queue.waiting += 1
             queue.replies.put(query)
         if query.refusal:
-            self._counters.add("refused")
+            self.counters.add("refused")
 
     def _queue(self, token: bytes, robot: str) -> ReplyQueue:
         queue = self._queues.get(token)
@@ -227,7 +225,7 @@ class ReplyQueues:
             return True
 
     def _failed(self, error: Exception) -> None:
-        self._counters.warn(log, "failed", "reply_failed reason=%r", str(error))
+        self.counters.warn(log, "failed", "reply_failed reason=%r", str(error))
 
     def close(self, timeout_s: float) -> None:
         """Stop accepting replies; wait briefly for queued ones."""
