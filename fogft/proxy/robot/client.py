@@ -10,7 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from fogft.errors import RosError
@@ -40,6 +40,7 @@ _IDLE_TICK_S = 0.1
 MakeDispatcher = Callable[[ServiceSpec, Callable[[Any, bytes], None], Wake], Dispatcher]
 
 
+@dataclass(eq=False)
 class ClientProxy:
     """Sends each request to the replicas that its policy chooses; returns the first success.
 
@@ -49,31 +50,25 @@ class ClientProxy:
         merge: Makes one status of an action of what its replicas say.
     """
 
-    def __init__(
-        self,
-        pool_uid: str,
-        node: RosNode | None,
-        dialer: Dialer,
-        make_dispatcher: MakeDispatcher,
-        *,
-        clock: Callable[[], float] = time.monotonic,
-        define: Define | None = None,
-        merge: Merge = lambda said: None,
-    ) -> None:
-        self._type_check = TypeCheck(define)
-        self._pool_uid = pool_uid
-        self._node = node
-        self._dialer = dialer
-        self.tell = dialer.tell  # signed records, for every replica
-        self._make_dispatcher = make_dispatcher
-        self._clock = clock
+    pool_uid: str
+    node: RosNode | None
+    dialer: Dialer
+    make_dispatcher: MakeDispatcher
+    _: KW_ONLY
+    clock: Callable[[], float] = time.monotonic
+    define: Define | None = None
+    merge: Merge = lambda said: None
+
+    def __post_init__(self) -> None:
+        self._type_check = TypeCheck(self.define)
+        self.tell = self.dialer.tell  # signed records, for every replica
         self._lock = threading.RLock()
         self._services: dict[str, ProxiedService] = {}
-        self.links = Links(dialer, self, self._keys)  # to whom it talks
+        self.links = Links(self.dialer, self, self._keys)  # to whom it talks
         self._version = (0, 0)
         self._membership: Membership | None = None
         self._through_gateways = False
-        self._topics = TopicsOnRobot(self._wake, merge, clock)
+        self._topics = TopicsOnRobot(self._wake, self.merge, self.clock)
         # Until when the thread of `run_once` sleeps; it is woken by who wants a look sooner.
         self._sleeps_until = NEVER
         self._sooner = Wakeup()
@@ -132,14 +127,14 @@ class ClientProxy:
             if service.server is not None:
                 service.server.respond(handle, payload)
 
-        make = self._make_dispatcher
+        make = self.make_dispatcher
         service = ProxiedService(spec, make(self._here(spec), respond, self._wake))
         if spec.fallback is not None:
             self._adopt(service)
         return service
 
     def _adopt(self, service: ProxiedService) -> None:
-        service.adopt(self._here(service.spec), self._node)
+        service.adopt(self._here(service.spec), self.node)
 
     def _here(self, spec: ServiceSpec) -> ServiceSpec:
         """Return a service's policy as it is here: a request goes to one gateway, not to all."""
@@ -153,14 +148,14 @@ class ClientProxy:
         """Hold one link to each member. An older membership, or another pool's, is refused."""
         version = (membership.epoch, membership.version)
         with self._lock:
-            if membership.pool_uid != self._pool_uid or version < self._version:
+            if membership.pool_uid != self.pool_uid or version < self._version:
                 log.warning("membership_refused version=%s have=%s", version, self._version)
                 return False
             self._version = version
             self._membership = membership
             good = (m for m in membership.members if m.certificate_name not in membership.revoked)
             members = {m.id: m for m in good}
-            own = self._dialer.certificate()
+            own = self.dialer.certificate()
             if own in membership.revoked:  # then nobody is to be talked to
                 log.error("robot_revoked certificate=%s", own)
                 members = {}
@@ -179,7 +174,7 @@ class ClientProxy:
 
     def renew(self) -> None:
         """Switch to new credentials, link by link; no request is lost."""
-        self._dialer.renew()
+        self.dialer.renew()
         if self._membership is not None:
             self.follow(self._membership)  # who was shut out under the old ones may be in again
         log.info("credentials_renewed")
@@ -192,7 +187,7 @@ class ClientProxy:
 
     def _keys(self, slot: int) -> dict[str, str]:
         types = {name: service.spec.type for name, service in self._services.items()}
-        return names.service_keys(self._pool_uid, slot, types | self._topics.types())
+        return names.service_keys(self.pool_uid, slot, types | self._topics.types())
 
     def _drop(self, id: ReplicaId) -> None:
         link = self.links.remove(id)
@@ -240,7 +235,7 @@ class ClientProxy:
 
         Raises RosError: The node's thread has ended: nothing would be taken any more.
         """
-        if self._node is not None and not self._node.alive:
+        if self.node is not None and not self.node.alive:
             raise RosError("ROS has stopped; see the log for the reason", "start the proxy again")
         self._await_look(timeout_s)
         changed, self._changed = self._changed, False
@@ -252,11 +247,11 @@ class ClientProxy:
             self._topics.tick()
             for service in self._services.values():
                 service.dispatcher.tick()
-            now = self._clock()
-            if self._node is not None and (changed or now >= self._advertise_at):
+            now = self.clock()
+            if self.node is not None and (changed or now >= self._advertise_at):
                 self._advertise_at = now + _IDLE_TICK_S
                 for service in self._services.values():
-                    service.advertise(self._node, now)
+                    service.advertise(self.node, now)
         return changed
 
     def _await_look(self, timeout_s: float) -> None:
@@ -264,7 +259,7 @@ class ClientProxy:
 
         While requests come, it sleeps no longer than the next one could, so none has to wake it.
         """
-        now = self._clock()
+        now = self.clock()
         until = now + (min(timeout_s, _TICK_S) if len(self._topics) else timeout_s)
         while not self._look_now:
             self._sleeps_until = NEVER  # before looking: what comes after that wakes us
@@ -276,7 +271,7 @@ class ClientProxy:
                 break
             self._sleeps_until = sleeps_until
             self._sooner.wait(max(0.0, self._sleeps_until - now))
-            now = self._clock()
+            now = self.clock()
         self._look_now = False
 
     def _differences(self, link: Link) -> Mapping[str, str]:
@@ -316,7 +311,7 @@ class ClientProxy:
             "services": services,
             "topics": topics,
             "uplink_suspected": self.links.silent_together,
-            "certificate": self._dialer.certificate(),
+            "certificate": self.dialer.certificate(),
         }
 
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
