@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import KW_ONLY, dataclass
 
 from fogft import poll
 from fogft.counters import Counters
@@ -50,6 +51,7 @@ class _Waiting:
         self.taken = False
 
 
+@dataclass(eq=False)
 class DialIn:
     """The dial-in port of one robot or gateway, at ``host:port``; port 0 for any that is free.
 
@@ -57,17 +59,13 @@ class DialIn:
     cannot be had.
     """
 
-    def __init__(
-        self,
-        listen: str,
-        pool_uid: str,
-        verify: Verify,
-        *,
-        revoked: Callable[[], Collection[str]] = frozenset,
-    ) -> None:
-        self._pool_uid = pool_uid
-        self._verify = verify
-        self._revoked = revoked
+    listen: str
+    pool_uid: str
+    verify: Verify
+    _: KW_ONLY
+    revoked: Callable[[], Collection[str]] = frozenset
+
+    def __post_init__(self) -> None:
         self._counters = Counters()
         self.counters = self._counters.snapshot
         self._lock = threading.Condition()
@@ -76,8 +74,8 @@ class DialIn:
         self._tunnels = Tunnels()
         self._greeting: dict[socket.socket, str] = {}  # oldest first, with their hosts
         self._closed = False
-        self._door = listening(listen)
-        host, port = listen.rpartition(":")[0], self._door.getsockname()[1]
+        self._door = listening(self.listen)
+        host, port = self.listen.rpartition(":")[0], self._door.getsockname()[1]
         self.endpoint = f"{host}:{port}"
         threading.Thread(target=self._accept, name="fogft-dial-in", daemon=True).start()
 
@@ -126,19 +124,19 @@ class DialIn:
         link.sendall(frames.challenge(nonce, host))
         message = tunnel.receive(link, 16 << 10)
         certificate, signature = frames.read_greeting(message)
-        proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
-        writer = self._verify(certificate, signature, proof)
+        proof = frames.proof_bytes(PURPOSE, nonce, self.pool_uid.encode())
+        writer = self.verify(certificate, signature, proof)
         try:
             holder = holder_of(writer.common_name)
         except ValueError as error:
             raise RecordError("role", str(error)) from error
         if (holder.role, writer.role) != (Role.REPLICA, Role.REPLICA.value):
             raise RecordError("role", f"`{writer.common_name}` is not a replica")
-        if holder.pool_uid != self._pool_uid:
+        if holder.pool_uid != self.pool_uid:
             raise RecordError("pool", f"`{writer.common_name}` is another pool's")
-        if writer.common_name in self._revoked():
+        if writer.common_name in self.revoked():
             raise RecordError("revoked", f"`{writer.common_name}` is revoked")
-        return ReplicaId(self._pool_uid, int(holder.name), holder.generation)
+        return ReplicaId(self.pool_uid, int(holder.name), holder.generation)
 
     def _wait(self, one: _Waiting) -> None:
         with self._lock:

@@ -13,7 +13,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -68,6 +68,7 @@ def on_thread(run: Callable[[], object]) -> None:
     threading.Thread(target=run, daemon=True).start()
 
 
+@dataclass(eq=False)
 class Manager:
     """Manages one pool until told to stop. Holds the pool's lease from the start.
 
@@ -77,27 +78,23 @@ class Manager:
         keeps_proxy: Whether it starts client proxies; else somebody else does.
     """
 
-    def __init__(
-        self,
-        store: PoolStore,
-        cloud: Cloud,
-        *,
-        proxy_command: Sequence[str] | None = None,
-        metrics: str | None = None,
-        keeps_proxy: bool = True,
-    ) -> None:
-        self._keeps_proxy = keeps_proxy
-        self._store = store
-        self._cloud = cloud
-        self._paths = store.paths
-        self._identity = store.identity()
-        published = store.membership()
+    store: PoolStore
+    cloud: Cloud
+    _: KW_ONLY
+    proxy_command: Sequence[str] | None = None
+    metrics: str | None = None
+    keeps_proxy: bool = True
+
+    def __post_init__(self) -> None:
+        self._paths = self.store.paths
+        self._identity = self.store.identity()
+        published = self.store.membership()
         first = max(self._identity.first_epoch, published.epoch if published else 0)
         self._lease = Lease(self._paths, at_least=first)
         self._report = disk.Report(self._paths.status)
         self._wake = threading.Event()
         self._proxy = ProxySupervisor(
-            self._paths, time.monotonic, proxy_command, ended=self._wake.set
+            self._paths, time.monotonic, self.proxy_command, ended=self._wake.set
         )
         self._ledger = Ledger(self._paths.credentials)
         self._certified_at: float | None = None
@@ -109,16 +106,15 @@ class Manager:
         self._trouble: list[Reason] = []
         self._told: status.PoolStatus | None = None
         self._tally = Tally()
-        store.heard = self._tally.heard
+        self.store.heard = self._tally.heard
         self._scrape = Scrape(
             lambda: of_pool(self._told, self._tally), {"pool": self._identity.name}
         )
-        self._metrics = metrics
         self._replicas: Sequence[status.ReplicaStatus] = ()
         self._costs = CostBook(self._paths.costs, self._identity.name, self._identity.uid)
         self._reconciler = Reconciler(
-            cloud,
-            store,
+            self.cloud,
+            self.store,
             clock=timekeeping.read,
             links=self._links,
             build_order=self._build_order,
@@ -128,7 +124,7 @@ class Manager:
             by_hand=self._ledger.by_hand,
             gateways=self._ledger.gateways,
             gateway=LaunchedGateway(
-                cloud, self._gateway_up, self._gateway_order, store.place_gateway
+                self.cloud, self._gateway_up, self._gateway_order, self.store.place_gateway
             ),
             on_done=self._wake.set,
             distances=Distances(Latencies(latency_file()), on_thread),
@@ -168,7 +164,7 @@ class Manager:
         if not lock.acquire(wait=False):
             return False  # somebody changes the pool: look again
         try:
-            is_over = lifetime.is_over(self._store.spec(), self._begun_at(), time.time())
+            is_over = lifetime.is_over(self.store.spec(), self._begun_at(), time.time())
             if is_over:
                 proxy_supervisor.forbid_restart(self._paths)
                 self._close()
@@ -186,7 +182,7 @@ class Manager:
         tick = self._attempt(self._reconciler.tick)
         if tick is None:
             return False
-        self._scrape.at(tick.spec.metrics.manager if self._metrics is None else self._metrics)
+        self._scrape.at(tick.spec.metrics.manager if self.metrics is None else self.metrics)
         self._attempt(lambda: self._charge(tick))
         self._attempt(lambda: self._discover(tick))
         self._attempt(lambda: self._announce(tick))
@@ -207,9 +203,9 @@ class Manager:
             return
         log.error("pool_superseded pool=%s epoch=%d", self._identity.name, heard)
         proxy_supervisor.forbid_restart(self._paths)
-        with shutdown.without_orders(self._paths, self._store.spec(), lambda _: None):
+        with shutdown.without_orders(self._paths, self.store.spec(), lambda _: None):
             os.replace(self._paths.identity, self._paths.exported)
-        self._store.identity()  # which says so
+        self.store.identity()  # which says so
 
     def _bound_logs(self) -> None:
         for path in (self._paths.manager_log, self._paths.proxy_log):
@@ -242,8 +238,8 @@ class Manager:
         return ServingLease(now, lifetime.unmanaged_s(spec, begun_at, now))
 
     def _begun_at(self) -> float:
-        history = self._store.history()
-        return lifetime.begun_at(self._store.intent(), self._store.identity().created_at, history)
+        history = self.store.history()
+        return lifetime.begun_at(self.store.intent(), self.store.identity().created_at, history)
 
     def _discover(self, tick: Tick) -> None:
         if self._discovery.look(tick.spec, tick.observed, tick.plan.wanted):
@@ -267,9 +263,9 @@ class Manager:
 
         with shutdown.without_client_proxy(self._paths, done):
             teardown.end_machines(
-                self._cloud,
+                self.cloud,
                 self._identity.uid,
-                known=teardown.known(self._store),
+                known=teardown.known(self.store),
                 done=done,
                 warned=lambda what: log.warning("not_verified reason=%r", what),
                 limit_s=LEAVE_LIMIT_S,
@@ -292,17 +288,17 @@ class Manager:
         due = self._certified_at is None or abs(now - self._certified_at) > CERTIFY_EVERY_S
         if due or revoked != self._revoked:
             utc = datetime.datetime.now(datetime.timezone.utc)
-            configuration.certify_robot(self._paths, self._identity, self._store.spec(), utc)
+            configuration.certify_robot(self._paths, self._identity, self.store.spec(), utc)
             self._certified_at, self._revoked = now, revoked
-        configuration.write_proxy_config(self._paths, self._identity, self._store.spec())
-        over = lifetime.is_over(self._store.spec(), self._begun_at(), time.time())
-        if self._keeps_proxy and not self._store.intent().stopping and not over:
+        configuration.write_proxy_config(self._paths, self._identity, self.store.spec())
+        over = lifetime.is_over(self.store.spec(), self._begun_at(), time.time())
+        if self.keeps_proxy and not self.store.intent().stopping and not over:
             report = self._fresh_report(time.time())
             version = "" if report is None else report.version
             before = self._proxy.replacements
             self._proxy.look(outdated=version not in ("", __version__))
             if self._proxy.replacements != before:
-                self._store.append(Event(now, EventKind.PROXY_REPLACED, 0, 0))
+                self.store.append(Event(now, EventKind.PROXY_REPLACED, 0, 0))
 
     def _fresh_report(self, now: float) -> ProxyReport | None:
         report = proxy_report.read(self._paths.proxy_status, self._identity.uid)
@@ -324,9 +320,9 @@ class Manager:
         if (report is None or not fresh) and not tick.over:
             cause = Cause.STALE_PROXY_REPORT if report else Cause.NO_PROXY_REPORT
             notes.append(Reason(cause))
-        ends_at = self._cloud.credentials_end_at() if isinstance(self._cloud, RealCloud) else None
+        ends_at = self.cloud.credentials_end_at() if isinstance(self.cloud, RealCloud) else None
         seen = replace(
-            status.of_tick(tick, self._store.history(), self._store.recent(), notes),
+            status.of_tick(tick, self.store.history(), self.store.recent(), notes),
             epoch=self._lease.epoch,
             manager_pid=os.getpid(),
             usd_to_date=self._costs.usd,
