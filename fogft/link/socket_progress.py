@@ -9,7 +9,7 @@ is known for ten seconds only: then a request is let through, by which the link 
 
 import logging
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from statistics import median_high
 
 from fogft.counters import Counters
@@ -169,9 +169,7 @@ class DeadlineFilter:
     carries: Callable[[float], float | None]
     left: Callable[[float, float], float]
     packs: Callable[[str], Compression | None]
-
-    def __post_init__(self) -> None:
-        self._counters = Counters()
+    _counters: Counters = field(default_factory=Counters, init=False)
 
     def may_arrive(
         self,

@@ -87,7 +87,7 @@ def classify(inputs: Inputs, health: Health, size: Size) -> Classification:
         else:
             machines.good.append(replica)
     _supersede(machines, health, size)
-    machines.replaced.sort(key=lambda s: (_rank(s), s.id))
+    machines.replaced.sort(key=lambda s: (2 if s.why is None else _ORDER.get(s.why.cause, 2), s.id))
     machines.lost.sort(key=lambda s: (s.verdict is not Verdict.LEAVING, s.id))
     return machines
 
@@ -127,11 +127,6 @@ def _unwanted(
     if not is_current(spec, machine):
         return _OUTDATED
     return None
-
-
-def _rank(replica: Assessment) -> int:
-    why = replica.why
-    return 2 if why is None else _ORDER.get(why.cause, 2)
 
 
 def _never_served(replica: Assessment, health: Health) -> bool:

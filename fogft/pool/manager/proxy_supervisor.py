@@ -80,7 +80,10 @@ class ProxySupervisor:
         for child in [one for one in self._children if one.process.poll() is not None]:
             self._children.remove(child)
             self._ended(child.process.returncode, now - child.started_at)
-        self._end_hanging()
+        for lock, hanging in self._hanging.items():
+            pid = disk.holder(lock, said=False)
+            if hanging.end(pid):
+                log.error("proxy_hangs pid=%d", pid)
         line = [self._holder(lock) for lock in self._places]
         serving = line[0]
         if serving and serving != self._serving:
@@ -103,12 +106,6 @@ class ProxySupervisor:
         self._watch(process.pid)
         log.info("proxy_started pid=%d others=%s", process.pid, running)
         return True
-
-    def _end_hanging(self) -> None:
-        for lock, hanging in self._hanging.items():
-            pid = disk.holder(lock, said=False)
-            if hanging.end(pid):
-                log.error("proxy_hangs pid=%d", pid)
 
     def _end_outdated(self, line: Sequence[int | None]) -> None:
         """End the last in line that is not ours; others only once one of ours is behind them."""
