@@ -16,6 +16,12 @@ from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.orders import Op, OrderError
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
+from fogft.proxy.replica.service_queue import (
+    HANGS_AFTER_S,
+    HANGS_AFTER_TIMES,
+    STUCK_AFTER_S,
+    STUCK_AFTER_TIMES,
+)
 from fogft.ros.port import RosClient
 from fogft.ros.state_bytes import StateBytes
 
@@ -45,7 +51,7 @@ class OrderedResponder:
         self._machine: OrderedReplica[Incoming] = OrderedReplica()
         self._clients: Clients | None = None
         self._begun: Begin | None = None
-        self._begun_at = 0.0
+        self._begun_at = self._longest_s = self._given_s = 0.0
         self._again: Begin | None = None  # ROS did not take it: it is tried again
         self.detail = ""
 
@@ -58,6 +64,20 @@ class OrderedResponder:
     def in_flight(self) -> int:
         """The number of unanswered requests."""
         return self._machine.in_flight
+
+    def quiet_s(self, *, stuck: bool = False) -> float:
+        """Return for how long its service has worked on one request, if it hangs; else 0.
+
+        `stuck`: only if it is to be started anew for it. As of plain services: `ServiceQueue`.
+        """
+        begun, longest_s = self._begun, self._longest_s
+        if begun is None or begun.op is not Op.APPLY or not longest_s:
+            return 0.0  # one that never answered may still be loading
+        most_s = max(HANGS_AFTER_S, HANGS_AFTER_TIMES * longest_s)
+        if stuck:
+            most_s = max(STUCK_AFTER_S, STUCK_AFTER_TIMES * longest_s, self._given_s)
+        quiet_s = self.clock() - self._begun_at
+        return quiet_s if quiet_s > most_s else 0.0
 
     def use(self, clients: Clients | None) -> None:
         """Set the clients of the local services; None without a ROS node."""
@@ -73,6 +93,7 @@ class OrderedResponder:
             incoming.refuse(Refusal.MALFORMED)
             return
         with self._lock:
+            self._given_s = max(self._given_s, incoming.remaining_s)
             try:
                 effects = self._machine.order(
                     op, epoch, index, incoming.payload, robot=incoming.robot, to=incoming
@@ -140,6 +161,8 @@ class OrderedResponder:
         with self._lock:
             if self._begun is begin:
                 self._begun = None
+                if begin.op is Op.APPLY:
+                    self._longest_s = max(self._longest_s, self.clock() - self._begun_at)
             if answer is not None:
                 self.detail = ""
             effects = self._machine.done(begin.serial, answer)
@@ -148,7 +171,7 @@ class OrderedResponder:
     def crashed(self) -> None:
         """Note that the service has died, with its state."""
         with self._lock:
-            self._again = None
+            self._again = self._begun = None
             effects = self._machine.lost()
         self._perform(effects)
 

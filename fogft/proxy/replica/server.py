@@ -229,6 +229,8 @@ class ServerProxy:
     def _hanging(self, *, stuck: bool = False) -> dict[str, float]:
         """Return the services that hang. Parts of actions take what their goals take."""
         hanging = self.responder.hanging(stuck=stuck)
+        quiet = {name: one.quiet_s(stuck=stuck) for name, one in self._ordered.items()}
+        hanging |= {name: seconds for name, seconds in quiet.items() if seconds}
         if not hanging:
             return hanging
         plain = {s.name for s in self._offering.services if s.part is Part.NONE}

@@ -18,11 +18,11 @@ from fogft.requests.load import NEARLY, NEVER, Handling, Load
 _ABANDONED_AFTER_S = 60.0
 # A service with work that has ended none for so long, and for so many times the longest that it
 # lately took, hangs. One that has never ended any may still be loading what it needs.
-_HANGS_AFTER_S = 1.0
-_HANGS_AFTER_TIMES = 5.0
+HANGS_AFTER_S = 1.0
+HANGS_AFTER_TIMES = 5.0
 # After so much it is started anew, if all that it has is past its deadline. One alone may be lost.
-_STUCK_AFTER_S = 60.0
-_STUCK_AFTER_TIMES = 20.0
+STUCK_AFTER_S = 60.0
+STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 _LONGEST_FADES = 0.999  # with each answer
 # While others wait, a request needs so many times what one usually takes, but no more than that
@@ -211,13 +211,13 @@ class ServiceQueue:
 
     def hangs(self, now: float) -> bool:
         """Whether the service has work, and has finished none for far longer than usual."""
-        return self.quiet_s(now) > max(_HANGS_AFTER_S, _HANGS_AFTER_TIMES * self._longest_s)
+        return self.quiet_s(now) > max(HANGS_AFTER_S, HANGS_AFTER_TIMES * self._longest_s)
 
     def stuck(self, now: float) -> bool:
         """Whether it hangs, and no caller waits for its work."""
         if self._unanswered < _STUCK_ON or now < self._last_deadline:
             return False
-        return self.quiet_s(now) > max(_STUCK_AFTER_S, _STUCK_AFTER_TIMES * self._longest_s)
+        return self.quiet_s(now) > max(STUCK_AFTER_S, STUCK_AFTER_TIMES * self._longest_s)
 
     def quiet_s(self, now: float) -> float:
         """Return for how long a service that has answered before has finished none of its work."""

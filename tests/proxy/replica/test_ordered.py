@@ -458,3 +458,27 @@ def test_noise_is_refused(scene):
     incoming = Incoming(scene, scene.links[0], b"\xff" * 16, b"q")
     scene.responders[0].request(incoming)
     assert scene.answers[-1][1].refusal == Refusal.MALFORMED
+
+
+def test_a_service_that_answers_nothing_any_more_hangs_and_is_stuck_in_the_end(tmp_path):
+    """As a plain one: after times of what it took before, and never within a caller's time."""
+    scene = Scene(tmp_path, replicas=1)
+    [responder] = scene.responders
+    scene.run()
+    scene.dispatcher.submit(b"q", 0)
+    scene.run()
+    scene.clock.now += 3600.0
+    assert responder.quiet_s() == 0.0, "what never answered may still be loading"
+    scene.clock.now -= 3600.0 - 0.5
+    scene.serve(0, b"r")
+    scene.run()
+    assert responder.quiet_s() == 0.0
+    scene.dispatcher.submit(b"q", 1)
+    scene.run()
+    scene.clock.now += 30.0
+    assert responder.quiet_s() > 30.0
+    assert responder.quiet_s(stuck=True) == 0.0
+    scene.clock.now += 60.0
+    assert responder.quiet_s(stuck=True) > 60.0
+    responder.crashed()
+    assert responder.quiet_s() == responder.quiet_s(stuck=True) == 0.0
