@@ -341,5 +341,5 @@ class Watched:
         return found not in (None, before)
 
     def forget(self) -> None:
-        """Have the next call return True: what was there could not be used yet."""
+        """Take the file for one not seen yet: what was there could not be used."""
         self._seen = None

@@ -11,7 +11,7 @@ class _Open(Protocol):
 def is_ready(
     file: int | _Open, timeout_s: float | None = 0.0, *, event: int = select.POLLIN
 ) -> bool:
-    """Wait until a file, socket or pidfd can be read without waiting; return whether it can.
+    """Wait until a file, socket or pidfd can be read, or what `event` says; return whether it can.
 
     Also true where that would fail, as of one that is closed. None: no time limit.
     """

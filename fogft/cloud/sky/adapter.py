@@ -64,7 +64,7 @@ def make(folder: Path, base: Path) -> SkyCloud:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container's user often has no name
         user = f"uid{os.getuid()}"
-    # Robots of one image have one user and one host name.
+    # Robots of one image have one user and one host name, but each should have its own id.
     machine = hashlib.sha256(read_bytes(MACHINE_ID) or b"").hexdigest()[:8]
     owner = f"{user}-{socket.gethostname()}"[:50] + f"-{machine}"
     google = importlib.util.find_spec("google") and importlib.util.find_spec("google.auth")

@@ -95,13 +95,13 @@ class InstalledSky:
         have been forgotten on the way; its late answer, old by then, is thrown away.
         """
         ends_at = time.monotonic() + limit_s
-        running, begun_at = self._given_up.get(subject, (None, ends_at - limit_s))
-        if ends_at - limit_s - begun_at > _FORGOTTEN * limit_s:
-            running, begun_at = None, ends_at - limit_s
+        running, begun_at = self._given_up.get(subject, (None, 0.0))
+        if time.monotonic() - begun_at > _FORGOTTEN * limit_s:
+            running = None
         if running is not None:
             wait([running], limit_s)
         if running is None or running.done():
-            running = Future()
+            running, begun_at = Future(), time.monotonic()
             threading.Thread(target=_run, args=(call, running), daemon=True).start()
             wait([running], max(0.0, ends_at - time.monotonic()))
             if running.done():

@@ -66,6 +66,7 @@ def export(
         try:
             with contextlib.ExitStack() as ended:
                 ended.enter_context(shutdown.without_manager(paths, told))
+                store.identity()  # the manager may have stepped back just then
                 proxy_supervisor.forbid_restart(paths)
                 ended.enter_context(shutdown.without_orders(paths, store.spec(), told))
                 holder = Holder(Role.MANAGER, "manager", 1, identity.uid)

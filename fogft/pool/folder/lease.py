@@ -47,7 +47,8 @@ class Lease:
 
     def beat(self) -> None:
         """Write the heartbeat. Raises PoolBusy where a later manager has it: stop at once."""
-        if self._lock.lost or read_epoch(self._paths) > self.epoch:
+        lost = self._lock.lost and self._paths.folder.exists()
+        if lost or read_epoch(self._paths) > self.epoch:
             raise PoolBusy(f"a later manager has taken over pool `{self._paths.folder.name}`")
         self._beat += 1
         self._write()

@@ -54,6 +54,7 @@ def end(
         except PoolNotFound:
             return  # another `down` was faster
         kept.enter_context(without_manager(paths, told))
+        store.identity()  # it may have stepped back just then
         # Should this be cut short, whoever manages the pool next goes on ending it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             before = disk.read_or(paths.intent, Intent())
@@ -67,8 +68,8 @@ def end(
             warned=warned,
             limit_s=limit_s,
         )
-        # The identity before the rest, but after the keys: from here on there is no such pool.
         shutil.rmtree(paths.credentials, ignore_errors=True)
+        # The identity before the rest: from here on there is no such pool.
         with contextlib.suppress(OSError):  # what stands in its place is no file
             paths.identity.unlink()
         _remove(paths.folder)
@@ -77,7 +78,7 @@ def end(
 def _end_exported(paths: PoolPaths, told: Callable[[str], None]) -> None:
     with disk.locked(paths.intent_lock):
         if not paths.exported.exists():
-            raise FogftError(f"`{paths.folder}` has just changed", "run `fogft down` again")
+            return  # another `down` was faster, or it was imported again
         # A manager that has just stepped back may still be running, and writing.
         with without_manager(paths, told), without_client_proxy(paths, told):
             _remove(paths.folder)
@@ -87,7 +88,7 @@ def _remove(folder: Path) -> None:
     for _ in range(_TRIES):  # a command may be writing to it
         shutil.rmtree(folder, ignore_errors=True)
     if folder.exists():
-        raise FogftError(f"`{folder}` cannot be removed", "it contains the pool's keys: remove it")
+        raise FogftError(f"`{folder}` cannot be removed", "remove it yourself")
 
 
 def without_manager(

@@ -16,12 +16,7 @@ from fogft.model.refusal import Refusal
 from fogft.ordering import orders
 from fogft.ordering.orders import Op, OrderError
 from fogft.ordering.replica import Begin, OrderedReplica, Refuse, Reply
-from fogft.proxy.replica.service_queue import (
-    HANGS_AFTER_S,
-    HANGS_AFTER_TIMES,
-    STUCK_AFTER_S,
-    STUCK_AFTER_TIMES,
-)
+from fogft.proxy.replica.service_queue import LONGEST_FADES, most_quiet_s
 from fogft.ros.port import RosClient
 from fogft.ros.state_bytes import StateBytes
 
@@ -73,9 +68,7 @@ class OrderedResponder:
         begun, longest_s = self._begun, self._longest_s
         if begun is None or begun.op is not Op.APPLY or not longest_s:
             return 0.0  # one that never answered may still be loading
-        most_s = max(HANGS_AFTER_S, HANGS_AFTER_TIMES * longest_s)
-        if stuck:
-            most_s = max(STUCK_AFTER_S, STUCK_AFTER_TIMES * longest_s, self._given_s)
+        most_s = max(most_quiet_s(longest_s, stuck=stuck), self._given_s if stuck else 0.0)
         quiet_s = self.clock() - self._begun_at
         return quiet_s if quiet_s > most_s else 0.0
 
@@ -161,8 +154,10 @@ class OrderedResponder:
         with self._lock:
             if self._begun is begin:
                 self._begun = None
-                if begin.op is Op.APPLY:
-                    self._longest_s = max(self._longest_s, self.clock() - self._begun_at)
+                if begin.op is Op.APPLY and answer is not None:
+                    took_s = self.clock() - self._begun_at
+                    self._longest_s = max(took_s, self._longest_s * LONGEST_FADES)
+                    self._given_s *= LONGEST_FADES
             if answer is not None:
                 self.detail = ""
             effects = self._machine.done(begin.serial, answer)
@@ -172,6 +167,7 @@ class OrderedResponder:
         """Note that the service has died, with its state."""
         with self._lock:
             self._again = self._begun = None
+            self._longest_s = self._given_s = 0.0  # of a new process nothing is known
             effects = self._machine.lost()
         self._perform(effects)
 

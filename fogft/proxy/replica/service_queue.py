@@ -18,17 +18,24 @@ from fogft.requests.load import NEARLY, NEVER, Handling, Load
 _ABANDONED_AFTER_S = 60.0
 # A service with work that has ended none for so long, and for so many times the longest that it
 # lately took, hangs. One that has never ended any may still be loading what it needs.
-HANGS_AFTER_S = 1.0
-HANGS_AFTER_TIMES = 5.0
+_HANGS_AFTER_S = 1.0
+_HANGS_AFTER_TIMES = 5.0
 # After so much it is started anew, if all that it has is past its deadline. One alone may be lost.
-STUCK_AFTER_S = 60.0
-STUCK_AFTER_TIMES = 20.0
+_STUCK_AFTER_S = 60.0
+_STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
-_LONGEST_FADES = 0.999  # with each answer
+LONGEST_FADES = 0.999  # with each answer
 # While others wait, a request needs so many times what one usually takes, but no more than that
 # share of the longest time that one was given here: what takes longer than most comes too late.
 _TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
 HOLD_LIMIT_S = 2.0  # a cancel service that has not answered by then is given up
+
+
+def most_quiet_s(longest_s: float, *, stuck: bool = False) -> float:
+    """Return for how long a service may end nothing, by the longest that it lately took."""
+    if stuck:
+        return max(_STUCK_AFTER_S, _STUCK_AFTER_TIMES * longest_s)
+    return max(_HANGS_AFTER_S, _HANGS_AFTER_TIMES * longest_s)
 
 
 class Job:
@@ -89,7 +96,7 @@ class ServiceQueue:
         deadline = job.deadline + (LONGEST_S if job.spare else 0.0)
         self._waiting.put(job.id, job.robot, deadline, job)
         given_s = job.deadline - job.arrived
-        self._longest_given_s = max(given_s, self._longest_given_s * _LONGEST_FADES)
+        self._longest_given_s = max(given_s, self._longest_given_s * LONGEST_FADES)
 
     def _has_room(self, job: Job) -> bool:
         if self.at_work and (job.alone or self._alone):
@@ -172,7 +179,7 @@ class ServiceQueue:
         if job.passed_on:
             took_s = now - job.begun
             self.limit.finished(job.level, took_s, now)
-            self._longest_s = max(took_s, self._longest_s * _LONGEST_FADES)
+            self._longest_s = max(took_s, self._longest_s * LONGEST_FADES)
         self.free(job)
         if self._next is not None:  # only now does the service begin with it
             self._next.begun, self._next.level = now, self.at_work
@@ -211,13 +218,13 @@ class ServiceQueue:
 
     def hangs(self, now: float) -> bool:
         """Whether the service has work, and has finished none for far longer than usual."""
-        return self.quiet_s(now) > max(HANGS_AFTER_S, HANGS_AFTER_TIMES * self._longest_s)
+        return self.quiet_s(now) > most_quiet_s(self._longest_s)
 
     def stuck(self, now: float) -> bool:
         """Whether it hangs, and no caller waits for its work."""
         if self._unanswered < _STUCK_ON or now < self._last_deadline:
             return False
-        return self.quiet_s(now) > max(STUCK_AFTER_S, STUCK_AFTER_TIMES * self._longest_s)
+        return self.quiet_s(now) > most_quiet_s(self._longest_s, stuck=True)
 
     def quiet_s(self, now: float) -> float:
         """Return for how long a service that has answered before has finished none of its work."""

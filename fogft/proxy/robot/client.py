@@ -78,7 +78,8 @@ class ClientProxy:
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
         """Proxy exactly these services. Requests under way continue.
 
-        Raises RosError: One of them cannot be proxied: it stays as it was, and all others change.
+        Raises RosError: One of them cannot be proxied, and all others change. It stays as it was,
+            or ends where it is stateful.
         """
         failure: RosError | None = None
         with self._lock:

@@ -56,12 +56,15 @@ class Following:
         Raises WireError: The new door's port cannot be had; there is none then.
         """
         old, self._config = self._config, config
-        if (old.dial_in, old.dial_in_listen) != (config.dial_in, config.dial_in_listen):
+        wanted = config.dial_in or config.dial_in_listen
+        same = (old.dial_in, old.dial_in_listen) == (config.dial_in, config.dial_in_listen)
+        if not same or (wanted and self.door is None):
             if self.door is not None:
                 self.door.close()
                 self.door = None
             self._open_door()
-        if (old.rendezvous, old.dial_in) != (config.rendezvous, config.dial_in):
+        same = (old.rendezvous, old.dial_in) == (config.rendezvous, config.dial_in)
+        if not same or (config.rendezvous and self._client is None):
             if self._client is not None:
                 self._client.close()
                 self._client = None
@@ -104,15 +107,11 @@ class Following:
             self._announce(self._client)
 
     def look(self) -> Membership | None:
-        """Return the membership if it may have changed. Raises StateError: a damaged file."""
-        try:
-            return self._look()
-        except (FogftError, OSError):
-            self._changed.set()
-            self._file.forget()
-            raise
+        """Return the membership if it may have changed.
 
-    def _look(self) -> Membership | None:
+        Raises FogftError or OSError: A file cannot be read, and records say nothing new. The next
+        look tries again.
+        """
         now = self._clock()
         self._looks = min(_LOOKS, self._looks + now - self._looked_at)
         self._looked_at = now
@@ -121,10 +120,22 @@ class Following:
             self._changed.clear()
             self._looks -= 1.0
         if self._file.changed():
+            try:
+                self._read()
+            except (FogftError, OSError):
+                self._file.forget()
+                if not changed:
+                    raise
             changed = True
-            self._read()
         if not changed:
             return None
+        try:
+            return self._located()
+        except (FogftError, OSError):
+            self._changed.set()
+            raise
+
+    def _located(self) -> Membership | None:
         known = self._known()
         latest = self._from_file
         for record in known.of(RecordKind.ADMISSION):

@@ -174,7 +174,14 @@ class _Running:
         made.append(proxy)
         check_field = functools.partial(trouble, bool_field)
         self.seen = SeenFromRos(config.pool, config.robot, self._make_visible, check_field)
-        proxy.serve(self.seen.follow(config.services))
+        self.again = False  # whether the configuration is to be tried again
+        try:
+            proxy.serve(self.seen.follow(config.services))
+        except RosError as error:
+            if not proxy.report()["services"]:
+                raise
+            log.error("service_failed reason=%r", error.message)
+            self.again = True
         proxy.pass_topics(config.topics, cast("SerialisedNode", joined.node))
         self.following = Following(config)
         self.told = disk.Report(config.status)
@@ -263,7 +270,7 @@ class _Running:
         announcements = Watched(config.announcements) if config.announcements else None
         started = reported = time.monotonic()
         looked = 0.0
-        changed = again = False  # since the last report; whether the configuration is tried again
+        changed = False  # since the last report
         participant, pauses, renew_at = b"", Pauses(), math.inf
         while not stop.is_set():
             changed = proxy.run_once(_LOOK_EVERY_S) or changed
@@ -282,7 +289,7 @@ class _Running:
             if self.held:
                 try_step(self._take_over, config.lock)
             if watched_config.changed():
-                again = not try_step(self._reconfigure, self.config_path)
+                self.again = not try_step(self._reconfigure, self.config_path)
             if (services := self.seen.changed()) is not None:
                 try_step(functools.partial(proxy.serve, services), self.config_path)
             try_step(self._follow, config.membership)
@@ -293,7 +300,7 @@ class _Running:
                 try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
             if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
                 reported, changed = now, False
-                if again:
+                if self.again:
                     watched_config.forget()
                 if self.lock.lost or not folder.exists():  # the pool's: its end is the pool's
                     log.warning("folder_gone path=%s", folder)
@@ -358,7 +365,7 @@ _troubles: dict[Path, str] = {}
 def try_step(step: Callable[[], None], path: Path) -> bool:
     """Run one step; errors such as a bad file or a full disk are logged once and skipped.
 
-    Returns whether there was none.
+    Returns whether it succeeded.
     """
     try:
         step()

@@ -105,7 +105,7 @@ class Pacer:
     def __post_init__(self) -> None:
         self._pace = Pace()
         self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
-        self._asked: dict[bytes, float] = {}  # those whose nodes may answer self.probes: until when
+        self._asked: dict[bytes, float] = {}  # whose nodes may answer probes: until when
         self._lock = threading.Lock()
         self._wake = threading.Condition(self._lock)
         self._thread: threading.Thread | None = None  # made when there is something to wait for
