@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from fogft.errors import RosError, Unreadable
@@ -73,24 +74,19 @@ class Publisher:
         node.destroy_publisher(self._publisher)
 
 
+@dataclass(eq=False)
 class Subscription:
     """A subscription of a node. Any thread."""
 
-    def __init__(
-        self,
-        subscription: Any,
-        topic: TopicSpec,
-        on_message: Callable[[bytes], None],
-        withdraw: Callable[[Subscription], None],
-        publishers: Callable[[str], Any],
-    ) -> None:
-        self._topic = topic
-        self._publishers = publishers
-        self.handle = subscription.handle
-        self._subscription = subscription
-        self._name: str = subscription.topic_name
-        self._on_message = on_message
-        self._withdraw = withdraw
+    subscription: Any
+    topic: TopicSpec
+    on_message: Callable[[bytes], None]
+    withdraw: Callable[[Subscription], None]
+    publishers: Callable[[str], Any]
+
+    def __post_init__(self) -> None:
+        self.handle = self.subscription.handle
+        self._name: str = self.subscription.topic_name
         self._open = True
 
     def mismatch(self) -> str:
@@ -99,26 +95,26 @@ class Subscription:
 
         name = self._name
         try:
-            found = [one.qos_profile for one in self._publishers(name)] if self._open else []
+            found = [one.qos_profile for one in self.publishers(name)] if self._open else []
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
             return ""
         for offered in found:
-            if self._topic.reliable and offered.reliability == ReliabilityPolicy.BEST_EFFORT:
+            if self.topic.reliable and offered.reliability == ReliabilityPolicy.BEST_EFFORT:
                 return f"a publisher of `{name}` offers best effort: write `reliable: false`"
-            if self._topic.latched and offered.durability == DurabilityPolicy.VOLATILE:
+            if self.topic.latched and offered.durability == DurabilityPolicy.VOLATILE:
                 return f"a publisher of `{name}` is not latched: write `latched: false`"
         return ""
 
     def close(self) -> None:
         """Withdraw it; repeatable. On return it is gone, unless the take loop called."""
         self._open = False
-        self._withdraw(self)
+        self.withdraw(self)
 
     def drain(self) -> None:
         """Deliver received messages. Take loop only."""
         for _ in range(BURST):
             try:
-                taken = self.handle.take_message(self._subscription.msg_type, True)
+                taken = self.handle.take_message(self.subscription.msg_type, True)
             except Exception as error:  # of one message; the take loop goes on
                 log.warning("message_not_taken topic=%s reason=%r", self._name, str(error))
                 return
@@ -126,11 +122,11 @@ class Subscription:
                 return
             try:
                 if self._open:
-                    self._on_message(bytes(taken[0]))
+                    self.on_message(bytes(taken[0]))
             except Exception:
                 log.exception("%s: a message was lost", self._name)
 
     def destroy(self, node: Any) -> None:
         """Free everything. Take loop only, once, when no wait set holds the handle."""
         self._open = False
-        node.destroy_subscription(self._subscription)
+        node.destroy_subscription(self.subscription)

@@ -6,7 +6,7 @@ Owns: calls of the fallback service. Not here: when it is asked (`requests.fallb
 import logging
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fogft.counters import worth_logging
@@ -25,29 +25,25 @@ log = logging.getLogger(__name__)
 Respond = Callable[[Any, bytes], None]
 
 
+@dataclass(eq=False)
 class Delivery:
     """The delivery of one service's outcomes; arguments as for `Dispatcher`.
 
     `forget` tells these replicas that a request is no longer wanted.
     """
 
-    def __init__(
-        self,
-        ledger: Ledger,
-        respond: Respond,
-        empty_response: bytes | None,
-        forget: Callable[[bytes, Iterable[int]], None],
-    ) -> None:
-        self._ledger = ledger
-        self._respond = respond
-        self._empty_response = empty_response
-        self._forget = forget
+    ledger: Ledger
+    respond: Respond
+    empty_response: bytes | None
+    forget: Callable[[bytes, Iterable[int]], None]
+
+    def __post_init__(self) -> None:
         self._client: RosClient | None = None
-        self.adopt(ledger.spec, None)
+        self.adopt(self.ledger.spec, None)
 
     def adopt(self, spec: ServiceSpec, client: RosClient | None) -> None:
         """Apply a spec's fallback, with its client; without one, ask no more. Under the lock."""
-        self._client, requests = client, self._ledger.requests
+        self._client, requests = client, self.ledger.requests
         if requests.fallback is None and spec.fallback is not None:
             requests.fallback = FallbackTimer(spec.fallback)
         elif requests.fallback is not None:
@@ -58,26 +54,26 @@ class Delivery:
     def give(self, pending: Pending, payload: bytes) -> None:
         """Send a response to its caller. A failure affects no other request."""
         try:
-            self._respond(pending.handle, payload)
+            self.respond(pending.handle, payload)
         except RosError as error:
             self._warn("undelivered", "response_undelivered", error.message)
 
     def poisoned(self, request: bytes, pending: Pending) -> None:
         """End a request that crashed several services, in the way set for its deadline."""
-        self._ledger.outcomes.poisoned_at = time.time()
-        empty = self._ledger.spec.on_timeout is OnTimeout.EMPTY
+        self.ledger.outcomes.poisoned_at = time.time()
+        empty = self.ledger.spec.on_timeout is OnTimeout.EMPTY
         outcome = Outcome.FALLBACK if self._falls_back else Outcome.POISON
-        self._end(request, pending, outcome, self._empty_response if empty else None)
+        self._end(request, pending, outcome, self.empty_response if empty else None)
 
     def expired(self, request: bytes, pending: Pending) -> None:
         """Handle a request's deadline."""
-        spec, response = self._ledger.spec, pending.rejection
+        spec, response = self.ledger.spec, pending.rejection
         if self._falls_back:
             outcome = Outcome.FALLBACK
         elif response is not None:
             outcome = Outcome.ANSWERED
-        elif spec.on_timeout is OnTimeout.EMPTY and self._empty_response is not None:
-            outcome, response = Outcome.EMPTY, self._empty_response
+        elif spec.on_timeout is OnTimeout.EMPTY and self.empty_response is not None:
+            outcome, response = Outcome.EMPTY, self.empty_response
         else:
             outcome = Outcome.SILENT
         log.warning(
@@ -89,8 +85,8 @@ class Delivery:
     @property
     def _falls_back(self) -> bool:
         """Whether the fallback has the last word."""
-        falls_back = self._ledger.spec.on_timeout is OnTimeout.FALLBACK
-        return falls_back and self._ledger.requests.fallback is not None
+        falls_back = self.ledger.spec.on_timeout is OnTimeout.FALLBACK
+        return falls_back and self.ledger.requests.fallback is not None
 
     def _end(
         self, request: bytes, pending: Pending, outcome: Outcome, response: bytes | None
@@ -99,25 +95,25 @@ class Delivery:
         if outcome is Outcome.FALLBACK:
             self._await_fallback(request, pending)
             return
-        with self._ledger.lock:
-            self._ledger.end(request, pending, outcome)
-            if self._ledger.requests.fallback is not None:  # it was meant for that one
-                self._ledger.requests.fallback.ended(request)
+        with self.ledger.lock:
+            self.ledger.end(request, pending, outcome)
+            if self.ledger.requests.fallback is not None:  # it was meant for that one
+                self.ledger.requests.fallback.ended(request)
         if response is not None:
             self.give(pending, response)
 
     def tick(self, now: float, *, able: bool) -> float:
         """Call the fallback for due requests, and give up the rest; return when to call again."""
-        timer, requests = self._ledger.requests.fallback, self._ledger.requests
+        timer, requests = self.ledger.requests.fallback, self.ledger.requests
         if timer is None:
             return NEVER
-        with self._ledger.lock:
+        with self.ledger.lock:
             due = [(request, requests.get(request)) for request in timer.due(now, able=able)]
             over = timer.given_up(now)
             look_at = timer.look_at(able=able)
         for request, pending in due:
             if pending is not None and not self._ask(request, pending):
-                with self._ledger.lock:
+                with self.ledger.lock:
                     timer.failed(request)
         for request, pending in over:
             self._without_fallback(request, pending)
@@ -125,12 +121,12 @@ class Delivery:
 
     def _await_fallback(self, request: bytes, pending: Pending) -> None:
         """The fallback has the rest of the say; it may have been asked before."""
-        timer = self._ledger.requests.fallback
+        timer = self.ledger.requests.fallback
         assert timer is not None
-        with self._ledger.lock:
-            must_ask = timer.expired(request, pending, self._ledger.clock())
+        with self.ledger.lock:
+            must_ask = timer.expired(request, pending, self.ledger.clock())
         if must_ask and not self._ask(request, pending):
-            with self._ledger.lock:
+            with self.ledger.lock:
                 ours = timer.answered(request) is not None
             if ours:
                 self._without_fallback(request, pending)
@@ -151,7 +147,7 @@ class Delivery:
 
     def _fallback_answered(self, request: bytes, payload: bytes) -> None:
         """Take the fallback's response, on the thread that takes from ROS."""
-        ledger = self._ledger
+        ledger = self.ledger
         accepts = ledger.requests.decide.accepts
         try:
             ok = accepts is None or accepts(payload)
@@ -170,7 +166,7 @@ class Delivery:
             return
         self.give(pending, payload)
         if not overdue:
-            self._forget(request, tuple(pending.open))
+            self.forget(request, tuple(pending.open))
 
     def _without_fallback(self, request: bytes, pending: Pending) -> None:
         """The fallback had nothing either: return the rejection if there is one."""
@@ -180,9 +176,9 @@ class Delivery:
         self._end(request, pending, outcome, response)
 
     def _warn(self, counter: str, event: str, reason: str) -> None:
-        with self._ledger.lock:
-            self._ledger.outcomes.count[counter] += 1
-            count = self._ledger.outcomes.count[counter]
+        with self.ledger.lock:
+            self.ledger.outcomes.count[counter] += 1
+            count = self.ledger.outcomes.count[counter]
         if worth_logging(count):
-            name = self._ledger.spec.name
+            name = self.ledger.spec.name
             log.warning("%s service=%s reason=%r count=%d", event, name, reason, count)
