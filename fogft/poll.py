@@ -1,15 +1,11 @@
 """Wait for a file descriptor of any number: `select.select` takes none above 1023."""
 
 import select
-from typing import Protocol
-
-
-class _Open(Protocol):
-    def fileno(self) -> int: ...
+import socket
 
 
 def is_ready(
-    file: int | _Open, timeout_s: float | None = 0.0, *, event: int = select.POLLIN
+    file: int | socket.socket, timeout_s: float | None = 0.0, *, event: int = select.POLLIN
 ) -> bool:
     """Wait until a file, socket or pidfd can be read, or what `event` says; return whether it can.
 

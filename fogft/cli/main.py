@@ -22,7 +22,6 @@ from fogft.errors import FogftError
 
 INTERRUPTED = 130
 STDOUT_CLOSED = 141
-_NO_ROOM = {errno.ENOSPC, errno.EDQUOT}
 # What Typer's checker of values says, and what we say.
 _OTHER_WORDS = (
     (" range.", "."),
@@ -98,7 +97,7 @@ def _run(args: Sequence[str]) -> int:
         _explain_usage(problem)
         return 2
     except OSError as problem:
-        if problem.filename is None and problem.errno not in _NO_ROOM:
+        if problem.filename is None and problem.errno not in (errno.ENOSPC, errno.EDQUOT):
             raise  # a connection's, not a file's
         where = "an open file" if problem.filename is None else f"`{problem.filename}`"
         output.error(f"{where}: {problem.strerror}")

@@ -90,9 +90,8 @@ class InstalledSky:
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
         """Run a call on its own thread within a limit, which SkyPilot's client lacks.
 
-        One that is given up still runs, here and on the API server. Until it has ended the same
-        question (`subject`) is not asked again, unless it takes so long that its connection must
-        have been forgotten on the way; its late answer, old by then, is thrown away.
+        One that is given up still runs, here and on the API server. Until it has ended, or must
+        have been lost, the same question (`subject`) is not asked again; a late answer is dropped.
         """
         ends_at = time.monotonic() + limit_s
         running, begun_at = self._given_up.get(subject, (None, 0.0))

@@ -47,9 +47,9 @@ class Lease:
 
     def beat(self) -> None:
         """Write the heartbeat. Raises PoolBusy where a later manager has it: stop at once."""
-        lost = self._lock.lost and self._paths.folder.exists()
-        if lost or read_epoch(self._paths) > self.epoch:
-            raise PoolBusy(f"a later manager has taken over pool `{self._paths.folder.name}`")
+        folder = self._paths.folder
+        if (self._lock.lost and folder.exists()) or read_epoch(self._paths) > self.epoch:
+            raise PoolBusy(f"a later manager has taken over pool `{folder.name}`")
         self._beat += 1
         self._write()
 

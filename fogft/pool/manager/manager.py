@@ -252,7 +252,7 @@ class Manager:
             alone_s = tick.spec.unmanaged_max_hours * lifetime.HOUR_S + RUN_ENDED_S
             machines = (*seen.machines, *seen.gateway, *seen.standbys)
             self._costs.look(
-                seen.now, machines, seen.offers, alone_s, self._reconciler.timekeeping.set_s
+                seen.now, machines, seen.offers, alone_s, self._reconciler.timekeeping.watch.set_s
             )
 
     def _leave(self) -> None:

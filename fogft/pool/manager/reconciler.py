@@ -228,7 +228,7 @@ class Reconciler:
         stopped = tuple(m for m in machines or () if m.phase is MachinePhase.STOPPED)
         if machines is not None and (gateway or stopped):
             machines = tuple(m for m in machines if m not in (*gateway, *stopped))
-        doubt_s = self.timekeeping.doubt_s
+        doubt_s = self.timekeeping.watch.doubt_s
         seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway, stopped)
         return seen, trouble
 

@@ -24,7 +24,7 @@ class Timekeeping:
         self._store = store
         self._updating = updating
         self._clock = clock
-        self._watch = Watch()
+        self.watch = Watch()  # how far the clock was set
         self._unwritten: list[tuple[EventKind, float, Reason]] = []
 
     def look(self) -> bool:
@@ -34,7 +34,7 @@ class Timekeeping:
         """
         reading = self._clock()
         self.now = reading.wall_s
-        jump = self._watch.look(reading)
+        jump = self.watch.look(reading)
         if jump is not None:
             log.error("clock_jumped set_s=%.1f slept_s=%.1f", jump.set_s, jump.slept_s)
             both = ((EventKind.CLOCK, jump.set_s), (EventKind.SLEPT, jump.slept_s))
@@ -46,16 +46,6 @@ class Timekeeping:
             del self._unwritten[0]
             self._updating.move(by_s)
         return jumped
-
-    @property
-    def doubt_s(self) -> float:
-        """By how much the clock was just set; see `Observed.doubt_s`."""
-        return self._watch.doubt_s
-
-    @property
-    def set_s(self) -> float:
-        """How far the clock was set since this manager began."""
-        return self._watch.set_s
 
 
 _QUICK_S = 0.1

@@ -78,8 +78,7 @@ class ClientProxy:
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
         """Proxy exactly these services. Requests under way continue.
 
-        Raises RosError: One of them cannot be proxied, and all others change. It stays as it was,
-            or ends where it is stateful.
+        Raises RosError: One cannot be proxied (a stateful one has ended); all others change.
         """
         failure: RosError | None = None
         with self._lock:

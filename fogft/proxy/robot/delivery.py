@@ -65,10 +65,10 @@ class Delivery:
         outcome = Outcome.FALLBACK if self._falls_back else Outcome.POISON
         self._end(request, pending, outcome, self.empty_response if empty else None)
 
-    def expired(self, request: bytes, pending: Pending) -> None:
+    def expired(self, request: bytes, pending: Pending, *, may_fall_back: bool = True) -> None:
         """Handle a request's deadline."""
         spec, response = self.ledger.spec, pending.rejection
-        if self._falls_back:
+        if self._falls_back and may_fall_back:
             outcome = Outcome.FALLBACK
         elif response is not None:
             outcome = Outcome.ANSWERED
@@ -78,7 +78,8 @@ class Delivery:
             outcome = Outcome.SILENT
         log.warning(
             "request_timed_out service=%s outcome=%s waited_s=%.3f open=%s request=%s",
-            spec.name, outcome.value, spec.timeout_s, sorted(pending.open), request.hex(),
+            spec.name, outcome.value, self.ledger.clock() - pending.arrived,
+            sorted(pending.open), request.hex(),
         )  # fmt: skip
         self._end(request, pending, outcome, response)
 

@@ -362,7 +362,7 @@ class Dispatcher:
         with self._lock:
             expired = self._requests.expire(self._clock(), every=every)
         for request, pending in expired:
-            self._delivery.expired(request, pending)
+            self._delivery.expired(request, pending, may_fall_back=not every)
             self._sender.forget(request, tuple(self._sender.links))
 
     def tick(self) -> float:

@@ -56,9 +56,8 @@ class Following:
         Raises WireError: The new door's port cannot be had; there is none then.
         """
         old, self._config = self._config, config
-        wanted = config.dial_in or config.dial_in_listen
-        same = (old.dial_in, old.dial_in_listen) == (config.dial_in, config.dial_in_listen)
-        if not same or (wanted and self.door is None):
+        before, doors = ((c.dial_in, c.dial_in_listen) for c in (old, config))
+        if before != doors or (any(doors) and self.door is None):
             if self.door is not None:
                 self.door.close()
                 self.door = None
@@ -109,8 +108,7 @@ class Following:
     def look(self) -> Membership | None:
         """Return the membership if it may have changed.
 
-        Raises FogftError or OSError: A file cannot be read, and records say nothing new. The next
-        look tries again.
+        Raises FogftError or OSError: A file cannot be read, and records say nothing new.
         """
         now = self._clock()
         self._looks = min(_LOOKS, self._looks + now - self._looked_at)

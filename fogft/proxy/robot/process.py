@@ -177,10 +177,9 @@ class _Running:
         self.again = False  # whether the configuration is to be tried again
         try:
             proxy.serve(self.seen.follow(config.services))
-        except RosError as error:
+        except RosError:
             if not proxy.report()["services"]:
                 raise
-            log.error("service_failed reason=%r", error.message)
             self.again = True
         proxy.pass_topics(config.topics, cast("SerialisedNode", joined.node))
         self.following = Following(config)

@@ -42,7 +42,7 @@ def test_a_jump_that_cannot_be_written_down_is_written_later(
     assert record is not None
     assert time.now - record.launched_at == pytest.approx(2.0, abs=2.0)
     assert store.trial().began_at == 1e9 + 3600
-    assert time.doubt_s == 3600.0
+    assert time.watch.doubt_s == 3600.0
 
 
 def _full_disk(event: Event) -> None:

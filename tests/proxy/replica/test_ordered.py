@@ -482,3 +482,7 @@ def test_a_service_that_answers_nothing_any_more_hangs_and_is_stuck_in_the_end(t
     assert responder.quiet_s(stuck=True) > 60.0
     responder.crashed()
     assert responder.quiet_s() == responder.quiet_s(stuck=True) == 0.0
+    responder.tick(alive=True)
+    scene.run()
+    scene.clock.now += 3600.0
+    assert responder.quiet_s(stuck=True) == 0.0, "of a new process nothing is known"

@@ -168,6 +168,7 @@ def test_a_membership_that_cannot_be_read_for_a_moment_is_read_then(tmp_path, mo
     config = read_client(tmp_path / "proxy.yaml")
     monkeypatch.setattr(Following, "holder", lambda _: Holder(Role.ROBOT, "robot", 1, UID))
     seen = Following(config)
+    assert seen.look() is None
     config.membership.write_text(MEMBERS)
     with monkeypatch.context() as patch:
         full = OSError(errno.EMFILE, "Too many open files")
@@ -177,3 +178,19 @@ def test_a_membership_that_cannot_be_read_for_a_moment_is_read_then(tmp_path, mo
     found = seen.look()
     assert found is not None
     assert [one.id.slot for one in found.members] == [0]
+
+
+def test_a_membership_that_stays_damaged_is_told_and_read_once_it_is_whole(tmp_path, monkeypatch):
+    (tmp_path / "proxy.yaml").write_text(CLIENT)
+    config = read_client(tmp_path / "proxy.yaml")
+    monkeypatch.setattr(Following, "holder", lambda _: Holder(Role.ROBOT, "robot", 1, UID))
+    config.membership.write_text(MEMBERS)
+    seen = Following(config)
+    assert seen.look() is not None
+    config.membership.write_text("{")
+    with pytest.raises(FogftError):
+        seen.look()
+    with pytest.raises(FogftError):
+        seen.look()
+    config.membership.write_text(MEMBERS)
+    assert seen.look() is not None
