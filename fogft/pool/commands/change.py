@@ -87,11 +87,9 @@ def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Ho
 
     A replica that is revoked is replaced, too.
     """
-    ledger = Ledger(store.paths.credentials)
-    with disk.locked(store.paths.intent_lock):  # no export may read it meanwhile
-        store.identity()
-        holders = ledger.named(role, name)
-        ledger.revoke(holders)
+    store.identity()
+    holders = Ledger(store.paths.credentials).named(role, name)
+    _revoke(store, holders)
     for holder in holders if role is Role.REPLICA else ():
         drained = partial(intent.drain, slot=int(holder.name), generation=holder.generation)
         change(store, drained)
@@ -102,17 +100,21 @@ def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:
     """Give this machine's client proxy new credentials, and revoke the old ones once the new
     ones are in use; return the new holder, the old ones, and whether that has happened.
     """
-    ledger = Ledger(store.paths.credentials)
     with disk.locked(store.paths.intent_lock):
         holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
-    old = [
-        one for one in ledger.named(Role.ROBOT, holder.name) if one.generation < holder.generation
-    ]
+    named = Ledger(store.paths.credentials).named(Role.ROBOT, holder.name)
+    old = [one for one in named if one.generation < holder.generation]
     in_use = wait_for(lambda: _in_use(store.paths, holder), PUBLISH_LIMIT_S)
     if in_use and old:
-        ledger.revoke(old)
+        _revoke(store, old)
         _published(store, old)
     return holder, old, in_use
+
+
+def _revoke(store: PoolStore, holders: Sequence[Holder]) -> None:
+    with disk.locked(store.paths.intent_lock):  # no export may read the ledger meanwhile
+        store.identity()
+        Ledger(store.paths.credentials).revoke(holders)
 
 
 def _in_use(paths: PoolPaths, holder: Holder) -> bool:
