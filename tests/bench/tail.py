@@ -83,6 +83,7 @@ def cancellation(folder: Path, *, quick: bool) -> list[dict[str, Any]]:
         below = folder / name.replace(" ", "-")
         below.mkdir()
         with Rig(below, 2, services=services, replica=replica, tell_losers=told) as rig:
+            rig.change(hedging="all")
             caller = Caller(rig.robot_domain, "bench_cancel")
             caller.wait()
             took = caller.spread(

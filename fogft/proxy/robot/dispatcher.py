@@ -163,10 +163,13 @@ class Dispatcher:
             if requests.size() == 1:
                 self._next_look, self._usual_s = soon, soon - now
             self._next_look, self._asked_at = min(self._next_look, soon), now
-        self._sender.first(request, payload, links, chosen, timeout_s)
+        taken = self._sender.first(request, payload, links, chosen, timeout_s)
         if self._decide.replicates:
             self._sender.replicate()
-        self._wake(soon)
+        if taken or not chosen:
+            self._wake(soon)
+        else:
+            self._wake()  # all of these declined, and another may take it
         return True
 
     def _turn_away(self, request: bytes, size: int) -> None:

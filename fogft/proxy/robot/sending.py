@@ -38,8 +38,8 @@ class Sender:
     def first(
         self, request: bytes, payload: bytes, links: Mapping[int, Link], chosen: Sequence[int],
         timeout_s: float,
-    ) -> None:  # fmt: skip
-        """Offer a new request to its chosen replicas."""
+    ) -> int:  # fmt: skip
+        """Offer a new request to its chosen replicas; return how many have taken it."""
         name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
         several, taken = len(chosen) > 1, 0  # one alone is no spare
         for replica in chosen:
@@ -55,6 +55,7 @@ class Sender:
         if several and request not in self._ledger.requests:
             # Answered before the last link had it: its answer could not reach that one.
             self.forget(request, chosen)
+        return taken
 
     def route(
         self,

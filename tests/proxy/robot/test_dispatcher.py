@@ -28,6 +28,7 @@ class Scene:
     def __init__(self, links: int = 2, **spec) -> None:
         self.clock = Clock()
         self.responses: list[tuple[object, bytes]] = []
+        self.looks: list[tuple[float, ...]] = []  # when it asked for one: at once is ()
         options = {
             key: spec.pop(key)
             for key in ("empty_response", "fault_of", "max_pending_bytes")
@@ -39,6 +40,7 @@ class Scene:
         self.dispatcher = Dispatcher(
             ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, **{"hedging": ALL, **spec}),
             lambda handle, payload: self.responses.append((handle, payload)),
+            wake=lambda *at: self.looks.append(at),
             clock=self.clock,
             **options,
         )
@@ -220,6 +222,21 @@ def test_a_full_window_is_passed_over_and_tried_later():
     scene.pass_time(0.02)
     scene.answer(0, b"good")
     assert scene.responses == [("caller", b"good")]
+
+
+def test_what_has_no_room_at_the_one_replica_goes_to_another_at_once():
+    """Under `failover` it would else be offered to that one until its deadline."""
+    scene = Scene(hedging=HedgingMode.FAILOVER)
+    scene.links[0].room = 0
+    scene.dispatcher.submit(b"q", "caller")
+    assert scene.looks[-1] == ()  # now
+    scene.pass_time(0.0)
+    scene.answer(1, b"good")
+    scene.links[0].room = 1
+    scene.dispatcher.submit(b"q", "next")
+    scene.answer(0, b"good")
+    assert scene.responses == [("caller", b"good"), ("next", b"good")]
+    assert scene.dispatcher.report()["hedging"]["switched"] == 0
 
 
 def test_a_request_waits_for_the_first_replica_to_come():

@@ -179,7 +179,7 @@ def test_auto_is_as_good_as_the_best_other_rule_from_idle_to_full(service, load)
     """
     seconds, ratios, of_idle = 20.0 / load, [], []  # as many requests at each load
     chance = load >= 0.7 and service != "constant"
-    for seed in range(3, 3 + by_day(8 if chance else 1, at_night=20)):
+    for seed in range(3, 3 + by_day(4 if chance else 1, at_night=20)):
         better = one_copy(shortest, service, load, seconds, seed)
         if load <= 0.2:  # of more load `all` makes an endless queue
             worlds = served(HedgingMode.ALL, service, load, seconds=seconds, seed=seed)
