@@ -25,7 +25,7 @@ class Launch:
     placement: Placement
     usd_per_hour: float
     spec_hash: str
-    # The SkyPilot task of the pool file, without its `fogft` section.
+    # The SkyPilot task of the pool file, without its `fogft` section; paths are absolute.
     task: Mapping[str, Any] = field(default_factory=dict)
     # What the machine needs to serve: file name -> content. Holds ``replica.yaml``,
     # ``ca.crt``, ``replica.crt`` and ``replica.key``; the configuration names the others

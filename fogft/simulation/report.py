@@ -165,7 +165,7 @@ def simulate(
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.parent)
     chosen = cloud or cloud_named_by(spec, source, file)
-    find = remembered(_pricing(make_cloud(chosen, file.resolve().parent).offers, source, file))
+    find = remembered(_pricing(make_cloud(chosen).offers, source, file))
     values = read_values(model)
     market, timing = MarketModel(), Timing()
     lines: Mapping[str, Any] = {}

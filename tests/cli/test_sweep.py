@@ -148,7 +148,7 @@ def scene(home: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
     """Real clouds were used from here."""
     (home / "sky").mkdir()
     scene = Scene(home / "sky")
-    monkeypatch.setattr(sky, "make", lambda folder, base: scene.cloud)
+    monkeypatch.setattr(sky, "make", lambda folder: scene.cloud)
     return scene
 
 

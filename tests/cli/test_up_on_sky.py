@@ -43,7 +43,7 @@ def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Scene:
     scene = Scene(tmp_path / "sky")
     scene.now = time.time()
     scene.provider.prices = {("us-east-1a", "m6i.large"): 0.019}
-    monkeypatch.setattr(sky, "make", lambda folder, base: scene.cloud)
+    monkeypatch.setattr(sky, "make", lambda folder: scene.cloud)
     return scene
 
 

@@ -22,7 +22,7 @@ LIMIT_S = 300.0
 
 
 def main(folder: Path) -> dict[str, Any]:
-    cloud = sky.make(folder / "state", folder)
+    cloud = sky.make(folder / "state")
     told: dict[str, Any] = {"check": dict(cloud.check(["aws"]))}
     told["unverified"] = cloud.unverified("aws")
     offers = cloud.offers(RESOURCES)

@@ -37,7 +37,6 @@ class Scene:
             self.sky,
             [self.provider] if self._with_provider else [],
             owner="ann@robot",
-            base=self.folder,
             clock=lambda: self.now,
             submit=lambda run: self.pending_work.append(run),
             repeat=lambda step: self.repeated_work.append(step),

@@ -949,11 +949,11 @@ def test_whose_machines_they_are_is_known_without_a_users_name_and_by_the_comput
     for id in (b"one\n", b"two\n"):
         (tmp_path / "id").write_bytes(id)
         monkeypatch.setattr(adapter, "MACHINE_ID", tmp_path / "id")
-        owners.append(adapter.make(tmp_path, tmp_path).owner)
+        owners.append(adapter.make(tmp_path).owner)
     assert owners[0] != owners[1]
     assert all(owner.startswith(f"uid{os.getuid()}-") for owner in owners)
     monkeypatch.setattr(adapter, "MACHINE_ID", tmp_path / "none")
-    assert adapter.make(tmp_path, tmp_path).owner not in owners
+    assert adapter.make(tmp_path).owner not in owners
 
 
 def test_where_a_cloud_maps_ports_skypilot_says_how_a_machine_is_reached(scene: Scene):

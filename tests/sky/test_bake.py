@@ -103,7 +103,7 @@ def docker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PATH", f"{program.parent}:/usr/bin:/bin")
     scene = Scene(tmp_path)
     (tmp_path / "state/wheels").mkdir()
-    monkeypatch.setattr(commands, "make_cloud", lambda name, base: scene.cloud)
+    monkeypatch.setattr(commands, "make_cloud", lambda name: scene.cloud)
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab/serve.py").write_text("serve")
     (tmp_path / "lab/pool.yaml").write_text(FILE)

@@ -381,7 +381,7 @@ def test_a_task_that_we_build_is_one_that_skypilot_takes(home: Path, tmp_path: P
             },
         }
     )
-    built = task.build(order, files=tmp_path, wheel=tmp_path, owner="ann", base=tmp_path)
+    built = task.build(order, files=tmp_path, wheel=tmp_path, owner="ann")
     made = sky.Task.from_yaml_config(built)
     (resources,) = made.resources
     assert (resources.region, resources.zone) == ("us-east-1", "us-east-1a")
@@ -401,7 +401,7 @@ def test_an_image_of_the_users_own_is_one_that_skypilot_takes(home: Path, tmp_pa
         asked = {"resources": {"infra": "aws/us-east-1", "image_id": image}}
         built = task.build(
             Scene(tmp_path).order(task=asked), files=tmp_path, wheel=tmp_path,
-            owner="ann", base=tmp_path,
+            owner="ann",
         )  # fmt: skip
         (resources,) = sky.Task.from_yaml_config(built).resources
         container = image.removeprefix("docker:") if image.startswith("docker:") else None
@@ -417,7 +417,7 @@ def test_a_task_without_ports_is_one_that_skypilot_takes(home: Path, tmp_path: P
 
     built = task.build(
         Scene(tmp_path).order(dials_out=True), files=tmp_path, wheel=tmp_path,
-        owner="ann", base=tmp_path,
+        owner="ann",
     )  # fmt: skip
     (resources,) = sky.Task.from_yaml_config(built).resources
     assert resources.ports is None
@@ -475,7 +475,7 @@ def test_a_cloud_that_refuses_the_launch_is_left_out_with_the_reason(
 def test_the_pages_table_of_clouds_is_what_skypilot_says(home: Path, tmp_path: Path):
     """Of the pool that is the default: spot machines, one port, and a machine that ends itself."""
     page = (Path(__file__).parents[2] / "docs/how-to/clouds.md").read_text()
-    cloud = SkyCloud(tmp_path / "sky", InstalledSky(), owner="ann", base=tmp_path)
+    cloud = SkyCloud(tmp_path / "sky", InstalledSky(), owner="ann")
     lacking = cloud.lacking({"use_spot": True, "cpus": "2+"})
     assert tuple(lacking) == VM_CLOUDS
     for name, why in lacking.items():
@@ -493,7 +493,7 @@ def test_a_task_with_several_types_is_one_that_skypilot_takes_in_this_order(
     others = [replace(EAST, instance=kind) for kind in ("m5.large", "r5.large")]
     built = task.build(
         Scene(tmp_path).order(), files=tmp_path, wheel=tmp_path, owner="ann",
-        base=tmp_path, instead=others,
+        instead=others,
     )  # fmt: skip
     resources = sky.Task.from_yaml_config(built).resources
     assert isinstance(resources, list), "in order"
@@ -518,7 +518,7 @@ def test_skypilot_tries_the_next_type_where_one_has_no_capacity(
     others = [replace(place, instance=kind) for kind in ("m5.large", "r5.large")]
     built = task.build(
         Scene(tmp_path).order(place=place), files=tmp_path, wheel=tmp_path,
-        owner="ann", base=tmp_path, instead=others,
+        owner="ann", instead=others,
     )  # fmt: skip
     sent = sky.Task.from_yaml_config(sky.Task.from_yaml_config(built).to_yaml_config())
     refused: list[Any] = []

@@ -39,7 +39,6 @@ def built(
         files=Path("/state/files"),
         wheel=Path("/state/wheel"),
         owner="Ann Lee@robot",
-        base=Path("/home/ann/pool"),
     )
 
 
@@ -111,17 +110,12 @@ def test_accelerators_that_the_instance_type_does_not_imply_are_named():
     assert (resources["instance_type"], resources["accelerators"]) == ("n1-standard-8", "T4:1")
 
 
-def test_files_of_this_machine_are_found_from_the_pool_files_folder():
-    made = built(
-        {
-            "workdir": ".",
-            "file_mounts": {"/models": "../models", "/data": "s3://bucket", "/b": {"name": "x"}},
-        }
-    )
+def test_files_of_the_user_are_kept_beside_those_of_fogft():
+    """Their paths are absolute by now; buckets and repositories are left alone."""
+    mounts = {"/models": "/home/ann/models", "/data": "s3://bucket", "/b": {"name": "x"}}
+    made = built({"workdir": "/home/ann/pool", "file_mounts": mounts})
     assert made["workdir"] == "/home/ann/pool"
-    assert made["file_mounts"]["/models"] == "/home/ann/models"
-    assert made["file_mounts"]["/data"] == "s3://bucket"
-    assert made["file_mounts"]["/b"] == {"name": "x"}
+    assert mounts.items() <= made["file_mounts"].items()
     assert made["file_mounts"]["~/.fogft/replica"] == "/state/files"
     assert made["file_mounts"]["~/.fogft/wheel"] == "/state/wheel"
     git = {"url": "https://example.org/x.git", "ref": "main"}

@@ -58,7 +58,7 @@ def _each_second(step: Callable[[], bool]) -> None:
     _on_thread(run)
 
 
-def make(folder: Path, base: Path) -> SkyCloud:
+def make(folder: Path) -> SkyCloud:
     """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until it is asked."""
     try:
         user = getpass.getuser()
@@ -69,7 +69,7 @@ def make(folder: Path, base: Path) -> SkyCloud:
     owner = f"{user}-{socket.gethostname()}"[:50] + f"-{machine}"
     google = importlib.util.find_spec("google") and importlib.util.find_spec("google.auth")
     providers = [Aws(), Gcp()] if google else [Aws()]
-    return SkyCloud(folder, InstalledSky(), providers, owner=owner, base=base)
+    return SkyCloud(folder, InstalledSky(), providers, owner=owner)
 
 
 @dataclass
@@ -81,7 +81,6 @@ class SkyCloud:
     providers: Sequence[Provider] = ()  # clouds that can be asked directly
     _: KW_ONLY
     owner: str  # whose machines these are, for their labels
-    base: Path  # where relative paths of the pool file start
     clock: Callable[[], float] = time.time
     submit: Callable[[Callable[[], None]], object] = _on_thread
     repeat: Callable[[Callable[[], bool]], object] = _each_second  # until it returns False
@@ -146,7 +145,6 @@ class SkyCloud:
             files=self.journal.files(order.id),
             wheel=packed,
             owner=self.owner,
-            base=self.base,
             instead=[offer.placement for offer in instead],
         )
         begun = Entry(

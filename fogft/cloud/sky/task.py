@@ -82,12 +82,11 @@ def build(
     files: Path,
     wheel: Path,
     owner: str,
-    base: Path,
     instead: Sequence[Placement] = (),
 ) -> dict[str, Any]:
     """Return the task of one replica, for exactly one location.
 
-    Relative paths start from `base`; `instead` is tried, in order, where there is no capacity.
+    `instead` is tried, in order, where there is no capacity.
     """
     refuse_what_cannot_be_honoured(order.task)
     template = read()
@@ -105,10 +104,7 @@ def build(
     task = copy.deepcopy({k: v for k, v in order.task.items() if k != "num_nodes"})
     task["name"] = order.pool
     task["setup"], task["run"] = setup_of(order.task, template), ours["run"]
-    if isinstance(task.get("workdir"), str):
-        task["workdir"] = _absolute(task["workdir"], base)
-    mounts = {k: _absolute(v, base) for k, v in (task.get("file_mounts") or {}).items()}
-    task["file_mounts"] = {**mounts, **ours["file_mounts"]}
+    task["file_mounts"] = {**(task.get("file_mounts") or {}), **ours["file_mounts"]}
     resources = _resources(order, owner) | ours["resources"]
     if instead:
         del resources["instance_type"]
@@ -150,13 +146,6 @@ def _sells(entry: Mapping[str, Any], placement: Placement) -> bool:
         and entry.get("instance_type") in (None, placement.instance.partition("+")[0])
         and entry.get("use_spot") in (None, placement.spot)
     )
-
-
-def _absolute(source: Any, base: Path) -> Any:
-    """Anchor a relative path of this machine; leave buckets and repositories alone."""
-    if not isinstance(source, str) or "://" in source:
-        return source
-    return str((base / Path(source).expanduser()).resolve())
 
 
 def _filled(value: Any, marks: Mapping[str, str]) -> Any:

@@ -25,7 +25,7 @@ def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
     """
     text = read_text(file)
     spec = parse(text, file=str(file))
-    cloud = make_cloud(cloud_named_by(spec, text, file), file.parent)
+    cloud = make_cloud(cloud_named_by(spec, text, file))
     if not isinstance(cloud, RealCloud):
         raise SpecError(f"`{file}` names no real cloud", "the local cloud needs no image")
     task = with_build(absolute(spec.task, file.parent.resolve()))

@@ -58,8 +58,8 @@ def make_store(pool: str) -> PoolStore:
     return PoolStore(PoolPaths.of(pool), lambda text, file: parse(text, file=file), time.time)
 
 
-def make_cloud(name: str, base: Path) -> Cloud:
-    """Return a cloud, one of `CLOUDS`; relative paths in its pool file start at `base`."""
+def make_cloud(name: str) -> Cloud:
+    """Return a cloud, one of `CLOUDS`."""
     if name not in CLOUDS:
         known = ", ".join(f"`{cloud}`" for cloud in CLOUDS)
         raise CloudError(
@@ -69,7 +69,7 @@ def make_cloud(name: str, base: Path) -> Cloud:
     if name == SKY:
         from fogft.cloud.sky import adapter
 
-        return adapter.make(home() / "sky", base)
+        return adapter.make(home() / "sky")
     from fogft.cloud.local.cloud import LocalCloud
 
     return LocalCloud(local_root())
@@ -77,7 +77,7 @@ def make_cloud(name: str, base: Path) -> Cloud:
 
 def cloud_of(identity: Identity) -> Cloud:
     """Return the cloud that a pool runs on."""
-    return make_cloud(identity.cloud, Path(identity.file).parent)
+    return make_cloud(identity.cloud)
 
 
 def local_root() -> Path:

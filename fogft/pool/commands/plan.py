@@ -75,7 +75,7 @@ def plan_file(
         name, seller = str(prices), PriceTable(prices)
     else:
         name = cloud or named_clouds.cloud_named_by(spec, source, file)
-        seller = make_cloud(name, file.resolve().parent)
+        seller = make_cloud(name)
         if name != LOCAL:
             told("fetching prices")
     try:

@@ -86,7 +86,7 @@ def order(
     source = read_text(file)
     spec = parse(source, str(file), checks_here(), file.parent)
     cloud_name = cloud or cloud_named_by(spec, source, file)
-    concrete = make_cloud(cloud_name, file.resolve().parent)
+    concrete = make_cloud(cloud_name)
     store = make_store(spec.name)
     with contextlib.suppress(PoolNotFound):
         check_same(store.identity(), spec, file.resolve(), cloud_name)
@@ -222,7 +222,7 @@ def mistakes(file: Path) -> list[SpecError]:
         source = pool_file.read_text(file)
         spec = pool_file.parse(source, str(file), checks, file.parent)
         if cloud_named_by(spec, source, file) == LOCAL:
-            make_cloud(LOCAL, file.resolve().parent).offers(spec.task.get("resources") or {})
+            make_cloud(LOCAL).offers(spec.task.get("resources") or {})
     except SpecError as error:
         return [error if error.line else located(error, source, file)]
     return []

@@ -8,7 +8,6 @@ Not here: what exists (`fogft.cloud`, past every memory) and asking the user (`f
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from fogft import disk
 from fogft.cloud.port import Auditing, Cloud
@@ -46,7 +45,7 @@ def clouds_used() -> list[str]:
 
 def sweep_cloud(name: str, cloud: Cloud | None = None) -> Swept:
     """Return the machines in a cloud that belong to this user's pools but have no manager."""
-    cloud = cloud or make_cloud(name, Path.cwd())
+    cloud = cloud or make_cloud(name)
     if not isinstance(cloud, Auditing):
         raise FogftError(f"cloud `{name}` cannot be swept")
     audit = cloud.audit()
@@ -85,7 +84,7 @@ def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
 
 def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
     """End machines one by one, but for those with a manager again; return the errors."""
-    cloud = make_cloud(found.cloud, Path.cwd())
+    cloud = make_cloud(found.cloud)
     problems: list[FogftError] = []
     for one in found.unowned:
         id = one.machine.id

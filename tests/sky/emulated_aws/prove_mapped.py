@@ -43,7 +43,7 @@ def pods() -> list[dict[str, Any]]:
 
 
 def adapter(folder: Path) -> SkyCloud:
-    return SkyCloud(folder, InstalledSky(), [], owner="proof", base=Path("/tmp"))
+    return SkyCloud(folder, InstalledSky(), [], owner="proof")
 
 
 def launched(cloud: SkyCloud, slot: int) -> Machine:

@@ -42,7 +42,7 @@ def stub_server() -> None:
 
 def adapter(folder: Path) -> SkyCloud:
     """Return an adapter as another process would have it."""
-    return SkyCloud(folder, InstalledSky(), [Aws()], owner="proof", base=Path("/tmp"))
+    return SkyCloud(folder, InstalledSky(), [Aws()], owner="proof")
 
 
 def preempt(cloud: SkyCloud, id: ReplicaId) -> None:
