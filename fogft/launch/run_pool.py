@@ -10,16 +10,11 @@ import signal
 import subprocess
 import sys
 from collections.abc import Sequence
-from types import FrameType
 
 from fogft.child import tied
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 READY = "fogft_pool_ready"  # a line of stdout, for the launch file
-
-
-class _Interrupted(Exception):
-    """A signal asked us to end."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -34,11 +29,11 @@ def main(arguments: Sequence[str]) -> int:
     )
     asked = parser.parse_args(arguments)
     for number in _ENDING:
-        signal.signal(number, _interrupt)
+        signal.signal(number, signal.default_int_handler)
     status = 0
     try:
         return _run(asked)
-    except _Interrupted:
+    except KeyboardInterrupt:
         pass
     finally:
         for number in _ENDING:
@@ -75,7 +70,7 @@ def _fogft(*words: str) -> subprocess.Popen[bytes]:
 def _wait(child: subprocess.Popen[bytes]) -> int:
     try:
         return child.wait()
-    except _Interrupted:
+    except KeyboardInterrupt:
         child.send_signal(signal.SIGINT)
         try:
             child.wait(5)
@@ -83,10 +78,6 @@ def _wait(child: subprocess.Popen[bytes]) -> int:
             child.kill()
             child.wait()
         raise
-
-
-def _interrupt(_number: int, _frame: FrameType | None) -> None:
-    raise _Interrupted
 
 
 if __name__ == "__main__":
