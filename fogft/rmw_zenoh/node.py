@@ -7,7 +7,6 @@ Its session is configured as theirs are: a peer that finds the others by the rou
 
 import functools
 import itertools
-import logging
 import os
 import threading
 import time
@@ -26,8 +25,6 @@ from fogft.rmw_zenoh.entities import Client, Server
 from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
 from fogft.ros import vendors
 from fogft.ros.pacing.pacer import NodeProbes
-
-log = logging.getLogger(__name__)
 
 _DOMAIN = "ROS_DOMAIN_ID"
 _LOOK_EVERY_S = 1.0

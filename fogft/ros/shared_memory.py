@@ -91,12 +91,6 @@ def _lock(descriptor: int) -> bool:
     return True
 
 
-def abandoned() -> list[Path]:
-    """Return the files that `sweep` would remove now, sorted; remove nothing."""
-    unused = _unused().values()
-    return sorted(FOLDER / n for names in unused if not any(map(_locked, names)) for n in names)
-
-
 def _unused() -> dict[str, list[str]]:
     """Return the groups that no process of ours maps or holds open."""
     candidates = grouped_names()

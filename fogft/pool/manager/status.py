@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from fogft import __version__
 from fogft.model.plain import Moment, from_plain, stored, to_plain
@@ -26,8 +26,6 @@ if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.planning.observed.health import Assessment
     from fogft.planning.observed.history import Record
     from fogft.pool.manager.reconciler import Tick
-
-T = TypeVar("T")
 
 VERSION = 1
 """Of the JSON form: goes up when a key goes or changes what it means, not when one comes."""

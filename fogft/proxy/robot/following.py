@@ -4,7 +4,6 @@ The later one counts. Where replicas are is corrected by what they say of themse
 dial in are reached through the door.
 """
 
-import logging
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
@@ -24,8 +23,6 @@ from fogft.records.client import Known, RendezvousClient
 from fogft.records.record import RecordKind, SignedRecord
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import Signer, Verifier
-
-log = logging.getLogger(__name__)
 
 # Changed records are looked at once a second, but for so many times in a row: a replica whose
 # record says each moment that it has moved would be dialled each moment.

@@ -51,11 +51,6 @@ class ReplyCredit:
         self._blockable = 0  # senders under way who may block
         self._outstanding: dict[bytes, _Sent] = {}  # by stamp, oldest first
 
-    @property
-    def outstanding(self) -> int:
-        """How many replies may still be on the way."""
-        return len(self._outstanding)
-
     def seen(self, connection: object, stamp: bytes) -> None:
         """Note the last acknowledged stamp on a connection; unknown ones are ignored."""
         if stamp not in self._outstanding:  # nothing new, as mostly
