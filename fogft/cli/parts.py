@@ -1,7 +1,5 @@
 """Run one part of a pool in the foreground, or let systemd do so."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

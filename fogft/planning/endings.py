@@ -7,8 +7,6 @@ first marked as draining, so that requests stop going there, and ends when it is
 Not here: why a replica should go (`classification`, `health`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 

@@ -4,8 +4,6 @@ It ends when it is told to (``end.json``, ``notice.json``, a signal) or when wha
 ended. One thread: the kernel ties children to the thread that started them.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import logging

@@ -1,7 +1,5 @@
 """``fogft gateway --config FILE``: a gateway as a process. It needs no ROS."""
 
-from __future__ import annotations
-
 import functools
 import logging
 import os

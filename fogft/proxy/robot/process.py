@@ -4,8 +4,6 @@ It follows two files, the configuration and the membership, and writes one, its 
 needs no manager: started alone it goes on with the last membership on disk.
 """
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import json
