@@ -59,10 +59,7 @@ def _replaced(path: Path, data: bytes, *, durable: bool) -> int:
             os.close(descriptor)
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
-        raise StateError(
-            f"`{path}` cannot be written: {error.strerror}",
-            "check the disk's free space and the folder's owner",
-        ) from error
+        raise not_done("written", path, error) from error
     return descriptor
 
 
@@ -249,7 +246,7 @@ def locked(path: Path) -> Iterator[None]:
     try:
         lock.acquire(wait=True)
     except OSError as error:
-        raise not_opened(path, error) from error
+        raise not_done("opened", path, error) from error
     try:
         yield
     finally:
@@ -265,17 +262,15 @@ def is_locked(path: Path) -> bool:
     except (FileNotFoundError, NotADirectoryError):
         return False
     except OSError as error:
-        raise not_opened(path, error) from error
+        raise not_done("opened", path, error) from error
     lock.release()
     return False
 
 
-def not_opened(path: Path, error: OSError) -> StateError:
-    """Return what is said of a lock's file that cannot be opened."""
-    return StateError(
-        f"`{path}` cannot be opened: {error.strerror}",
-        "check the disk's free space and the folder's owner",
-    )
+def not_done(what: str, path: Path, error: OSError) -> StateError:
+    """Return the error for a file of ours that cannot be opened or written (`what`)."""
+    hint = "check the disk's free space and the folder's owner"
+    return StateError(f"`{path}` cannot be {what}: {error.strerror}", hint)
 
 
 def holder(lock: Path, *, said: bool = True) -> int | None:

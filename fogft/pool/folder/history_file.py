@@ -54,10 +54,7 @@ class HistoryFile:
             try:
                 _append_durably(self._path, _line(event).encode())
             except OSError as error:
-                raise StateError(
-                    f"`{self._path}` cannot be written: {error.strerror}",
-                    "check the disk's free space and the folder's owner",
-                ) from error
+                raise disk.not_done("written", self._path, error) from error
             history.add(event)
             self._appended += 1
             if self._appended >= COMPACT_AFTER:

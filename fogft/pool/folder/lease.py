@@ -36,7 +36,7 @@ class Lease:
         try:
             taken = lock.acquire(wait=False)
         except OSError as error:
-            raise disk.not_opened(paths.manager_lock, error) from error
+            raise disk.not_done("opened", paths.manager_lock, error) from error
         if not taken:
             said = (disk.read_bytes(paths.manager_lock) or b"").decode("latin-1")
             who = f" (pid {said})" if said.isascii() and said.isdecimal() else ""
