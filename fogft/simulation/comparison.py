@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property, partial
+from statistics import fmean
 from typing import Any
 
 from fogft.model.groups import groups_of, with_spot
@@ -203,11 +204,7 @@ class Row:
         return out
 
 
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
-
-
-def estimate(values: Sequence[Any], of: Callable[[Sequence[Any]], float] = _mean) -> Estimate:
+def estimate(values: Sequence[Any], of: Callable[[Sequence[Any]], float] = fmean) -> Estimate:
     """Return a statistic of some values with its interval, deterministically."""
     chance = random.Random(len(values))
     found = sorted(of(chance.choices(values, k=len(values))) for _ in range(_RESAMPLES))
