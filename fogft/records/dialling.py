@@ -94,7 +94,9 @@ async def _attempt(endpoint: str) -> socket.socket:
 async def _greet(
     raw: socket.socket, endpoint: str, ca: Path, signer: Signer, pool_uid: str
 ) -> tuple[Connection, str]:
-    reader, writer = await asyncio.open_connection(sock=raw, ssl=_context(ca), server_hostname="")
+    context = client_context(ca)
+    context.minimum_version = ssl.TLSVersion.TLSv1_3
+    reader, writer = await asyncio.open_connection(sock=raw, ssl=context, server_hostname="")
     try:
         binding = _check(writer.get_extra_info("ssl_object"), endpoint, pool_uid)
         unframer = frames.Unframer()
@@ -109,9 +111,9 @@ async def _greet(
     return Connection(reader, writer, unframer, endpoint), seen_host
 
 
-def _context(ca: Path) -> ssl.SSLContext:
+def client_context(ca: Path) -> ssl.SSLContext:
+    """Return what verifies a certificate of the pool's CA. Raises CredentialError."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.minimum_version = ssl.TLSVersion.TLSv1_3
     context.check_hostname = False  # its role and pool are what must be right, not its host
     try:
         context.load_verify_locations(ca)

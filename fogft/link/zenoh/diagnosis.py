@@ -17,6 +17,7 @@ from fogft.link.port import Peer
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import host_and_port
+from fogft.records.dialling import client_context
 
 # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
 _OUT_OF_TIME = (9, 10)
@@ -52,12 +53,7 @@ def explain(peer: Peer, credentials: CredentialPaths) -> str:
 
 
 def _context(credentials: CredentialPaths) -> ssl.SSLContext:
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False
-    try:
-        context.load_verify_locations(credentials.ca)
-    except (OSError, ssl.SSLError):
-        raise CredentialError(f"the CA `{credentials.ca}` cannot be used") from None
+    context = client_context(credentials.ca)
     try:
         context.load_cert_chain(credentials.certificate, credentials.key)
     except (OSError, ssl.SSLError):
