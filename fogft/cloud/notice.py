@@ -21,8 +21,6 @@ from fogft.model.names import NOTICE_SOURCES
 
 log = logging.getLogger(__name__)
 
-__all__ = ["Notice", "NoticeKind", "Watch"]
-
 POLL_S = 1.0
 FILE_POLL_S = 0.1  # costs nothing, and a local machine may live for a second only
 LOST_POLL_S = 30.0

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.cloud import notice_formats as formats
-from fogft.cloud.notice import Notice, NoticeKind, Watch
+from fogft.cloud.notice import Watch
+from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.errors import CloudError
 from tests.cloud.fake_metadata import FakeMetadata, serving
 

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fogft.cloud import notice
-from fogft.cloud.notice import Notice, NoticeKind
+from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.link.zenoh.settings import forget_threads
 from fogft.metrics import proxies
 from fogft.metrics.scrape import Scrape
