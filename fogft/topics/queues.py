@@ -22,18 +22,15 @@ class Ring:
         self._bytes = 0
         self.last = 0
 
-    def put(self, message: bytes) -> int:
-        """Add a message; return how many older ones were dropped."""
+    def put(self, message: bytes) -> None:
+        """Add a message; older ones are dropped for it."""
         self.last += 1
         self._kept.append((self.last, message))
         self._bytes += len(message)
-        gone = 0
         while len(self._kept) > self._depth or (
             self._bytes > self.kept_bytes and len(self._kept) > 1
         ):
             self._bytes -= len(self._kept.popleft()[1])
-            gone += 1
-        return gone
 
     def begin(self) -> int:
         """Return the number after which a new robot begins."""
