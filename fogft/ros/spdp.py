@@ -93,12 +93,10 @@ def _send(message: bytes, domain_id: int) -> None:
                     sending.sendto(message, (_GROUP, BASE_PORT + DOMAIN_GAIN * domain_id))
 
 
-def declare_gone(prefix: bytes, domain_id: int) -> bool:
-    """Send a killed participant's disposal message, by its id's prefix; return whether it was."""
-    if not is_known(prefix):
-        return False
-    _send(gone(prefix), domain_id)
-    return True
+def declare_gone(prefix: bytes, domain_id: int) -> None:
+    """Send a killed participant's disposal message, by its id's prefix."""
+    if is_known(prefix):
+        _send(gone(prefix), domain_id)
 
 
 class Introduction:

@@ -62,13 +62,11 @@ def robot_name() -> str:
     return name or "robot"
 
 
-def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> bool:
-    """Update the client proxy's configuration; return whether it changed."""
+def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> None:
+    """Write the client proxy's configuration if it changes."""
     content = proxy_config(identity, spec)
-    if disk.read_bytes(paths.proxy_config) == content.encode():
-        return False
-    disk.write_whole(paths.proxy_config, content)
-    return True
+    if disk.read_bytes(paths.proxy_config) != content.encode():
+        disk.write_whole(paths.proxy_config, content)
 
 
 def proxy_config(
@@ -103,13 +101,11 @@ def proxy_config(
 
 def certify_robot(
     paths: PoolPaths, identity: Identity, spec: PoolSpec, now: datetime.datetime
-) -> bool:
-    """Ensure that the client proxy has a valid certificate; return whether it is new."""
+) -> None:
+    """Ensure that the client proxy has a valid certificate."""
     revoked = Ledger(paths.credentials).revoked()
-    if authority.is_good(paths.credentials / "robot.crt", now, revoked):
-        return False
-    rotate_robot(paths, identity, spec)
-    return True
+    if not authority.is_good(paths.credentials / "robot.crt", now, revoked):
+        rotate_robot(paths, identity, spec)
 
 
 def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:

@@ -68,14 +68,16 @@ def planned() -> PlannedLaunch:
 
 def test_the_client_proxy_reads_what_was_written(paths: PoolPaths) -> None:
     """Every key survives, and paths lead to the pool's files."""
-    assert configuration.write_proxy_config(paths, identity(paths.folder), spec())
+    configuration.write_proxy_config(paths, identity(paths.folder), spec())
     config = read_client(paths.proxy_config)
     assert (config.pool, config.pool_uid, config.services) == ("pool", UID, SERVICES)
     assert (config.suspect_after_s, config.domain_id) == (3.5, None)
     assert (config.membership, config.status) == (paths.membership, paths.proxy_status)
     assert (config.lock, config.announcements) == (paths.proxy_lock, paths.announcements)
     assert config.credentials.key == paths.credentials / "robot.key"
-    assert not configuration.write_proxy_config(paths, identity(paths.folder), spec())
+    written = paths.proxy_config.stat().st_ino
+    configuration.write_proxy_config(paths, identity(paths.folder), spec())
+    assert paths.proxy_config.stat().st_ino == written, "it is left alone where nothing changes"
 
 
 def test_where_each_process_answers_prometheus_is_passed_on(paths: PoolPaths) -> None:
@@ -137,10 +139,13 @@ def test_relative_paths_are_relative_to_the_pool_file() -> None:
 def test_the_robots_certificate_is_made_once_and_renewed_in_time(paths: PoolPaths) -> None:
     """It lasts a year, is kept while it lasts, and is replaced two months before its end."""
     who, now = identity(paths.folder), datetime.datetime.now(datetime.timezone.utc)
-    assert configuration.certify_robot(paths, who, spec(), now)
-    assert not configuration.certify_robot(paths, who, spec(), now)
-    assert not configuration.certify_robot(paths, who, spec(), now + datetime.timedelta(days=300))
-    assert configuration.certify_robot(paths, who, spec(), now + datetime.timedelta(days=310))
+    certificates = []
+    for days in (0, 0, 300, 310):
+        configuration.certify_robot(paths, who, spec(), now + datetime.timedelta(days=days))
+        certificates.append((paths.credentials / "robot.crt").read_bytes())
+    first, *kept, renewed = certificates
+    assert kept == [first, first]
+    assert renewed != first
     described = authority.describe(paths.credentials / "robot.crt")
     assert described.role == authority.Role.ROBOT.value
     assert described.common_name.startswith("robot.")
