@@ -8,7 +8,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 
 from fogft import poll
 from fogft.errors import FogftError
@@ -37,7 +37,7 @@ class DialOut:
         self._sign = sign
         self._lock = threading.Lock()
         self._targets: dict[str, threading.Event] = {}  # set when the door is not wanted any more
-        self._details: dict[str, str] = {}
+        self._details: dict[str, str] = {}  # each door's problem, empty while connected
         self._tunnels = Tunnels()
 
     def follow(self, doors: Iterable[str]) -> None:
@@ -58,11 +58,6 @@ class DialOut:
                     name=f"fogft-dial-out-{number}",
                     daemon=True,
                 ).start()
-
-    def details(self) -> Mapping[str, str]:
-        """Return each dial-in port's problem; empty while connected."""
-        with self._lock:
-            return dict(self._details)
 
     def close(self) -> None:
         """Close all connections. Repeatable."""

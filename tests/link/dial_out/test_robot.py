@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import random
 import resource
 import socket
@@ -98,19 +99,22 @@ def test_a_loopback_port_outlives_a_moment_without_descriptors(door):
         assert caller.recv(1) == b""  # taken, and given up since no replica waits there
 
 
-def test_a_replica_waits_for_a_door_that_is_not_there_yet(authority, dial_out, start_replica, dial):
+def test_a_replica_waits_for_a_door_that_is_not_there_yet(
+    authority, dial_out, start_replica, dial, caplog
+):
     """It says what is wrong meanwhile, and comes in once the robot is there."""
+    caplog.set_level(logging.INFO)
     replica = start_replica()
     with socket.socket() as kept:  # bound and deaf, so that nobody else takes the port meanwhile
         kept.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         kept.bind(("127.0.0.1", 0))
         endpoint = f"127.0.0.1:{kept.getsockname()[1]}"
-        out = dial_out(replica.endpoint, endpoint)
-        wait_for(lambda: "refused" in out.details().get(endpoint, "").lower())
+        dial_out(replica.endpoint, endpoint)
+        wait_for(lambda: "refused" in caplog.text.lower())
     late = DialIn(endpoint, POOL_UID, Verifier(authority.folder / "ca.crt"))
     try:
         wait_for(lambda: late.waiting().get(ID))
-        wait_for(lambda: out.details()[endpoint] == "")  # of both its connections
+        wait_for(lambda: f"door_reached door={endpoint}" in caplog.text)
         link = dial(late.local(ID))
         wait_for(lambda: link.usable)
     finally:
@@ -229,8 +233,9 @@ def test_a_replica_that_takes_no_part_after_greeting_is_dropped(authority, door)
         assert link.fileno() >= 0
 
 
-def test_a_replica_survives_whatever_answers_at_a_door(authority, dial_out):
-    """Noise, silence and closing doors: it says so and tries on."""
+def test_a_replica_survives_whatever_answers_at_a_door(authority, dial_out, caplog):
+    """Noise, silence and closing doors: it says so and tries on, and so anew if told again."""
+    caplog.set_level(logging.INFO)
     noisy = socket.create_server(("127.0.0.1", 0))
     stop = threading.Event()
 
@@ -246,8 +251,10 @@ def test_a_replica_survives_whatever_answers_at_a_door(authority, dial_out):
     threading.Thread(target=serve, daemon=True).start()
     endpoint = f"127.0.0.1:{noisy.getsockname()[1]}"
     out = dial_out("127.0.0.1:1", endpoint)
-    wait_for(lambda: "bytes" in out.details().get(endpoint, ""))
+    wait_for(lambda: "bytes" in caplog.text)
     out.follow(())
-    wait_for(lambda: not out.details())
+    caplog.clear()
+    out.follow((endpoint,))
+    wait_for(lambda: "bytes" in caplog.text)
     stop.set()
     noisy.close()
