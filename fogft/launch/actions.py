@@ -14,7 +14,14 @@ from typing import Any
 
 import yaml
 from launch import Action, LaunchContext
-from launch.actions import EmitEvent, ExecuteProcess, RegisterEventHandler
+from launch.actions import (
+    EmitEvent,
+    ExecuteProcess,
+    OpaqueFunction,
+    PopLaunchConfigurations,
+    PushLaunchConfigurations,
+    RegisterEventHandler,
+)
 from launch.event_handlers import OnProcessExit, OnProcessIO
 from launch.events import Shutdown
 from launch.frontend import Entity, Parser, expose_action
@@ -37,10 +44,8 @@ _NOT_CARRIED = {
     "shell": "write the pool file's `run` instead",
     "log_cmd": "`fogft logs` shows the commands of replicas",
 }
-_POOL_KEYS = (
-    *("name", "file", "replicas", "resources", "services", "setup"),
-    *("workdir", "fogft", "cloud", "on_exit", "timeout"),
-)
+_TEXTS = ("name", "file", "setup", "workdir", "cloud", "on_exit")
+_POOL_KEYS = (*_TEXTS, "replicas", "resources", "services", "fogft", "timeout")
 
 
 @expose_action("cloud_node")
@@ -134,7 +139,10 @@ class FogPool(Action):  # type: ignore[misc]
         cloud = _cloud(context)
         if cloud == "false":
             return self._actions
-        asked = {key: _evaluated(context, value) for key, value in self._given.items()}
+        asked = {
+            key: (_text if key in _TEXTS else _evaluated)(context, value)
+            for key, value in self._given.items()
+        }
         if asked["on_exit"] not in ("", "leave", "down"):
             raise FogftError(
                 f"fog pool: `on_exit` is `{asked['on_exit']}`", "write `leave` or `down`"
@@ -144,6 +152,9 @@ class FogPool(Action):  # type: ignore[misc]
         chosen = [n for n in nodes if n.condition is None or n.condition.evaluate(context)]
         tree = _tree(asked, [node.command(context) for node in chosen])
         cloud = asked["cloud"] if cloud in ("", "true") else cloud
+        scope = dict(context.launch_configurations)  # of the groups around it, which end before
+        enter = OpaqueFunction(function=lambda later: later.launch_configurations.update(scope))
+        local = [PushLaunchConfigurations(), enter, *local, PopLaunchConfigurations()]
         return _running(_written(tree), tree["name"], asked, cloud, local)
 
 

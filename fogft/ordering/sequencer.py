@@ -14,7 +14,7 @@ from fogft.ordering import orders
 from fogft.ordering.active_version import ActiveVersion
 from fogft.ordering.catching_up import CatchingUp
 from fogft.ordering.orders import START, Op, OrderError, Position, Promise
-from fogft.ordering.peer import Peer, Phase
+from fogft.ordering.peer import RETRY_LIMIT_S, Peer, Phase
 
 CHECK_EVERY_S = 1.0
 
@@ -274,9 +274,12 @@ class Sequencer:
                 peer.acked = max(peer.acked, index)
                 return
             expected = orders.read_index(detail) if reason is Refusal.GAP else None
-            if expected is not None:
+            if expected is not None and (peer.rewind or now >= peer.went_back_at + RETRY_LIMIT_S):
+                peer.went_back_at = now
                 peer.go_back(expected)
                 return
+            if expected is not None:
+                peer.wait_s = RETRY_LIMIT_S  # it may say so of all that it is ever sent
         peer.pause(now)
         self._look_whom_most_obey()
 

@@ -12,7 +12,7 @@ from fogft.model.groups import MAX_GROUPS
 from fogft.model.names import NAMES_BYTES_LIMIT, POOL_NAME_PATTERN
 from fogft.model.spec import CONCURRENCY_LIMIT, Part, PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
-from fogft.model.topic import ActionSpec, Origin, Select, TopicSpec
+from fogft.model.topic import DEPTH_LIMIT, ActionSpec, Origin, Select, TopicSpec
 from fogft.poolfile import rules
 from fogft.poolfile.reader import Reader
 from fogft.poolfile.task import check_resources, check_task
@@ -248,6 +248,9 @@ def action_topics(action: ActionSpec) -> tuple[TopicSpec, ...]:
     feedback, status = f"{action.name}/_action/feedback", f"{action.name}/_action/status"
     of_status = "action_msgs/msg/GoalStatusArray"
     return (
-        TopicSpec(feedback, f"{action.type}_FeedbackMessage", Origin.REPLICAS, Select.GOAL),
+        TopicSpec(
+            *(feedback, f"{action.type}_FeedbackMessage", Origin.REPLICAS, Select.GOAL),
+            depth=DEPTH_LIMIT,  # of all goals together, between two pulls
+        ),
         TopicSpec(status, of_status, Origin.REPLICAS, Select.STATUS, depth=1, latched=True),
     )

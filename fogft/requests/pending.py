@@ -62,6 +62,7 @@ class PendingRequests:
         self._short: dict[bytes, float] = {}
         self._rejected: dict[bytes, None] = {}  # those that have a rejected answer
         self._counts_deaths = counts_deaths
+        self._able: Sequence[int] = ()  # who could be asked when this was last asked
         self._cautious_until = -NEVER
         self._alarms = Alarms()
 
@@ -97,7 +98,7 @@ class PendingRequests:
             raise ValueError("a request with this id is under way already")
         if not self._pending:
             self.choose.look_at = NEVER  # that was for those that have ended
-        chosen = self.choose.first(request, able, now)
+        self._able, chosen = able, self.choose.first(request, able, now)
         if now < self._cautious_until and len(chosen) > (most := self._most_at_once(able)):
             for spared in chosen[most:]:
                 self.choose.declined(request, spared, full=False)
@@ -116,7 +117,7 @@ class PendingRequests:
         self, able: Sequence[int], now: float, *, newest_first: bool
     ) -> list[tuple[bytes, int]]:
         """Return the requests to send to further replicas now."""
-        choose, steps = self.choose, []
+        self._able, choose, steps = able, self.choose, []
         if choose.news:
             choose.news = False
             self.use(choose)
@@ -280,8 +281,9 @@ class PendingRequests:
             self._cautious_until = now + CAUTIOUS_S
             if pending is not None and replica in pending.open:
                 # Beside others it is but suspected: any of them may have been the cause. So may be
-                # the replica, if it has died over this before while another works on it.
-                again = replica in pending.died_at and len(pending.open) > 1
+                # the replica, if it has died over this before while another works on it, or may.
+                others = {*pending.open, *self._able} - pending.died_at - pending.barred
+                again = replica in pending.died_at and bool(others)
                 alone = replica in pending.alone_at and not again
                 pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
                 pending.alone_until = (now + pending.deadline) / 2

@@ -95,10 +95,13 @@ class Subscription:
 
         name = self._name
         try:
-            found = [one.qos_profile for one in self.publishers(name)] if self._open else []
+            found = self.publishers(name) if self._open else []
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
             return ""
-        for offered in found:
+        for one in found:
+            offered = one.qos_profile
+            if one.topic_type != self.topic.type:
+                return f"a publisher of `{name}` has type `{one.topic_type}`"
             if self.topic.reliable and offered.reliability == ReliabilityPolicy.BEST_EFFORT:
                 return f"a publisher of `{name}` offers best effort: write `reliable: false`"
             if self.topic.latched and offered.durability == DurabilityPolicy.VOLATILE:

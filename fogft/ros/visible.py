@@ -232,7 +232,7 @@ class RosLog(logging.Handler):
 
     def _tell(self, record: logging.LogRecord) -> None:
         try:
-            text = self.format(record)
+            text = self.format(record).encode(errors="replace").decode()  # rclpy takes UTF-8
         except Exception:  # a message that does not go with its arguments
             self.handleError(record)
             return

@@ -19,6 +19,7 @@ _SUCCEEDED = 4
 _UNKNOWN = 0
 _CDR_HEADER = b"\x00\x01\x00\x00"
 _NO_TIME = bytes(8)
+RESULT_OF_NONE = _CDR_HEADER + bytes(16)  # a request that is answered at once
 GOALS_KEPT = 4096
 BYTES_KEPT = 64 << 20
 _AGAIN_AFTER_S = 0.25  # and twice as long each time

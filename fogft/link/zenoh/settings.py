@@ -89,6 +89,21 @@ def replica_settings(
         "listen/exit_on_failure": True,
         "transport/unicast/max_sessions": SESSIONS_LIMIT,
         "transport/unicast/accept_pending": _HANDSHAKES_LIMIT,
+        # Whatever robots ask for: the threads that serve all of them may wait for none.
+        "qos/network": [
+            {
+                "id": key,
+                "flows": ["ingress"],
+                "messages": ["query"],
+                "key_exprs": [key],
+                "overwrite": {"priority": priority, "congestion_control": congestion},
+            }
+            for key, priority, congestion in (
+                ("**", "data_low", "drop"),
+                (names.slot_key(id.pool_uid, id.slot, names.PROBE), "interactive_high", "drop"),
+                (names.slot_key(id.pool_uid, id.slot, names.ANSWERS), "data", "block"),
+            )
+        ],
         # Any name: the handshake has proved that the CA made its holder a robot.
         "access_control": _access(keys, "ingress", "egress", {}),
     }

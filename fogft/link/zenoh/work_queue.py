@@ -34,14 +34,15 @@ class WorkQueue:
         with self._lock:
             return sum(map(len, self._lanes.values()))
 
-    def offer(self, job: Callable[[], None], lane: bytes = b"") -> bool:
-        """Queue a job; if its lane is full, count it and return False."""
+    def offer(self, job: Callable[[], None], lane: bytes = b"", *, always: bool = False) -> bool:
+        """Queue a job; if its lane is full, or there are too many, count it and return False."""
         with self._lock:
             waiting = self._lanes.get(lane)
             if waiting is not None and len(waiting) < LIMIT:
                 waiting.append(job)
                 return True
-            if waiting is None and len(self._lanes) < LANES_LIMIT and not self._closing:
+            room = always or len(self._lanes) < LANES_LIMIT
+            if waiting is None and room and not self._closing:
                 self._lanes[lane] = deque((job,))
                 self._queue.put(partial(self._next, lane))
                 return True

@@ -18,7 +18,7 @@ from fogft.byte_limit import ByteLimit
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
-from fogft.model.spec import Part, ServiceSpec
+from fogft.model.spec import Part
 from fogft.proxy.replica.responder import OUTSTANDING
 from fogft.ros.port import RosClient
 from fogft.topics import goals
@@ -255,15 +255,3 @@ class GoalsOnce:
                 client.forget(known.ticket)
             for _, incoming in known.waiting:
                 incoming.refuse(reason if known.begun_at is not None else Refusal.NOT_READY)
-
-
-def for_the_moment(services: tuple[ServiceSpec, ...]) -> Callable[[str, bytes], bool] | None:
-    """Return a predicate for answers that hold only for the moment; None if none do.
-
-    A replica that comes later is asked for a result as soon as it is given the goal: it may answer
-    that before it knows the goal.
-    """
-    results = {s.name for s in services if s.part is Part.RESULT}
-    if not results:
-        return None
-    return lambda service, answer: service in results and goals.is_unknown(answer)

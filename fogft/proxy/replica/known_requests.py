@@ -6,7 +6,7 @@ owner's lock.
 """
 
 import heapq
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 
 from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.proxy.replica.service_queue import Job
@@ -34,6 +34,11 @@ class KnownRequests:
         self._kept_bytes = 0
         self.held = 0  # how many jobs are open
         self.large = ByteLimit(held_bytes)
+        self._large_of: Counter[str] = Counter()  # how many large ones, by robot
+
+    def has_room(self, robot: str, size: int) -> bool:
+        """Whether a request fits: each robot may have one large one, whatever others hold."""
+        return size <= SMALL_BYTES or self.large.has_room(size) or not self._large_of[robot]
 
     def __len__(self) -> int:
         """Return how much is remembered: requests, answered ones included, and deadlines."""
@@ -63,12 +68,15 @@ class KnownRequests:
         self.held += 1
         if job.size > SMALL_BYTES:
             self.large.add(job.size)
+            self._large_of[job.robot] += 1
 
     def end(self, job: Job, answer: bytes | None = None) -> None:
         """Note that a job is done; its answer is kept for copies, within the bounds."""
         self.held -= 1
         if job.size > SMALL_BYTES:
             self.large.remove(job.size)
+            self._large_of[job.robot] -= 1
+            self._large_of += Counter()  # those who have none are forgotten
         if answer is None:
             return
         job.answer = answer

@@ -14,14 +14,14 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 
-from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.proxy.replica.known_requests import COPIES_LIMIT, KnownRequests
-from fogft.proxy.replica.service_queue import HOLD_LIMIT_S, Job, ServiceQueue
+from fogft.proxy.replica.service_queue import Job, ServiceQueue
 from fogft.requests.load import Handling
 from fogft.ros.port import RosClient
+from fogft.topics import goals
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +43,8 @@ class Responder:
     Args:
         limits: How many may be at work, by service, where it is not to be learned.
         latest: Services of which the newest request goes first.
-        passing: Whether a service's answer holds for the moment only: a copy is run anew; None
-            where none does.
+        results: Services that answer when a goal ends. That it is unknown holds for the moment
+            only: a copy is run anew.
         answered: Told of each request that the service has answered, and when.
     """
 
@@ -59,14 +59,14 @@ class Responder:
         *,
         limits: Mapping[str, int] | None = None,
         latest: Collection[str] = (),
-        passing: Callable[[str, bytes], bool] | None = None,
+        results: Collection[str] = (),
         answered: Callable[[Job, float], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._is_ready = is_ready
         self._limits = dict(limits or {})
         self._latest = frozenset(latest)
-        self._passing = passing
+        self._results = frozenset(results)
         self._clock, self._answered = clock, answered
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
@@ -170,7 +170,9 @@ class Responder:
         queue = self._queues.get(service)
         if queue is None:
             limit, latest = self._limits.get(service), service in self._latest
-            queue = self._queues[service] = ServiceQueue(self.outstanding, limit, latest=latest)
+            queue = self._queues[service] = ServiceQueue(
+                self.outstanding, limit, latest=latest, results=service in self._results
+            )
         return queue
 
     def _reason_to_refuse(
@@ -188,9 +190,9 @@ class Responder:
         deadline = now + remaining_s
         full = queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s)
         size = len(incoming.payload)
-        if full or (size > SMALL_BYTES and not self.known.large.has_room(size)):
+        if full or not self.known.has_room(incoming.robot, size):
             return Refusal.OVERLOADED, None
-        if self.known.held < self.held_limit:
+        if queue.waiting() + queue.at_work < self.held_limit:
             return None, None
         displaced = queue.evict(incoming.robot, deadline)
         return (Refusal.OVERLOADED if displaced is None else None), displaced
@@ -215,19 +217,21 @@ class Responder:
             client, queue = self._cancel_clients.get(job.service), self._queues[job.service]
             if client is not None:
                 with self._lock:
-                    held = queue.hold(job, self._clock())
+                    held = queue.hold(self._clock()) if job.passed_on else None
                 if held is not None:
-                    self._interrupt(job.service, client, held)
+                    self.interrupted += self._await(job.service, client, EMPTY_REQUEST, held)
 
-    def _interrupt(self, service: str, client: RosClient, held: float) -> None:
+    def _await(self, service: str, client: RosClient, request: bytes, held: float) -> bool:
+        """End a hold once this is answered; return whether it was sent."""
         try:
-            client.call(EMPTY_REQUEST, lambda _: self._interrupted(service, held))
-            self.interrupted += 1
+            client.call(request, lambda _: self._release(service, held))
         except RosError as error:
-            log.warning("cancel_not_called service=%s reason=%r", service, str(error))
-            self._interrupted(service, held)
+            log.warning("service_not_asked service=%s reason=%r", service, str(error))
+            self._release(service, held)
+            return False
+        return True
 
-    def _interrupted(self, service: str, held: float) -> None:
+    def _release(self, service: str, held: float) -> None:
         with self._lock:
             self._queues[service].release(held)  # and no later one: it may answer late
         self._pass_on(service)
@@ -250,7 +254,8 @@ class Responder:
         """Give the service a request; return whether it was taken. If not, it has ended."""
         try:
             payload, job.payload = job.payload, b""
-            job.ticket = self._clients[job.service].call(payload, partial(self._finished, job))
+            client = self._clients[job.service]
+            job.ticket = client.call(payload, partial(self._finished, job))
         except RosError as error:
             log.warning("request_not_passed_on service=%s reason=%r", job.service, str(error))
             hopeless = isinstance(error, Unreadable)
@@ -259,6 +264,11 @@ class Responder:
             self._end(job.id, Refusal.NOT_READY)
         else:
             self.ran += 1
+            if job.service in self._results:
+                with self._lock:
+                    held = self._queues[job.service].hold_batch(self._clock())
+                if held is not None:
+                    self._await(job.service, client, goals.RESULT_OF_NONE, held)
             return True
         return False
 
@@ -268,7 +278,8 @@ class Responder:
         with self._lock:
             waiting, job.waiting = job.waiting or [], None
             if waiting:
-                passing = self._passing is not None and self._passing(job.service, payload)
+                # A replica that comes later is asked for a result as soon as it is given the goal.
+                passing = job.service in self._results and goals.is_unknown(payload)
                 self.known.end(job, None if passing or job.unwanted else payload)
                 if passing:
                     self.known.forget(job)
@@ -339,7 +350,7 @@ class Responder:
             abandoned = [job for queue in self._queues.values() for job in queue.abandoned(now)]
             for name, queue in self._queues.items():
                 if queue.held_until <= now:
-                    log.warning("cancel_unanswered service=%s waited_s=%.1f", name, HOLD_LIMIT_S)
+                    log.warning("service_silent service=%s", name)
                     queue.release()
         for id in late:
             self._end(id, Refusal.EXPIRED)

@@ -26,7 +26,7 @@ from fogft.model.spec import Part, ServiceSpec
 from fogft.model.state import StateSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
-from fogft.proxy.replica.goals_once import GoalsOnce, for_the_moment
+from fogft.proxy.replica.goals_once import GoalsOnce
 from fogft.proxy.replica.offering import Offering
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.replica.responder import CANCEL_TYPE, Responder
@@ -102,7 +102,7 @@ class ServerProxy:
             lambda name: name in self.ready,
             limits=limits_of(services),
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
-            passing=for_the_moment(services),
+            results=[s.name for s in services if s.part is Part.RESULT],
             answered=answered,
             clock=clock,
         )

@@ -29,6 +29,10 @@ LONGEST_FADES = 0.999  # with each answer
 # share of the longest time that one was given here: what takes longer than most comes too late.
 _TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
 HOLD_LIMIT_S = 2.0  # a cancel service that has not answered by then is given up
+# An action server answers for a result when its goal ends, and of such requests that it has not
+# taken its queue keeps the last ten. It is given so many, and then one that it answers at once.
+_BATCH = 8
+_BATCH_LIMIT_S = 60.0  # it may be at work on a goal, and takes nothing meanwhile
 
 
 def most_quiet_s(longest_s: float, *, stuck: bool = False) -> float:
@@ -71,9 +75,17 @@ class ServiceQueue:
     Args:
         most: What the service's own queue holds: never is more passed on, unless `given`.
         given: How many may be at work; None to learn it.
+        results: Whether it is an action's `get_result`.
     """
 
-    def __init__(self, most: int, given: int | None = None, *, latest: bool = False) -> None:
+    def __init__(
+        self,
+        most: int,
+        given: int | None = None,
+        *,
+        latest: bool = False,
+        results: bool = False,
+    ) -> None:
         self._waiting: FairQueue[Job] = FairQueue(latest=latest)
         self.waiting = self._waiting.size  # how many
         self.evict = self._waiting.evict  # what must go so that a newcomer fits in
@@ -88,6 +100,7 @@ class ServiceQueue:
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
         self._last_deadline = 0.0
         self.held_until = NEVER  # nothing is begun before, or before `release`
+        self._results, self._batch = results, 0  # passed on since it was seen to have taken all
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
     def put(self, job: Job) -> None:
@@ -99,9 +112,13 @@ class ServiceQueue:
         self._longest_given_s = max(given_s, self._longest_given_s * LONGEST_FADES)
 
     def _has_room(self, job: Job) -> bool:
-        if self.at_work and (job.alone or self._alone):
+        if self.at_work and (job.alone or self._alone or self._batch_is_full):
             return False
         return self.at_work < (self.limit.limit if job.spare else self.limit.in_hand)
+
+    @property
+    def _batch_is_full(self) -> bool:
+        return self._results and self._batch >= _BATCH
 
     def has_free_slot(self, now: float) -> bool:
         """Whether nothing waits, and the service can start one more (almost) at once."""
@@ -160,6 +177,7 @@ class ServiceQueue:
     def begin(self, job: Job, now: float) -> None:
         """Note that a job is passed on."""
         self.at_work += 1
+        self._batch += 1
         self._alone = job.alone
         self._unanswered += 1
         self._last_deadline = max(self._last_deadline, job.deadline)
@@ -194,27 +212,31 @@ class ServiceQueue:
         if job.passed_on:
             job.passed_on = False
             self.at_work -= 1
+            if not self.at_work:
+                self._batch = 0
             self._alone = False
             self._unanswered -= 1
             if not self._unanswered:
                 self._quiet_since = None
 
-    def hold(self, job: Job, now: float) -> float | None:
-        """Begin nothing more until `release`; return until when at most.
-
-        None if the job does not run, or one is held.
-        """
-        if self.held_until < NEVER or not job.passed_on:
+    def hold(self, now: float, limit_s: float = HOLD_LIMIT_S) -> float | None:
+        """Begin nothing more until `release`; return until when at most, None if one is held."""
+        if self.held_until < NEVER:
             return None
         self.at_work += 1
-        self.held_until = now + HOLD_LIMIT_S
+        self.held_until = now + limit_s
         return self.held_until
+
+    def hold_batch(self, now: float) -> float | None:
+        """Do the same if a batch is full, until the action server is seen to have taken it."""
+        return self.hold(now, _BATCH_LIMIT_S) if self._batch_is_full else None
 
     def release(self, until: float | None = None) -> None:
         """End a `hold`, if there is one; with `until` that one only."""
         if self.held_until < NEVER and until in (None, self.held_until):
             self.held_until = NEVER
             self.at_work -= 1
+            self._batch = 0
 
     def hangs(self, now: float) -> bool:
         """Whether the service has work, and has finished none for far longer than usual."""
@@ -235,7 +257,7 @@ class ServiceQueue:
     def died(self) -> None:
         """Note that the service is a new process, of which nothing is known."""
         self.release()
-        self._quiet_since, self._unanswered, self._next = None, 0, None
+        self._quiet_since, self._unanswered, self._next, self._batch = None, 0, None, 0
         self._longest_s = self._last_deadline = 0.0
 
     def overdue(self, job: Job, now: float) -> None:

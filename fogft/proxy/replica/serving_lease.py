@@ -15,15 +15,15 @@ class HeldLease:
     """The lease of one replica; without one it never ends.
 
     It ends no later than it would if every lease had come at the moment it was signed, so nobody
-    gains by holding leases back to show them one after another. A manager's clock that is set back
-    shortens none: it only makes new leases useless until the old one is over.
+    gains by holding leases back to show them one after another. A manager's clock may be set: none
+    was signed before the one before it.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._order: Order = (-1, -1)
         self._ahead: float | None = None  # our clock less the manager's, at the first lease
-        self._heard_at = self._ends_at = 0.0
+        self._heard_at = self._ends_at = self._signed_at = 0.0
 
     def renew(self, record: Record) -> None:
         """Take a verified lease; an older one changes nothing."""
@@ -31,7 +31,9 @@ class HeldLease:
             return
         lease, now = roster.lease(record), self._clock()
         ahead = now - lease.at if self._ahead is None else self._ahead
-        ends_at = min(now, lease.at + ahead) + lease.lasts_s
+        ahead = max(ahead, self._signed_at - lease.at)
+        self._signed_at = min(now, lease.at + ahead)
+        ends_at = self._signed_at + lease.lasts_s
         self._order, self._heard_at = record.order, now
         self._ends_at = max(ends_at, self._ends_at)
         self._ahead = ahead  # last: by it other threads see that there is a lease

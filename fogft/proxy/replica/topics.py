@@ -117,6 +117,11 @@ class TopicsOnReplica:
         self._looked_at = clock()
         self._seen = {name: Seen() for name in self._topics}
         self._trouble: dict[str, str] = {}
+        # For the command's next life: what robots latched.
+        self._latched = {
+            name: Ring(topic.depth if topic.latched else 0, latched=True)
+            for name, topic in self._topics.items()
+        }
         # Publishing may block for a moment, and the wire's threads must not.
         self.queue: SimpleQueue[Incoming | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -143,7 +148,10 @@ class TopicsOnReplica:
         for name, topic in self._topics.items():
             try:
                 if topic.origin is Origin.ROBOT:
-                    self._publishers[name] = node.publisher(topic)
+                    publisher = node.publisher(topic)
+                    for _, message in self._latched[name].after(0, Ring.kept_bytes):
+                        publisher.publish(message)
+                    self._publishers[name] = publisher
                 else:
                     heard = self._outgoing[name].heard
                     self._subscriptions[name] = node.subscribe(topic, heard)
@@ -198,6 +206,7 @@ class TopicsOnReplica:
                     continue
                 publisher.check(message)
                 if self._seen[incoming.service].is_new(session, number):
+                    self._latched[incoming.service].put(message)
                     publisher.publish(message)
                 incoming.reply(b"")
             except (FrameError, Unreadable) as error:

@@ -30,6 +30,7 @@ _CANCELS_KEPT = 4096
 _CANCEL_FOR_S = 60.0  # a replica may be away for a moment
 _CANCEL_TIMEOUT_S = 10.0
 _CANCEL_AGAIN_S = 0.25
+_SEVERAL = b""  # in place of the goal to cancel
 
 
 @dataclass(frozen=True)
@@ -74,9 +75,11 @@ class _CancelPart(Decide):
         self._sent: OrderedDict[bytes, tuple[bytes, float]] = OrderedDict()  # goal, until when
 
     def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
-        goal = goals.goal_of(pending.payload)
-        if any(goal):  # else it means all goals made by now, and must not come later again
-            self._note(request, goal, self._action.clock() + _CANCEL_FOR_S)
+        if goals.names_one(pending.payload):
+            goal, until = goals.goal_of(pending.payload), self._action.clock() + _CANCEL_FOR_S
+            self._note(request, goal, until)
+        else:  # it means all goals made by now, and must not come later again
+            self._note(request, _SEVERAL, -math.inf)
 
     def _note(self, id: bytes, goal: bytes, until: float) -> None:
         self._sent[id] = goal, until
@@ -88,11 +91,10 @@ class _CancelPart(Decide):
     ) -> Judgement:
         """Note what a replica has cancelled, of what it was told to: it may name others' goals."""
         if reading:
-            asked, _ = self._sent.get(id, (b"", 0.0))
-            several = pending is not None and not goals.names_one(pending.payload)
+            asked, _ = self._sent.get(id, (None, 0.0))
             with self._action.lock:
                 for goal in goals.cancelled(payload):
-                    if several or goal == asked:
+                    if asked in (_SEVERAL, goal):
                         self._action.goals.cancelled(goal)
         return super().judge(id, replica, payload, reading, pending)
 

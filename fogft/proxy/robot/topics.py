@@ -9,7 +9,7 @@ import logging
 import os
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,7 @@ from fogft.model.replica import short
 from fogft.model.topic import Origin, Select, TopicSpec
 from fogft.proxy.robot.dispatcher import MALFORMED_LIMIT
 from fogft.topics import frames
-from fogft.topics.queues import Numbered, Outbox
+from fogft.topics.queues import Outbox, Ring
 from fogft.topics.select import Selection
 
 if TYPE_CHECKING:
@@ -66,8 +66,8 @@ class RobotTopic:
         self._merge = merge
         self._lock = threading.RLock()
         self._session = os.urandom(frames.SESSION_BYTES)
-        self._number = 0
-        self._kept: deque[Numbered] = deque(maxlen=topic.depth if topic.latched else 0)
+        # All that it numbers; kept for replicas that come later where it is latched.
+        self._kept = Ring(topic.depth if topic.latched else 0, latched=True)
         self._ways: dict[int, _Way] = {}
         self._links: dict[int, Link] = {}
         self._selection = Selection(topic.select)
@@ -106,15 +106,15 @@ class RobotTopic:
     def heard(self, message: bytes) -> None:
         """Take a message from ROS for every replica."""
         with self._lock:
-            self._number += 1
+            self._kept.put(message)
+            number = self._kept.last
             self.count["messages"] += 1
-            self._kept.append((self._number, message))
             self.count["dropped"] += not (self._ways or self.topic.latched)
-            self._unconfirmed[self._number] = None
+            self._unconfirmed[number] = None
             if len(self._unconfirmed) > _UNCONFIRMED_LIMIT:
                 del self._unconfirmed[next(iter(self._unconfirmed))]
             for way in self._ways.values():
-                self.count["dropped"] += way.outbox.put(self._number, message)
+                self.count["dropped"] += way.outbox.put(number, message)
             self._send()
 
     def route(self, links: Mapping[int, Link], members: Iterable[int]) -> None:
@@ -126,7 +126,7 @@ class RobotTopic:
                 self._said.pop(key, None)
             for key in known - self._ways.keys():
                 way = self._ways[key] = _Way(self.topic)
-                for number, message in self._kept:
+                for number, message in self._kept.after(0, Ring.kept_bytes):
                     way.outbox.put(number, message)
             for key in self._links.keys() - links.keys():
                 self._selection.left(key)

@@ -10,6 +10,7 @@ from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.proxy.replica.responder import EMPTY_REQUEST, Responder
 from fogft.requests.load import Handling, Load
+from fogft.topics import goals
 from tests.fakes.proxy import Clock, FakeClient, FakeIncoming
 from tests.fakes.threads import meanwhile
 
@@ -17,6 +18,7 @@ A = b"a" * 16
 B, C, D = b"b" * 16, b"c" * 16, b"d" * 16
 
 
+UNKNOWN = bytes((0, 1, 0, 0, 0))  # a result: the goal is not known
 BOUNDS = {"held_limit", "held_bytes", "outstanding", "kept_bytes", "kept_ids"}
 
 
@@ -218,10 +220,10 @@ def test_whoever_waits_behind_a_request_that_ros_refuses_does_not_wait_longer():
 
 def test_deadlines_of_what_was_forgotten_do_not_pile_up():
     """An id that is run anew, again and again, and more ids than are kept."""
-    scene = Scene(passing=lambda service, answer: answer == b"not yet", kept_ids=10)
+    scene = Scene(results=["/s"], kept_ids=10)
     for n in range(2000):
         scene.ask(A, remaining_s=3600.0)
-        scene.answer(n, b"not yet")
+        scene.answer(n, UNKNOWN)
     for n in range(2000):
         scene.ask(n.to_bytes(16, "big"), remaining_s=3600.0)
         scene.answer(2000 + n)
@@ -240,14 +242,64 @@ def test_a_copy_of_finished_work_gets_the_kept_answer():
 
 
 def test_an_answer_for_the_moment_is_not_kept_and_a_copy_is_run_anew():
-    scene = Scene(passing=lambda service, answer: answer == b"not yet")
+    scene = Scene(results=["/s"])
     first = scene.ask(A)
-    scene.answer(0, b"not yet")
+    scene.answer(0, UNKNOWN)
     copy = scene.ask(A)
-    assert (first.outcome, copy.outcome) == ([b"not yet"], [])
+    assert (first.outcome, copy.outcome) == ([UNKNOWN], [])
     scene.answer(1, b"r")
     assert (copy.outcome, scene.ask(A).outcome) == ([b"r"], [b"r"])
     assert (scene.responder.in_flight, len(scene.client.calls)) == (0, 2)
+
+
+def test_results_are_asked_for_no_faster_than_an_action_server_takes_the_requests():
+    """They are answered when goals end; of what it has not taken, its queue keeps the last ten."""
+    scene = Scene(results=["/s"], limits={"/s": 512})
+    asked = [
+        scene.ask(bytes([n]) * 16, payload=b"result", remaining_s=3600.0) for n in range(1, 41)
+    ]
+    calls, seen = scene.client.calls, 0
+    for _ in range(5):
+        payloads = [payload for payload, _ in calls[seen:]]
+        assert payloads == [b"result"] * 8 + [goals.RESULT_OF_NONE]
+        seen = len(calls)
+        calls[-1][1](UNKNOWN)  # it has taken all before
+    assert scene.responder.at_work == 40
+    for payload, answer in list(calls):
+        if payload == b"result":
+            answer(b"r")
+    assert [one.outcome for one in asked] == [[b"r"]] * 40
+
+
+def test_an_action_server_that_takes_nothing_for_a_minute_or_is_new_is_asked_again():
+    scene = Scene(results=["/s"], limits={"/s": 512})
+    for n in range(1, 25):
+        scene.ask(bytes([n]) * 16, payload=b"result", remaining_s=3600.0)
+    assert len(scene.client.calls) == 9
+    scene.clock.now += 61.0
+    scene.responder.tick()
+    assert len(scene.client.calls) == 18
+    scene.responder.crashed()
+    scene.ask(B, payload=b"result", remaining_s=3600.0)
+    assert len(scene.client.calls) == 19
+
+
+def test_what_waits_at_one_service_keeps_nothing_from_another():
+    """An action's results may wait for hours."""
+    scene = Scene(held_limit=4, limits={"/s": 512})
+    scene.responder.use({"/s": scene.client, "/other": (other := FakeClient())})
+    for n in range(1, 9):
+        scene.ask(bytes([n]) * 16, remaining_s=3600.0)
+    scene.ask(B, service="/other")
+    assert (len(scene.client.calls), len(other.calls)) == (4, 1)
+
+
+def test_one_robot_s_large_requests_keep_no_other_s_out():
+    scene = Scene(held_bytes=200_000, limits={"/s": 1})
+    for n in range(1, 9):
+        scene.ask(bytes([n]) * 16, payload=bytes(60_000), robot="eve", remaining_s=1e7)
+    first, second = (scene.ask(id, payload=bytes(60_000), robot="ada") for id in (A, B))
+    assert (first.outcome, second.outcome) == ([], ["refused overloaded"])
 
 
 def test_a_copy_whose_answer_is_no_longer_kept_is_refused_not_run_again():

@@ -93,8 +93,8 @@ class ControlQueries:
 
     def later(self, greeting: frame.Greeting, job: Callable[[], None], asked: QueryEnd) -> None:
         """Run a job on the other thread; if its sender's queue is full, just end the query."""
-        who = greeting.certificate or self.sessions.holder(greeting.token).encode()
-        if not self.work.offer(job, who):
+        known = self.sessions.holder(greeting.token).encode()
+        if not self.work.offer(job, known or greeting.certificate, always=bool(known)):
             self._end_of_stranger(asked, "")
 
     def _turn_away(self, asked: QueryEnd, refusal: str, why: str) -> None:
@@ -129,8 +129,8 @@ class ControlQueries:
         for one in offered:
             verdict = self.records.offer(one)
             if verdict is Verdict.REFUSED:
-                self.counters.add("records_refused")
-                log.warning("record_refused reason=%r", self.records.last_refusal)
+                why = self.records.last_refusal
+                self.counters.warn(log, "records_refused", "record_refused reason=%r", why)
             elif verdict is Verdict.OLDER:
                 self.counters.add("records_older")
                 record = read_body(one)
