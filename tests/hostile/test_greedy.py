@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import subprocess
+import sys
 import threading
+import time
 from collections.abc import Callable
 
 import zenoh
@@ -110,6 +113,36 @@ def flood(
     while not done.is_set():
         with contextlib.suppress(zenoh.ZError):
             session.get(key, lambda reply: None, payload=PROBE, attachment=signed, timeout=5.0)
+
+
+def test_a_robot_that_reads_nothing_and_asks_on_holds_up_no_other(
+    authority: Authority,
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    owner: Owner,
+) -> None:
+    """One thread of Zenoh's, and one of ours, answer all robots: they wait for room for none."""
+    replica = start_replica(reply_bytes=4 << 20)
+    good = dial(replica.endpoint)
+    wait_for(lambda: good.usable)
+    eve = authority.robot("eve")
+    paths = map(str, (eve.ca, eve.certificate, eve.key))
+    command = [sys.executable, "-m", "tests.hostile.deaf", replica.endpoint, *paths]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as deaf:
+        try:
+            assert deaf.stdout is not None
+            assert deaf.stdout.readline() == "deaf\n"
+            heard_at = {
+                round(time.monotonic() - (good.status().heard_age_s or 0.0))
+                for _ in paced(0.1, seconds=by_day(8.0, at_night=60.0))
+            }
+            assert good.offer(SERVICE, request_id(100), b"x", 30.0)
+            wait_for(lambda: owner.of(100))
+            assert deaf.poll() is None
+        finally:
+            deaf.kill()
+    assert len(heard_at) > 3  # its probes were answered all the time
+    assert good.status().reopened == 0
 
 
 def test_a_robot_asks_in_its_own_name_only(
