@@ -22,14 +22,15 @@ LATER = f"{1 << 40:x}"
 class Lied(World):
     """A world in which one replica says of each order what a test wants."""
 
-    says: Callable[[Sent], Says] | None = None
+    says: Callable[[Sent], Says | None] | None = None
+    to_liar = 0
 
     def arrive(self, sent: Sent) -> None:
-        if sent.order.replica != LIAR or self.says is None:
+        self.to_liar += sent.order.replica == LIAR
+        said = self.says(sent) if self.says and sent.order.replica == LIAR else None
+        if said is None:
             super().arrive(sent)
-            return
-        said = self.says(sent)
-        if isinstance(said, Reply):
+        elif isinstance(said, Reply):
             self.letters.append(Letter(sent, False, said.payload))
         else:
             self.letters.append(Letter(sent, False, None, said))
@@ -86,6 +87,27 @@ def test_what_one_replica_says_of_the_order_loses_no_answer(lie: str, from_the_s
         assert len(world.history) == number + 1
     assert [call.answer for call in world.history] == list(range(1, 21))
     assert world.sequencer.mark == Position(world.epoch, 20)
+
+
+@pytest.mark.parametrize("gap", [0, 1])
+def test_a_replica_that_lacks_all_it_is_sent_is_not_sent_it_for_ever(gap: int) -> None:
+    """It says of each request that an earlier one is missing: the robot's uplink is for others."""
+    world = Lied(counter, 0)
+    world.settle()
+    world.says = lambda sent: (
+        Refuse(sent, Refusal.GAP, str(gap)) if sent.order.op is Op.APPLY else None
+    )
+    for number in range(20):
+        world.ask(0, ("add", 1))
+        for _ in range(20):
+            world.tick(0.05)
+            for _ in range(50):  # so often to and fro in this time
+                for _ in range(len(world.letters)):
+                    world.deliver(0)
+                for replica in world.working():
+                    world.work(replica)
+        assert len(world.history) == number + 1
+    assert world.to_liar < 20 * 20
 
 
 def test_a_term_ends_where_more_replicas_obey_a_later_one() -> None:

@@ -275,6 +275,34 @@ def test_who_comes_later_gets_what_is_latched_and_nothing_else():
         assert world.nodes[0].published["/to"] == wanted
 
 
+@pytest.mark.parametrize("latched", [True, False])
+def test_a_command_that_starts_anew_gets_what_robots_latched(latched):
+    """It leaves ROS and comes back; the robot has sent it, and does so only once."""
+    world = World(TopicSpec("/to", "p/msg/T", Origin.ROBOT, depth=2, latched=latched))
+    for message in (b"one", b"two", b"three"):
+        world.robot_node.heard["/to"](message)
+        world.carry()
+    world.replicas[0].use(None)
+    world.replicas[0].use(node := FakeTopics())
+    world.robot_node.heard["/to"](b"four")
+    world.carry()
+    assert node.published["/to"] == ([b"two", b"three"] if latched else []) + [b"four"]
+
+
+def test_what_is_kept_for_late_replicas_is_bounded_by_bytes(monkeypatch):
+    monkeypatch.setattr("fogft.topics.queues.Ring.kept_bytes", 1000)
+    world = World(TopicSpec("/to", "p/msg/T", Origin.ROBOT, depth=100, latched=True))
+    link = world.links.pop()
+    world.route()
+    said = [b"%0100d" % number for number in range(50)]
+    for message in said:
+        world.robot_node.heard["/to"](message)
+    world.links.append(link)
+    world.route()
+    world.carry()
+    assert world.nodes[0].published["/to"] == said[-10:]
+
+
 def test_a_robot_that_comes_later_gets_what_a_replica_latched():
     world = World(TopicSpec("/back", "p/msg/T", Origin.REPLICAS, depth=1, latched=True))
     for message in (b"old", b"new"):

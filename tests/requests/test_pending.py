@@ -17,7 +17,7 @@ from fogft.model.choices import FallbackSpec
 from fogft.model.refusal import Effect, Refusal
 from fogft.requests.alarms import ALARM_S, FALSE_ALARMS, LATELY_S
 from fogft.requests.auto import Auto
-from fogft.requests.choose import All
+from fogft.requests.choose import All, Failover
 from fogft.requests.decide import Decide, Means
 from fogft.requests.fallback import FallbackTimer
 from fogft.requests.load import Load
@@ -158,6 +158,31 @@ def test_who_cries_wolf_is_not_believed():
     requests.refused(A, 1, Refusal.CRASHED, 1.0)
     assert requests.get(A).deaths == 1, "the other one is"
     assert wolf(requests, 99, FALSE_ALARMS * ALARM_S + LATELY_S) == 1, "it may have been mended"
+
+
+@pytest.mark.parametrize("policy", [All, Auto, Failover])
+@pytest.mark.parametrize("refusal", [Refusal.OVERLOADED, Refusal.LOST])
+def test_one_replica_alone_makes_no_request_poison(policy, refusal):
+    """It says each time that its service died; the other one refuses each request once."""
+    requests = PendingRequests(policy(), Spy(), counts_deaths=True)
+    for n in range(20):
+        id, now, refused, ended = bytes([n]) * 16, 10.0 * n, False, False
+        step = list(requests.begin(id, b"x", (0, 1), deadline=now + 5.0, now=now))
+        while not ended and now < 10.0 * n + 5.0:
+            for replica in step:
+                if replica == 0:
+                    verdict = requests.refused(id, 0, Refusal.CRASHED, now)
+                    assert verdict is not Verdict.POISON
+                elif not refused:
+                    refused = True
+                    requests.refused(id, 1, refusal, now)
+                else:
+                    ended = requests.answered(id, id, 1, OK, True, None, now)[1] is not None
+                    break
+            now += 0.02
+            more = requests.more((0, 1), now, newest_first=False)
+            step = [replica for _, replica in more if requests.attempt(id, replica, now)]
+        assert ended
 
 
 def test_one_death_over_many_requests_is_one_alarm():

@@ -50,6 +50,13 @@ def test_a_publisher_that_offers_less_is_told_of_with_the_remedy(make_node, ros_
     assert fine.mismatch() == ""
 
 
+def test_a_publisher_of_another_type_is_told_of(make_node, ros_domain):
+    make_node(ros_domain).publisher(replace(SAID, type="std_msgs/msg/Int32"))
+    heard = make_node(ros_domain).subscribe(SAID, lambda _: None)
+    wait_for(heard.mismatch, "the publisher")
+    assert heard.mismatch() == f"a publisher of `{SAID.name}` has type `std_msgs/msg/Int32`"
+
+
 def test_withdrawn_ends_do_nothing_more(make_node, ros_domain):
     heard: list[bytes] = []
     node = make_node(ros_domain)

@@ -55,6 +55,7 @@ def test_only_so_many_may_give_jobs():
     work = WorkQueue("test", counters)
     assert all(work.offer(print, b"%d" % one) for one in range(LANES_LIMIT))
     assert not work.offer(print, b"another")
+    assert work.offer(print, b"of one who is let in", always=True)
     assert counters.snapshot() == {"control_queries_dropped": 1}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -67,6 +68,19 @@ def test_a_clock_that_is_set_ends_no_replica_early(steps):
         assert held.left_s is not None
         assert before is None or held.left_s >= before - 1e-6
         assert clock.now + held.left_s <= longest + 1e-6
+
+
+@pytest.mark.parametrize(("fast_h", "lasts_h"), [(2, 1), (13, 12), (25, 24)])
+def test_a_manager_s_clock_that_was_fast_and_is_set_right_ends_no_replica(fast_h, lasts_h):
+    clock, at = Clock(), 1e9 + 3600.0 * fast_h
+    held = HeldLease(clock)
+    for minute in range(60 * (lasts_h + 2)):
+        if minute == 10:
+            at -= 3600.0 * fast_h
+        held.renew(lease(minute, at=at, lasts_s=3600.0 * lasts_h))
+        assert held.left_s >= 3600.0 * lasts_h - 60.0
+        clock.now += 60.0
+        at += 60.0
 
 
 def test_whoever_looks_while_the_first_lease_is_taken_sees_all_of_it_or_none():

@@ -80,6 +80,30 @@ def test_a_goal_reaches_every_replica_and_the_first_acceptance_counts():
     assert all(link.forgotten == [] for link in scene.links)  # nobody is told to drop it
 
 
+def test_of_all_that_are_cancelled_none_goes_to_a_replica_that_comes_later():
+    """Also what only a later answer names, as the first replica had ended it already."""
+    scene = Scene()
+    for goal in (first := b"x" * 16, second := b"y" * 16):
+        scene.ask("goal", HEADER + goal + b"5")
+        for slot in (0, 1):
+            scene.say(slot, ACCEPTED, "goal")
+        scene.ask("result", HEADER + goal)
+    scene.say(0, ABORTED, "result")
+    scene.ask("cancel", HEADER + bytes(24))
+    scene.say(0, cancelled(first), "cancel")
+    scene.say(1, cancelled(first, second), "cancel")
+    late = FakeLink(2)
+    scene.route(*scene.links, late)
+    scene.tick(1.0)
+    assert scene.given(late, "goal") == []
+
+
+def cancelled(*goals: bytes) -> bytes:
+    """Return the answer to a cancellation of all."""
+    info = b"".join(goal + bytes(8) for goal in goals)
+    return HEADER + bytes(4) + len(goals).to_bytes(4, "little") + info
+
+
 def test_a_goal_that_all_refuse_is_refused():
     scene = Scene()
     scene.ask("goal", HEADER + ID)

@@ -163,6 +163,19 @@ def test_one_robot_does_not_take_all_the_room():
     assert scene.request(20, robot="greedy").outcome == []
 
 
+def test_one_robot_s_large_requests_keep_no_other_s_out():
+    scene = Scene(held_bytes=100_000)
+    eve, ada = (
+        [
+            scene.request(n, payload=bytes(60_000), robot=robot, remaining_s=1e7)
+            for n in (first, first + 1)
+        ]
+        for first, robot in ((1, "eve"), (3, "ada"))
+    )
+    full = [refused(Refusal.OVERLOADED)]
+    assert [[one.outcome for one in of] for of in (eve, ada)] == [[[], full], [[], full]]
+
+
 def test_kept_answers_are_bounded_by_bytes():
     scene = Scene(kept_bytes=10)
     for number in range(5):
