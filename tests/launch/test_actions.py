@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import textwrap
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -162,6 +163,35 @@ def test_a_wrong_word_for_the_end_is_refused(home: Path) -> None:
     pool = FogPool([CloudNode(package="a", executable="b")], name="lt", on_exit="explode")
     with pytest.raises(FogftError, match="`on_exit` is `explode`"):
         pool.execute(launch.LaunchContext())
+
+
+@pytest.mark.parametrize("setup", ["[ -d /opt/demo ]", "echo 'network: none' > /etc/x.yaml\n", "7"])
+def test_commands_and_names_are_no_yaml(home: Path, setup: str) -> None:
+    pool = FogPool([CloudNode(executable="/bin/true")], name="2024", setup=setup)
+    pool.execute(launch.LaunchContext())
+    tree = yaml.safe_load((home / "launch" / "2024.yaml").read_text())
+    assert (tree["name"], tree["setup"]) == ("2024", setup)
+
+
+def test_local_nodes_have_the_configurations_of_the_groups_around_the_pool(
+    tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They start when the pool is ready: those groups have ended then."""
+    ready = tmp_path / "ready"
+    ready.write_text(f"#!/bin/sh\necho '{READY}'\n")
+    ready.chmod(0o755)
+    monkeypatch.setattr("fogft.launch.actions.sys", SimpleNamespace(executable=str(ready)))
+    seen: list[str] = []
+    look = launch.actions.OpaqueFunction(
+        function=lambda then: seen.append(then.launch_configurations.get("speed", "none"))
+    )
+    pool = FogPool([CloudNode(executable="/bin/true"), look], name="lt")
+    set_here = launch.actions.SetLaunchConfiguration("speed", "fast")
+    service = launch.LaunchService()
+    group = launch.actions.GroupAction([set_here, pool])
+    service.include_launch_description(launch.LaunchDescription([group]))
+    assert service.run() == 0
+    assert seen == ["fast"]
 
 
 def test_a_pool_file_supplies_the_rest(tmp_path: Path, home: Path) -> None:
