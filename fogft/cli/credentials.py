@@ -116,11 +116,12 @@ def revoke(
 
     holders, told = revoke_credentials(composition.store_of(pool), _role(role), name)
     listed = ", ".join(f"`{holder.short}`" for holder in holders)
+    are = "is" if len(holders) == 1 else "are"
     if told:
-        output.done(f"{role} {listed} is revoked")
+        output.done(f"{role} {listed} {are} revoked")
     else:
         output.warn(
-            f"{role} {listed} is revoked, but no manager is running to tell the other members"
+            f"{role} {listed} {are} revoked, but no manager is running to tell the other members"
         )
         output.hint("start one with `fogft up`")
 
@@ -152,7 +153,7 @@ def rotate(
         return
     if which is not Role.ROBOT or name:
         raise FogftError(
-            f"the keys of {f'{role} `{name}`' if name else role} are on another machine",
+            f"the keys of {f'{role} `{name}`' if name else f'a {role}'} are on another machine",
             f"`fogft credentials issue {role} {name or 'NAME'}`, `fogft join` there, then "
             f"`fogft credentials revoke {role} {name or 'NAME'}.1`",
         )

@@ -92,17 +92,17 @@ def up(
         machines = f"{count} machine{'' if count == 1 else 's'}"
         output.confirm(f"launch {machines} at these prices?" if count else "continue?")
     limit_s = timeout or (progress.REAL_LIMIT_S if order.costs_money else progress.LIMIT_S)
-    if startup.start(order) and not order.is_new and not upgrades:
-        output.say("the pool had no manager: started a new one")
-    applied_at = time.time()  # what was seen before, or by an old manager, says nothing of it
     name = order.spec.name
-    replaces = order.replaces_replicas or order.rolled_back or under_way or upgrades
-    awaited = Awaited(
-        frozenset(service.name for service in order.spec.services),
-        applied_at,
-        order.digest if replaces else "",
-    )
     try:
+        if startup.start(order) and not order.is_new and not upgrades:
+            output.say("the pool had no manager: started a new one")
+        applied_at = time.time()  # what was seen before, or by an old manager, says nothing of it
+        replaces = order.replaces_replicas or order.rolled_back or under_way or upgrades
+        awaited = Awaited(
+            frozenset(service.name for service in order.spec.services),
+            applied_at,
+            order.digest if replaces else "",
+        )
         seen, outcome = progress.wait(paths, awaited, limit_s)
     except KeyboardInterrupt:
         output.say(f"interrupted: `{name}` continues to start; `fogft down {name}` shuts it down")
@@ -142,7 +142,7 @@ def _not_updated(status: PoolStatus) -> FogftError:
     lines = [f"`{status.pool}` was not updated: {why}"]
     if replica := _replica_at_fault(status.reasons):
         lines += _end_of_log(status, replica)
-    hint = "see `fogft logs`; this file is not tried again: change it and run `fogft up`"
+    hint = "see `fogft logs`; then change this file, if only a comment, and run `fogft up`"
     return FogftError("\n".join(lines), hint)
 
 

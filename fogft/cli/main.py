@@ -8,6 +8,7 @@ Imports that take long are made inside the command that needs them (tests/cli/te
 """
 
 import errno
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -60,6 +61,8 @@ def root(
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line and exit the process."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not every locale has all characters
+        sys.stdout.reconfigure(errors="replace")
     sys.exit(run(sys.argv[1:] if args is None else args))
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 from fogft.doctor import machine, pools, ros
@@ -20,6 +21,8 @@ ALL: tuple[Check, ...] = (
 def examine(file: Path | None = None) -> Iterator[Finding]:
     """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come."""
     spec = None if file is None else read(file)
-    pools_here = tuple(composition.pools())
+    pools_here: tuple[str, ...] = ()
+    with suppress(OSError):  # `machine.state_folder` says so
+        pools_here = tuple(composition.pools())
     for check in ALL:  # some take seconds, and a report's age is told from now
         yield from run(check, Situation(home(), pools_here, spec, time.time()))

@@ -249,7 +249,9 @@ def _clock(written: Any) -> int:
         minutes = int(match[1]) * 60 + int(match[2])
     if not 0 <= minutes <= 24 * 60:
         hint = "write hours and minutes: 8:30"
-        raise SpecError(f"{written!r:.40} is not a time of the day", hint)
+        if isinstance(written, int):  # as YAML reads what looks like one
+            written = f"{written // 60}:{written % 60:02}"
+        raise SpecError(f"`{written!s:.40}` is not a time of the day", hint)
     return minutes * 60
 
 

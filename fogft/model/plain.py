@@ -118,7 +118,8 @@ def _reader(hint: Any) -> Read:  # noqa: PLR0911
         (one,) = (_reader(kind) for kind in arguments if kind is not types.NoneType)
         return lambda raw: None if raw is None else one(raw)
     if origin is tuple and arguments[-1] is not ...:
-        return _fixed([_reader(kind) for kind in arguments])
+        reads = [_reader(kind) for kind in arguments]
+        return lambda raw: tuple(read(one) for read, one in zip(reads, _list(raw), strict=True))
     if origin in (tuple, frozenset, Sequence, list):
         return _listed(list if origin is Sequence else origin, _reader(arguments[0]))
     if origin in (Mapping, dict):
@@ -177,10 +178,6 @@ def _list(raw: Any) -> list[Any]:
     if not isinstance(raw, list):
         raise ValueError(f"{raw!r:.40} is not a list")  # noqa: TRY004
     return raw
-
-
-def _fixed(reads: list[Read]) -> Read:
-    return lambda raw: tuple(read(one) for read, one in zip(reads, _list(raw), strict=True))
 
 
 def _listed(make: Callable[[Iterable[Any]], Any], read: Read) -> Read:

@@ -121,8 +121,8 @@ class ServiceSpec:
     )
     ok_field: str = key(
         Text("the name of a field", "name a boolean field, such as `success`", only(is_field_name)),
-        "Boolean field of the response; while it is false, fogft waits for another replica's "
-        "response.",
+        "Boolean field of the response; while it is false, fogft waits for another replica's; "
+        "if all are false, one is returned.",
         default="",
         parameter=True,
     )
@@ -474,11 +474,6 @@ class PoolSpec:
         gateway, rendezvous, door = self.gateway.endpoints(host)
         topology = Topology((Gateway(LAUNCHED, gateway),), through=(LAUNCHED,))
         return replace(self, topology=topology, rendezvous=(rendezvous,), dial_in=door)
-
-    @cached_property
-    def proxied_names(self) -> frozenset[str]:
-        """The names of the services that make a replica ready."""
-        return frozenset(service.name for service in self.proxied)
 
     @cached_property
     def replica_hash(self) -> str:

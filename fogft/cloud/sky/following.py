@@ -79,7 +79,11 @@ class Following:
             elif self.clock() - entry.begun_at > LAUNCH_LIMIT_S:
                 self._fail(entry, self._hung(entry, LAUNCH_LIMIT_S, "launching"))
             elif not entry.placement.spot and not entry.endpoint:
-                self._meet(entry)
+                # Once its provider lists it: it is to end itself, and not merely stop.
+                for instance in self.ending.census.of(entry.id, entry) or ():
+                    self.ending.census.end_when_shut_down(instance)
+                    if instance.public_ip:
+                        self._move(entry, endpoint=f"{instance.public_ip}:{entry.port}")
         else:
             try:
                 job = self.sky.launched_job(entry.request)
@@ -89,13 +93,6 @@ class Following:
                 self._move(entry, stage=Stage.SETTING_UP, job=job, running_at=self.clock())
                 self._find_endpoint(entry)
                 self.ending.census.of(entry.id, entry)  # seen once, its absence counts
-
-    def _meet(self, entry: Entry) -> None:
-        """Have a machine on demand end itself, and not merely stop, once its provider lists it."""
-        for instance in self.ending.census.of(entry.id, entry) or ():
-            self.ending.census.end_when_shut_down(instance)
-            if instance.public_ip:
-                self._move(entry, endpoint=f"{instance.public_ip}:{entry.port}")
 
     def _find_endpoint(self, entry: Entry) -> None:
         """Ask where a machine is reached whose cloud maps its port, until that is known."""

@@ -72,8 +72,15 @@ def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
 
 def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[str, Any]:
     """Return the alternative of a section that a placement was bought by."""
-    found = (entry for _, entry in alternatives(resources) if _sells(entry, placement))
-    return next(found, resources)
+    machine = placement.instance.partition("+")[0]
+    for _, entry in alternatives(resources):
+        if (
+            sells(entry, placement.cloud, placement.region, placement.zone)
+            and entry.get("instance_type") in (None, machine)
+            and entry.get("use_spot") in (None, placement.spot)
+        ):
+            return entry
+    return resources
 
 
 def build(
@@ -137,15 +144,6 @@ def _resources(order: Launch, owner: str) -> dict[str, Any]:
     out |= _kind(order.placement)
     out["labels"] = dict(chosen.get("labels") or {}) | naming.labels(order, owner)
     return out
-
-
-def _sells(entry: Mapping[str, Any], placement: Placement) -> bool:
-    """Whether a placement can have come from this alternative."""
-    return (
-        sells(entry, placement.cloud, placement.region, placement.zone)
-        and entry.get("instance_type") in (None, placement.instance.partition("+")[0])
-        and entry.get("use_spot") in (None, placement.spot)
-    )
 
 
 def _filled(value: Any, marks: Mapping[str, str]) -> Any:

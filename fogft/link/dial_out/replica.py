@@ -4,12 +4,13 @@ One that is taken into use is joined with this replica's own listener, and anoth
 place. Not here: the door (`robot`), the listener (`listener`).
 """
 
-import hashlib
 import logging
 import socket
 import threading
 import time
 from collections.abc import Iterable
+from ipaddress import IPv4Address
+from zlib import crc32
 
 from fogft import poll
 from fogft.errors import FogftError
@@ -74,8 +75,9 @@ class DialOut:
                 self._say(door, "")
                 if self._wait(link, stop):
                     # Of each door another host, for who keeps strangers out at our own port.
-                    ours = _host_of(door) if self._local[0] == "127.0.0.1" else ""
-                    own = socket.create_connection(self._local, _CONNECT_TIMEOUT_S, (ours, 0))
+                    ours = IPv4Address(0x7F000002 + crc32(door.encode()) % 0xFFFFFC)
+                    source = str(ours) if self._local[0] == "127.0.0.1" else "", 0
+                    own = socket.create_connection(self._local, _CONNECT_TIMEOUT_S, source)
                     self._tunnels.carry(link, own)
                     link = None
                     continue  # at once: another one takes its place
@@ -117,8 +119,3 @@ class DialOut:
                 return
             self._details[door] = detail
         log.info("door_%s door=%s reason=%r", "shut" if detail else "reached", door, detail)
-
-
-def _host_of(door: str) -> str:
-    one, two, three = hashlib.sha256(door.encode()).digest()[:3]
-    return f"127.{one}.{two}.{1 + three % 254}"

@@ -3,9 +3,11 @@
 Owns: a connection's socket. Not here: the judgement (`socket_progress`), when to look (`link`).
 """
 
+import select
 import time
 from collections.abc import Callable
 
+from fogft import poll
 from fogft.link.socket_progress import BULK_BYTES, SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.sockets import Address, OwnSocket
@@ -62,7 +64,7 @@ class FlowWatch:
                 if flow is None or not (sending() or asked()):
                     break
                 if sending():
-                    if not sockets.takes_more(connection):
+                    if not poll.is_ready(connection, event=select.POLLOUT):  # in the kernel
                         sockets.end_sending(connection)  # at once: soon it may take more
                         return
                 elif flow.received != received:

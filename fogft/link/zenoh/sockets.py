@@ -8,7 +8,6 @@ import contextlib
 import ctypes
 import fcntl
 import os
-import select
 import socket
 import stat
 import struct
@@ -17,7 +16,6 @@ import time
 from collections.abc import Iterator
 from itertools import chain
 
-from fogft import poll
 from fogft.link.socket_progress import Flow
 
 Address = tuple[str, int]
@@ -157,11 +155,6 @@ def flow(connection: socket.socket) -> Flow | None:
         round_trip_s=(rtt_us + 4 * variation_us) / 1e6,
         unsent=unsent,
     )
-
-
-def takes_more(connection: socket.socket) -> bool:
-    """Whether the kernel's send buffer has room."""
-    return poll.is_ready(connection, event=select.POLLOUT)
 
 
 def keep_short(connection: socket.socket) -> None:

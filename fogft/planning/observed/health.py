@@ -171,7 +171,7 @@ def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
         return False
     if not is_current(spec, machine):
         return bool(link.ready)
-    wanted = spec.proxied_names
+    wanted = frozenset(service.name for service in spec.proxied)
     if spec.discovered and not spec.services and spec.discovered_by != machine.spec_hash:
         wanted = frozenset(name for name, _ in link.offered)
     return bool(wanted) and wanted <= link.ready

@@ -14,6 +14,7 @@ from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import ReplicaStatus
 
 HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
+AGAIN_S = 16.0  # by then, a `run` that ended before the `up` was started again
 
 
 class Outcome(Enum):
@@ -50,10 +51,10 @@ class Awaited:
             return Outcome.WITHDRAWN
         if self.is_answering(seen):
             return Outcome.ANSWERING
-        if keeps_ending(seen):
-            return Outcome.RUN_KEEPS_ENDING
         if types_differ(seen):
             return Outcome.TYPES_DIFFER
+        if keeps_ending(seen) and seen.status.observed_at >= self.since + AGAIN_S:
+            return Outcome.RUN_KEEPS_ENDING
         given_up = is_given_up(seen) and seen.status.observed_at >= self.since
         return Outcome.NEVER_READY if given_up else Outcome.PENDING
 

@@ -159,16 +159,11 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
     names = [unit.name for unit in units]
     said = [where.systemctl("daemon-reload"), where.systemctl("enable", *names)]
     if not any(one.returncode for one in said):
-        if paths is not None:
-            _yield_to(paths)
+        if paths is not None:  # whom systemd did not start: its own replace them
+            for lock in (paths.manager_lock, paths.spare_lock, paths.standby_lock):
+                process_control.end_holder(lock)
         said.append(where.systemctl("restart", "--no-block", *names))
     return [one.stderr.strip() for one in said if one.returncode]
-
-
-def _yield_to(paths: PoolPaths) -> None:
-    """End the manager, the spare and the standby not started by systemd; its own replace them."""
-    for lock in (paths.manager_lock, paths.spare_lock, paths.standby_lock):
-        process_control.end_holder(lock)
 
 
 def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:

@@ -127,9 +127,9 @@ def _parse(data: bytes) -> tuple[Label, dict[str, Any], bytes]:
         sealed = _bytes(raw, "sealed")
         if len(_bytes(raw, "salt")) != _SALT_BYTES or len(_bytes(raw, "nonce")) != _NONCE_BYTES:
             raise ValueError("its salt or nonce is of the wrong length")
-    except (ValueError, RecursionError) as error:
+    except (ValueError, RecursionError):
         raise CredentialError(
-            f"this is not a join bundle: {error}", "`fogft credentials issue` creates one"
+            "this is not a join bundle", "`fogft credentials issue` creates one"
         ) from None
     return label, {key: value for key, value in raw.items() if key != "sealed"}, sealed
 

@@ -190,7 +190,9 @@ def read_identity(paths: PoolPaths) -> Identity:
     except StateError as error:
         found = _told_identity(paths)
         if found is None:
-            raise StateError(error.message, _NO_IDENTITY) from error
+            denied = isinstance(error.__cause__, PermissionError)
+            hint = "run fogft as the user who owns it" if denied else _NO_IDENTITY
+            raise StateError(error.message, hint) from error
     if found is None and paths.exported.exists():
         name = paths.folder.name
         raise PoolBusy(

@@ -30,6 +30,8 @@ def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
         try:
             sold = cloud.offers({**resources, "ports": []} if spec.dials_out else resources)
         except SpecError as error:
+            if not error.key:
+                raise
             key = places.get(name, "") + error.key
             raise SpecError.of_key(key, error.what, error.hint) from error
         found += [

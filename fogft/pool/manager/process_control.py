@@ -38,8 +38,8 @@ def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0)
     with _opened(pid) as descriptor:
 
         def gone() -> bool:
-            if _is_alive(descriptor):
-                return False
+            if descriptor is not None and not poll.is_ready(descriptor):
+                return False  # it has not ended; a zombie has
             return not disk.is_locked(lock) or disk.holder(lock) not in (None, pid)
 
         for number in (signal.SIGTERM, signal.SIGKILL):
@@ -66,11 +66,6 @@ def call_at_end(pid: int, call: Callable[[], None]) -> None:
             call()
 
     threading.Thread(target=wait, name=f"end-of-{pid}", daemon=True).start()
-
-
-def _is_alive(descriptor: int | None) -> bool:
-    """Whether a process has not ended; a zombie has. False where the kernel cannot tell."""
-    return descriptor is not None and not poll.is_ready(descriptor)
 
 
 def _send(pid: int, descriptor: int | None, number: signal.Signals) -> None:

@@ -56,6 +56,11 @@ class OrderedResponder:
         return self._machine.current
 
     @property
+    def complete(self) -> bool:
+        """Whether the services for its state are there too."""
+        return all(client.available() for client in self._clients or ())
+
+    @property
     def in_flight(self) -> int:
         """The number of unanswered requests."""
         return self._machine.in_flight

@@ -387,7 +387,8 @@ class ServerProxy:
     def _detail_of_complete(self) -> str:
         for name, ordered in self._ordered.items():
             if not ordered.ready:
-                return ordered.detail or f"`{name}` does not have the current state yet"
+                why = "" if ordered.complete else ": `run` does not offer its snapshot or restore"
+                return ordered.detail or f"`{name}` does not have the current state yet{why}"
         for name, seconds in () if self._topics.trouble else self._hanging().items():
             return f"`{name}` has requests and has answered none for {seconds:.0f} s"
         return self._topics.trouble

@@ -195,10 +195,6 @@ class Pace:
             pace = self.clients[id] = ClientPace(now, self.sent)
         return pace
 
-    def asked_after(self, client: ClientPace) -> list[bytes]:
-        """Return the clients whose last request came after this one's."""
-        return [id for id, other in self.clients.items() if other.asked_at > client.asked_at]
-
     def take(self, client: ClientPace, now: float) -> bool:
         """Whether a response to a client may be sent now; if so, it counts as sent."""
         client.refill(now)  # also where there is room: time is not saved up

@@ -229,8 +229,8 @@ class Pacer:
         now = self.clock()
         with self._wake:
             client = self._pace.client(id, now)
-            later = self._pace.asked_after(client) if client.silent(now) else ()
-            if any(self.probes.same_node(id, other) for other in later):
+            later = [i for i, o in self._pace.clients.items() if o.asked_at > client.asked_at]
+            if client.silent(now) and any(self.probes.same_node(id, other) for other in later):
                 return  # or what a killed node left open would push out its successor's responses
             client.answered_probe(now)
             self._wake.notify()
