@@ -53,6 +53,15 @@ def test_a_file_that_is_not_ours_is_an_error_and_no_trace(tmp_path, monkeypatch,
     assert said.startswith(f"error: `{home / 'pools'}`: Not a directory\n")
 
 
+def test_what_a_locale_cannot_write_is_replaced(home):
+    script = "import fogft.cli.main as m, sys; m.run = lambda _: print('\u2588'); m.main([])"
+    environ = {**os.environ, "FOGFT_HOME": str(home), "PYTHONIOENCODING": "latin-1"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environ, capture_output=True, check=True
+    )
+    assert done.stdout == b"?\n"
+
+
 def test_a_full_disk_behind_stdout_is_an_error_and_no_trace(home, tmp_path):
     done = subprocess.run(
         ["sh", "-c", f"{sys.executable} -m fogft --help > /dev/full"],

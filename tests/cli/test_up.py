@@ -148,13 +148,14 @@ def test_a_manager_that_another_up_replaces_is_waited_for(file, looks):
     assert main.run(["up", str(file)]) == 0
 
 
-def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys):
+@pytest.mark.parametrize("at", ["status.read", "startup.start"])
+def test_an_interrupt_says_what_goes_on(file, looks, monkeypatch, capsys, at):
     looks()
 
     def interrupt(*_: object) -> Seen:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("fogft.pool.commands.status.read", interrupt)
+    monkeypatch.setattr(f"fogft.pool.commands.{at}", interrupt)
     assert main.run(["up", str(file)]) == 130
     last = capsys.readouterr().err.splitlines()[-1]
     assert last == "interrupted: `planner` continues to start; `fogft down planner` shuts it down"
@@ -244,7 +245,7 @@ def test_an_update_that_is_rolled_back_is_an_error_with_its_reason(home, file, l
     assert main.run(["up", str(file)]) == 1
     assert capsys.readouterr().err.endswith(
         "error: `planner` was not updated: replica 0.2: `run` exited 4 times\n\n"
-        "hint: see `fogft logs`; this file is not tried again: change it and run `fogft up`\n"
+        "hint: see `fogft logs`; then change this file, if only a comment, and run `fogft up`\n"
     )
 
 

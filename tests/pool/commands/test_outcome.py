@@ -8,13 +8,13 @@ import pytest
 
 from fogft.model.reason import Cause, Reason
 from fogft.planning.rollout import UpdateState
-from fogft.pool.commands.outcome import HOPELESS_RESTARTS, Awaited, Outcome, Settled
+from fogft.pool.commands.outcome import AGAIN_S, HOPELESS_RESTARTS, Awaited, Outcome, Settled
 from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus, UpdateStatus
 from tests.fakes.pools import REPLICA, STATUS
 
 APPLIED_AT = 10.0
-UP = replace(STATUS, notes=(), replicas=(REPLICA,), target=1, observed_at=20.0)
+UP = replace(STATUS, notes=(), replicas=(REPLICA,), target=1, observed_at=APPLIED_AT + AGAIN_S)
 LEAVING = replace(REPLICA, slot=1, phase="draining")
 SILENT = (replace(UP.services[0], ready_replicas=0),)
 STARTING = replace(REPLICA, phase="starting")
@@ -46,6 +46,8 @@ def updated(state: UpdateState | None, *, applied: str = "new", fault: str = "",
             Outcome.PENDING,
         ),
         (replace(UP, services=SILENT, replicas=(HOPELESS,)), Outcome.RUN_KEEPS_ENDING),
+        # Before, which says nothing of a command that was mended since.
+        (replace(UP, services=SILENT, replicas=(HOPELESS,), observed_at=25.0), Outcome.PENDING),
         (replace(UP, services=SILENT, replicas=(HOPELESS, STARTING)), Outcome.PENDING),
         (replace(UP, services=SILENT, replicas=(LEAVING,)), Outcome.PENDING),
         (replace(UP, replicas=(LEAVING, HOPELESS)), Outcome.ANSWERING),  # one that leaves answers

@@ -157,6 +157,17 @@ def test_damaged_identity_is_an_error(pool: Scene, damage: dict[str, object]) ->
     assert "fogft sweep --end" in caught.value.hint
 
 
+def test_an_identity_of_another_user_is_not_to_be_removed(pool: Scene, monkeypatch) -> None:
+    def denied(path: Path, *_: object, **__: object) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "read_text", denied)
+    monkeypatch.setattr(Path, "read_bytes", denied)
+    with pytest.raises(StateError, match="Permission denied") as caught:
+        read_identity(pool.paths)
+    assert caught.value.hint == "run fogft as the user who owns it"
+
+
 @pytest.mark.parametrize("name", ["pool", "another"])
 def test_a_damaged_identity_is_as_the_manager_told_it(pool: Scene, name: str) -> None:
     """So `fogft down` still ends the machines; what another pool's manager told is not taken."""

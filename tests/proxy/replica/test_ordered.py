@@ -333,6 +333,15 @@ def test_a_failed_restore_is_told_and_tried_again(scene):
     assert scene.responders[1].detail == ""
 
 
+def test_it_knows_whether_the_services_for_its_state_are_there(scene):
+    """A typo in their names would else be a state that never becomes the current one."""
+    assert scene.responders[1].complete
+    scene.clients[1].restore.there = False
+    assert not scene.responders[1].complete
+    scene.responders[1].use(None)
+    assert scene.responders[1].complete
+
+
 def test_a_crashed_service_does_not_answer_from_its_first_state(scene):
     """Its command was started again: it is given requests only after it has been restored."""
     scene.run()
