@@ -70,7 +70,7 @@ class Peer:
     won: int = 0
     wait_s: float = RETRY_FIRST_S / 2
     retry_at: float = 0.0
-    went_back_at: float = -RETRY_LIMIT_S
+    went_back: int = 0  # so often since it last acknowledged a number
     checked_at: float = 0.0
     waits_since: float | None = None
     lag: Lag = field(default_factory=Lag)

@@ -17,6 +17,7 @@ from fogft.ordering.orders import START, Op, OrderError, Position, Promise
 from fogft.ordering.peer import RETRY_LIMIT_S, Peer, Phase
 
 CHECK_EVERY_S = 1.0
+_GOES_BACK = 8  # so often, without a number acknowledged: orders may overtake each other
 
 
 @dataclass(frozen=True)
@@ -177,7 +178,7 @@ class Sequencer:
             answers = self._applied(replica, index)
             if peer is not None:
                 peer.open.discard(index)
-                peer.acked = max(peer.acked, index)
+                peer.acked, peer.went_back = max(peer.acked, index), 0
                 peer.won += answers
                 if peer.joined:
                     self._replicas.feed(replica, peer)
@@ -274,8 +275,8 @@ class Sequencer:
                 peer.acked = max(peer.acked, index)
                 return
             expected = orders.read_index(detail) if reason is Refusal.GAP else None
-            if expected is not None and (peer.rewind or now >= peer.went_back_at + RETRY_LIMIT_S):
-                peer.went_back_at = now
+            if expected is not None and not (peer.joined and peer.went_back >= _GOES_BACK):
+                peer.went_back += peer.joined and not peer.rewind
                 peer.go_back(expected)
                 return
             if expected is not None:

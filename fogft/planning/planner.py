@@ -160,7 +160,10 @@ def plan_once(inputs: Inputs, health: Health) -> Plan:
         needs = needed_launches(sized.groups, counts, machines, history)
     room = wanted + spec.max_surge - machines.live
     first: Assessment | None = None
-    safe = any(s.serving and not s.placement.spot for s in (*machines.good, *machines.replaced))
+    safe = any(
+        (s.ever_ready if health.uplink_suspected else s.serving) and not s.placement.spot
+        for s in (*machines.good, *machines.replaced)
+    )
     begun = [
         need
         for need in needs

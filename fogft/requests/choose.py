@@ -152,7 +152,6 @@ class Failover(Learning):
         super().__init__()
         self._current: int | None = None
         self._failed = False  # the present one has: the next choice is another, if there is one
-        self._overflows: set[bytes] = set()  # requests that its link declined a moment ago
         self.switched = 0
         self.hedges = 0
 
@@ -166,10 +165,6 @@ class Failover(Learning):
         """Return another replica if none works on the request, or seems to."""
         if not candidates:
             return ()
-        if request in self._overflows:
-            self._overflows.remove(request)
-            if others := [replica for replica in candidates if replica != self._current]:
-                return self._asked(request, others[:1], now)
         for replica, begun in open.items():
             if not self._doubts(replica, begun, now):
                 overdue_at = self._replicas[replica].doubtful_at(begun)
@@ -201,10 +196,10 @@ class Failover(Learning):
         return (self._current,)
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
-        """Keep the current replica: a full window is not a failure. The request may overflow."""
+        """Switch away from a replica that has no room, or too slow a path."""
         self._replicas[replica].dropped(request)
         if full and replica == self._current:
-            self._overflows.add(request)
+            self._failed = True
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Switch away from a replica that failed."""
@@ -223,7 +218,6 @@ class Failover(Learning):
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
         """Switch away from a replica that missed a deadline: its service may hang."""
-        self._overflows.discard(request)
         if expired and self._current in open:
             self._failed = True
 

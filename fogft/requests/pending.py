@@ -40,7 +40,7 @@ POISON_DEATHS = 2  # once beside others, and then alone: that is no chance
 # So long after a death no request is at all replicas at once: another that kills would end them.
 CAUTIOUS_S = 60.0
 _SPREADS_AFTER_S = 1.0
-_LOOK_AGAIN_S = 0.02  # at a request for which nobody says when
+LOOK_AGAIN_S = 0.02  # at a request for which nobody says when
 _NO_WAIT = (0.0, RETRY_FIRST_S / 2)
 
 
@@ -135,7 +135,7 @@ class PendingRequests:
                 self._short[request] = again_at  # unless something happens to it
                 soonest = min(soonest, again_at)
             else:
-                soonest = min(soonest, now + _LOOK_AGAIN_S)
+                soonest = min(soonest, now + LOOK_AGAIN_S)
         choose.look_at = now if choose.news else soonest
         return steps
 
@@ -283,7 +283,7 @@ class PendingRequests:
                 # Beside others it is but suspected: any of them may have been the cause. So may be
                 # the replica, if it has died over this before while another works on it, or may.
                 others = {*pending.open, *self._able} - pending.died_at - pending.barred
-                again = replica in pending.died_at and bool(others)
+                again = pending.died_at == {replica} and bool(others)
                 alone = replica in pending.alone_at and not again
                 pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
                 pending.alone_until = (now + pending.deadline) / 2

@@ -110,6 +110,22 @@ def test_a_replica_that_lacks_all_it_is_sent_is_not_sent_it_for_ever(gap: int) -
     assert world.to_liar < 20 * 20
 
 
+def test_an_honest_replica_that_orders_overtake_is_sent_them_again_at_once() -> None:
+    """A large order is decompressed aside, and the small one after it comes first."""
+    world = World(counter, 0, replicas=1)
+    world.settle()
+    before = world.now
+    for _ in range(20):
+        for client in (0, 1):
+            world.ask(client, ("add", 1))
+        while world.letters:
+            world.deliver(-1)
+            for replica in world.working():
+                world.work(replica)
+    assert len(world.history) == 40
+    assert world.now == before
+
+
 def test_a_term_ends_where_more_replicas_obey_a_later_one() -> None:
     """The file of terms was lost: two of three have obeyed one that it knows nothing of."""
     sequencer = Sequencer(5)

@@ -185,6 +185,27 @@ def test_one_replica_alone_makes_no_request_poison(policy, refusal):
         assert ended
 
 
+@pytest.mark.parametrize("policy", [All, Auto, Failover])
+def test_a_request_that_kills_is_found_although_one_replica_is_busy(policy):
+    """That one refuses it for as long as it lasts."""
+    requests = PendingRequests(policy(), Spy(), counts_deaths=True)
+    deaths, verdict, now = 0, None, 0.0
+    step = list(requests.begin(A, b"x", (0, 1, 2), deadline=60.0, now=now))
+    while verdict is not Verdict.POISON and now < 60.0:
+        for replica in step:
+            busy = replica == 1
+            verdict = requests.refused(
+                A, replica, Refusal.OVERLOADED if busy else Refusal.CRASHED, now
+            )
+            deaths += not busy
+            if verdict is Verdict.POISON:
+                break
+        now += 0.02
+        step = [r for r in asked(requests, 0, 1, 2, now=now) if requests.attempt(A, r, now)]
+    assert verdict is Verdict.POISON
+    assert deaths <= 3
+
+
 def test_one_death_over_many_requests_is_one_alarm():
     """All that a service had ends with it: that others answer most of it makes nobody a liar."""
     requests = PendingRequests(All(), Spy(), counts_deaths=True)

@@ -75,8 +75,7 @@ class KnownRequests:
         self.held -= 1
         if job.size > SMALL_BYTES:
             self.large.remove(job.size)
-            self._large_of[job.robot] -= 1
-            self._large_of += Counter()  # those who have none are forgotten
+            self._large_of -= Counter((job.robot,))  # which forgets those who have none
         if answer is None:
             return
         job.answer = answer

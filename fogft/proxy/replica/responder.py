@@ -318,7 +318,7 @@ class Responder:
                 self._clock() - job.arrived, ended=job.passed_on and reason is not Refusal.EXPIRED
             )
             if reason is not Refusal.EXPIRED:
-                queue.free(job)
+                queue.free(job, taken=job.ticket is not None)
             elif job.passed_on:
                 queue.overdue(job, self._clock())
         for incoming in waiting:

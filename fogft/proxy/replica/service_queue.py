@@ -202,18 +202,17 @@ class ServiceQueue:
         if self._next is not None:  # only now does the service begin with it
             self._next.begun, self._next.level = now, self.at_work
             self._begun_last, self._next = now, None
-        self._unanswered = self.at_work
-        self._quiet_since = now if self.at_work else None
+        self._unanswered = self.at_work - (self.held_until < NEVER)  # a hold is no request
+        self._quiet_since = now if self._unanswered else None
 
-    def free(self, job: Job) -> None:
-        """Note that the service is done with a job."""
+    def free(self, job: Job, *, taken: bool = True) -> None:
+        """Note that the service is done with a job, or was not given it (`taken`)."""
         if job is self._next:
             self._next = None
         if job.passed_on:
             job.passed_on = False
             self.at_work -= 1
-            if not self.at_work:
-                self._batch = 0
+            self._batch = max(0, self._batch - (not taken)) if self.at_work else 0
             self._alone = False
             self._unanswered -= 1
             if not self._unanswered:

@@ -29,7 +29,7 @@ from fogft.requests.auto import Auto
 from fogft.requests.choose import All, Choose, Failover
 from fogft.requests.decide import Accepts, Decide, Means, Pending, Trace
 from fogft.requests.load import NEVER
-from fogft.requests.pending import PendingRequests, Verdict
+from fogft.requests.pending import LOOK_AGAIN_S, PendingRequests, Verdict
 from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
@@ -166,10 +166,9 @@ class Dispatcher:
         taken = self._sender.first(request, payload, links, chosen, timeout_s)
         if self._decide.replicates:
             self._sender.replicate()
-        if taken or not chosen:
-            self._wake(soon)
-        else:
-            self._wake()  # all of these declined, and another may take it
+        if chosen and not taken:  # all of these declined, and another may take it
+            soon = self._next_look = min(self._next_look, now + LOOK_AGAIN_S)
+        self._wake(soon)
         return True
 
     def _turn_away(self, request: bytes, size: int) -> None:

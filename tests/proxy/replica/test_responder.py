@@ -284,6 +284,42 @@ def test_an_action_server_that_takes_nothing_for_a_minute_or_is_new_is_asked_aga
     assert len(scene.client.calls) == 19
 
 
+def test_result_requests_that_cannot_be_sent_are_none_of_a_batch():
+    """Else those of one robot would keep the results of all until a goal ends."""
+    scene = Scene(results=["/s"], limits={"/s": 512})
+    scene.ask(A, remaining_s=3600.0)
+    call = scene.client.call
+    for n in range(1, 12):
+        scene.client.call = refuse_to_read
+        assert scene.ask(bytes([n]) * 16).outcome == ["refused malformed"]
+    scene.client.call = call
+    for n in range(20, 27):
+        scene.ask(bytes([n]) * 16, payload=b"result", remaining_s=3600.0)
+    assert [payload for payload, _ in scene.client.calls[1:]] == [b"result"] * 7 + [
+        goals.RESULT_OF_NONE
+    ]
+
+
+def refuse_to_read(payload: bytes, _: object) -> int:
+    raise Unreadable(f"{payload!r} is no request")
+
+
+def test_an_interrupted_service_that_has_nothing_left_does_not_hang():
+    """Its last request ends before its cancel service has answered."""
+    scene = Scene(limits={"/s": 1})
+    cancel = FakeClient()
+    scene.responder.use({"/s": scene.client}, {"/s": cancel})
+    scene.ask(A)
+    scene.clock.now += 0.5
+    scene.answer(0)
+    scene.ask(B)
+    scene.responder.cancel([B])
+    scene.answer(1)
+    cancel.calls[0][1](b"ok")
+    scene.clock.now += 70.0
+    assert scene.responder.hanging() == {}
+
+
 def test_what_waits_at_one_service_keeps_nothing_from_another():
     """An action's results may wait for hours."""
     scene = Scene(held_limit=4, limits={"/s": 512})

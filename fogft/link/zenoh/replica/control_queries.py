@@ -94,7 +94,8 @@ class ControlQueries:
     def later(self, greeting: frame.Greeting, job: Callable[[], None], asked: QueryEnd) -> None:
         """Run a job on the other thread; if its sender's queue is full, just end the query."""
         known = self.sessions.holder(greeting.token).encode()
-        if not self.work.offer(job, known or greeting.certificate, always=bool(known)):
+        lane = known or b"\0" + greeting.certificate  # which may say that it is anybody
+        if not self.work.offer(job, lane, always=bool(known)):
             self._end_of_stranger(asked, "")
 
     def _turn_away(self, asked: QueryEnd, refusal: str, why: str) -> None:
