@@ -42,7 +42,7 @@ class Ring:
         """Return messages after a number, oldest first: one, or up to a number of bytes."""
         found: list[Numbered] = []
         size = 0
-        for one in self._kept:
+        for one in tuple(self._kept):  # another thread may put one meanwhile
             if one[0] > number:
                 size += len(one[1])
                 if found and size > limit_bytes:
