@@ -249,8 +249,8 @@ def _clock(written: Any) -> int:
         minutes = int(match[1]) * 60 + int(match[2])
     if not 0 <= minutes <= 24 * 60:
         hint = "write hours and minutes: 8:30"
-        if isinstance(written, int):  # as YAML reads what looks like one
-            written = f"{written // 60}:{written % 60:02}"
+        if minutes > 0:  # YAML has read it as a number
+            written = f"{minutes // 60}:{minutes % 60:02}"
         raise SpecError(f"`{written!s:.40}` is not a time of the day", hint)
     return minutes * 60
 

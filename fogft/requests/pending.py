@@ -281,7 +281,7 @@ class PendingRequests:
             self._cautious_until = now + CAUTIOUS_S
             if pending is not None and replica in pending.open:
                 # Beside others it is but suspected: any of them may have been the cause. So may be
-                # the replica, if it has died over this before while another works on it, or may.
+                # the replica, if it alone has died over this, and another works on it, or may.
                 others = {*pending.open, *self._able} - pending.died_at - pending.barred
                 again = pending.died_at == {replica} and bool(others)
                 alone = replica in pending.alone_at and not again

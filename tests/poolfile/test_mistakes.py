@@ -121,6 +121,14 @@ def test_what_skypilot_would_take_for_something_else_is_told(task, keys, line, m
     assert first.line == line or first.message.startswith(f"p.yaml:{line}: ")
 
 
+@pytest.mark.parametrize(("written", "told"), [("25:00", "25:00"), ("true", "True"), ("-5", "-5")])
+def test_a_time_that_there_is_not_is_told_as_it_was_written(written, told):
+    """YAML 1.1 reads 25:00 as the number 1500."""
+    window = f"{{from: {written}, to: '6:00', replicas: 0}}"
+    [mistake] = found(SMALL % ("", f"schedule: {{time_zone: UTC, windows: [{window}]}}"))
+    assert f"`{told}` is not a time of the day" in str(mistake)
+
+
 def test_a_schedule_may_ask_for_no_replica_at_night():
     window = "{from: '20:00', to: '6:00', replicas: 0}"
     assert found(SMALL % ("", f"schedule: {{time_zone: UTC, windows: [{window}]}}")) == []

@@ -13,6 +13,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -126,17 +127,20 @@ class World:
             process.kill()
             process.wait()
         while left := self._workers():  # the API server's, each in a session of its own
-            for pid in left:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, signal.SIGKILL)
+            for pid, command in left.items():
+                # Python's tracker ends after all others, and removes their semaphores.
+                if b"resource_tracker" not in command:
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+            time.sleep(0.05)
 
-    def _workers(self) -> list[int]:
+    def _workers(self) -> dict[int, bytes]:
         """Find what was started in our folder and lives; SkyPilot overwrites all else of it."""
-        found = []
+        found = {}
         for entry in Path("/proc").glob("[0-9]*"):
             with contextlib.suppress(OSError):
                 if Path(os.readlink(entry / "cwd")).is_relative_to(self.folder):
-                    found.append(int(entry.name))
+                    found[int(entry.name)] = (entry / "cmdline").read_bytes()
         return found
 
 

@@ -76,7 +76,7 @@ class DialOut:
                 if self._wait(link, stop):
                     # Of each door another host, for who keeps strangers out at our own port.
                     ours = IPv4Address(0x7F000002 + crc32(door.encode()) % 0xFFFFFC)
-                    source = str(ours) if self._local[0] == "127.0.0.1" else "", 0
+                    source = (str(ours) if self._local[0] == "127.0.0.1" else "", 0)
                     own = socket.create_connection(self._local, _CONNECT_TIMEOUT_S, source)
                     self._tunnels.carry(link, own)
                     link = None
