@@ -19,9 +19,8 @@ from zenoh import handlers
 from fogft.link import frame
 from fogft.model import names
 from fogft.model.credentials import CredentialPaths
-from fogft.records.signing import Signer
-from tests.hostile.robot import PROBE, greeting, session_at, target
-from tests.link.wire_pool import hears, knows, request_id
+from tests.hostile.robot import PROBE, greets, session_at, target
+from tests.link.wire_pool import request_id
 
 LARGE_ANSWERS = 8  # so many fill what the network and the replica keep of them
 QUERIES = 20
@@ -30,20 +29,10 @@ QUERIES = 20
 def main() -> None:
     endpoint, *paths = sys.argv[1:]
     files, at = CredentialPaths(*map(Path, paths)), target(endpoint)
-    token, blocks = bytes(range(8)), zenoh.CongestionControl.BLOCK
-    bare = frame.encode_greeting(frame.Greeting(token))
+    reads_no_more = handlers.Callback(lambda reply: threading.Event().wait(), indirect=False)
     with session_at(at, files) as session:
-        hears(session, at.key)
-        knows(session, at.peer.id.slot, at.peer.id.pool_uid)
-        signed = greeting(Signer(files.certificate, files.key), at, token)
-        key = names.slot_key(*at.place, names.PROBE)
-        (said,) = session.get(key, payload=PROBE, attachment=signed)
-        assert said.ok is not None
-        reads_no_more = handlers.Callback(lambda reply: threading.Event().wait(), indirect=False)
-        answers = names.slot_key(*at.place, names.ANSWERS)
-        at_once = zenoh.ConsolidationMode.NONE
-        session.get(answers, reads_no_more, attachment=bare, timeout=1e6, consolidation=at_once)
-        time.sleep(0.5)
+        token = greets(session, files, at, reads_no_more)
+        bare = frame.encode_greeting(frame.Greeting(token))
         origin = frame.origin("eve", token)
         for number in range(LARGE_ANSWERS):
             header = frame.encode_request(request_id(number), 60.0, origin)
@@ -59,7 +48,7 @@ def main() -> None:
                     payload=PROBE if number % 2 else bytes(1 << 16),  # well made or not
                     attachment=bare,
                     timeout=60.0,
-                    congestion_control=blocks,
+                    congestion_control=zenoh.CongestionControl.BLOCK,
                 )
             time.sleep(0.05)
         threading.Event().wait()

@@ -6,7 +6,7 @@ import random
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -56,8 +56,13 @@ def greeting(signer: Signer, at: Target, token: bytes) -> bytes:
     return frame.encode_greeting(frame.Greeting(token, *signed))
 
 
-def greets(session: zenoh.Session, files: CredentialPaths, at: Target) -> bytes:
-    """Have a robot's bare session let in, and return its token."""
+def greets(
+    session: zenoh.Session,
+    files: CredentialPaths,
+    at: Target,
+    heard: Any = lambda reply: None,
+) -> bytes:
+    """Have a robot's bare session let in, which hears answers so; return its token."""
     hears(session, at.key)
     knows(session, at.peer.id.slot, at.peer.id.pool_uid)
     token = bytes(range(8))
@@ -66,7 +71,8 @@ def greets(session: zenoh.Session, files: CredentialPaths, at: Target) -> bytes:
     assert said.ok is not None
     bare = frame.encode_greeting(frame.Greeting(token))
     answers = names.slot_key(*at.place, names.ANSWERS)
-    session.get(answers, lambda reply: None, attachment=bare, timeout=1e6)
+    at_once = zenoh.ConsolidationMode.NONE
+    session.get(answers, heard, attachment=bare, timeout=1e6, consolidation=at_once)
     time.sleep(0.3)
     return token
 
