@@ -69,7 +69,7 @@ class Overhead(Defaults):
                         _warm_up(caller, service)
                     yield lambda condition, number: _call(caller, names[condition], number)
             finally:
-                beside.terminate()
+                beside.kill()  # now and then rclpy's `spin` does not hear SIGTERM
                 beside.wait()
 
     def findings(self, samples: Samples) -> Sequence[Finding]:
