@@ -116,10 +116,11 @@ def _scale(pool: str | None, by: int, *, wait: bool) -> None:
     from fogft.pool.commands.outcome import Settled
 
     store = composition.store_of(pool)
-    wishes = change(store, lambda now: intent.scale(now, store.spec(), by))
+    now = time.time()
+    wishes = change(store, lambda before: intent.scale(before, store.spec(), by, now))
     since = time.time()  # what was seen before says nothing of it
     spec = store.spec()
-    before, after = (one.wanted(spec) for one in wishes)
+    before, after = (one.wanted(spec, now) for one in wishes)
     if wait:
         progress.settle(store, Settled(since), f"does not have {after} replicas")
         output.done(f"`{store.name}` has {after} replicas (had {before})")

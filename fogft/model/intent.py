@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from fogft.errors import FogftError
 from fogft.model.choices import MAX_REPLICAS
 from fogft.model.plain import Count, Moment
+from fogft.model.schedule import wish
 from fogft.model.spec import PoolSpec
 
 LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
@@ -30,13 +31,13 @@ class Intent:
     began_at: Moment = 0.0  # when `max_hours` began anew; 0: they count from the pool's creation
     retried_at: Moment = 0.0
 
-    def wanted(self, spec: PoolSpec) -> int:
+    def wanted(self, spec: PoolSpec, now: float) -> int:
         """Return the number of replicas set by the user or the file; see `sizing` for its use."""
         if self.stopping:
             return 0
         if self.target is not None and self.is_scaled(spec):
             return self.target
-        return spec.replicas
+        return wish(spec, now).replicas
 
     def is_scaled(self, spec: PoolSpec) -> bool:
         """Whether the user's number of replicas overrides the file's."""
@@ -51,14 +52,14 @@ class Intent:
         return any((location + "/").startswith(place + "/") for place in self.excluded)
 
 
-def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
-    """Change the number of replicas by `change`."""
+def scale(intent: Intent, spec: PoolSpec, change: int, now: float) -> Intent:
+    """Change the number of replicas by `change`. At what the file wants, the file decides again."""
     if spec.availability is not None:
         raise FogftError(
             f"`{spec.name}` cannot be scaled: `availability` sets its number of replicas",
             "change `fogft.availability` or `fogft.replicas` in the pool file and run `fogft up`",
         )
-    wanted = intent.wanted(spec) + change
+    wanted = intent.wanted(spec, now) + change
     least = max((1, *(service.quorum for service in spec.services)))
     if not least <= wanted <= MAX_REPLICAS:
         limit = f"minimum is {least}" if wanted < least else f"maximum is {MAX_REPLICAS}"
@@ -68,7 +69,7 @@ def scale(intent: Intent, spec: PoolSpec, change: int) -> Intent:
             if least == 1
             else "a service needs that `quorum`: change it in the pool file and run `fogft up`",
         )
-    if wanted == spec.replicas:
+    if wanted == wish(spec, now).replicas:
         return replace(intent, target=None, scaled_from=None)
     return replace(intent, target=wanted, scaled_from=spec.replicas)
 

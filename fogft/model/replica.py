@@ -221,6 +221,11 @@ class Observed:
     gateway: tuple[Machine, ...] = ()  # that was launched; more than one while it is replaced
     standbys: tuple[Machine, ...] = ()  # machines that are stopped
 
+    @property
+    def wall_clock(self) -> float:
+        """The time of the week's windows: a clock that was set is believed after a while only."""
+        return self.now - self.doubt_s
+
     def below(self, cap: float | None) -> float | None:
         """Return what a cap leaves for replicas."""
         if cap is None:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from fogft.model.choices import ScheduleSpec, WindowSpec
 from fogft.model.keys import DAY_S
+from fogft.model.spec import PoolSpec
 
 
 class Wish(NamedTuple):
@@ -37,12 +38,15 @@ def window_at(schedule: ScheduleSpec, moment: float) -> WindowSpec | None:
     return next((w for w in schedule.windows if _holds(w, today, second)), None)
 
 
-def wish(schedule: ScheduleSpec, now: float, usual: Wish) -> Wish:
-    """Return the wanted replicas and cap now; `usual` applies outside windows.
+def wish(spec: PoolSpec, now: float) -> Wish:
+    """Return the replicas and the cap that the file wants now.
 
     Within `prelaunch_s` before a window that wants more replicas, its number holds, and
     the higher of both caps. Every minute of that time is looked at: a window may be shorter.
     """
+    schedule, usual = spec.schedule, Wish(spec.replicas, spec.max_usd_per_hour)
+    if schedule is None:
+        return usual
     current = best = _within(window_at(schedule, now), usual)
     ahead_s = 60.0
     while ahead_s < schedule.prelaunch_s + 60.0:

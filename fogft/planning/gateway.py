@@ -18,6 +18,7 @@ from fogft.model.replica import Machine, MachinePhase, Observed, Offer, ReplicaI
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import History
 from fogft.planning.observed.launches import given_up
+from fogft.planning.sizing import left_usd
 
 LOST_S = 60.0
 """Replaced when the robot's link to it was down for so long. Seconds."""
@@ -89,7 +90,7 @@ def plan_gateway(
     step = GatewayPlan(host, tuple(ends), frozenset(failed), note=awaited)
     if observed.gateway or not spec.gateway.launch or intent.stopping:
         return step
-    offer, note = _chosen(spec, intent, observed.now, history, offers)
+    offer, note = _chosen(spec, intent, observed, history, offers)
     return step._replace(launch=offer, note=note or awaited)
 
 
@@ -114,7 +115,7 @@ def _fault(
 
 
 def _chosen(
-    spec: PoolSpec, intent: Intent, now: float, history: History, offers: Sequence[Offer]
+    spec: PoolSpec, intent: Intent, observed: Observed, history: History, offers: Sequence[Offer]
 ) -> tuple[Offer | None, Reason | None]:
     """Return what to buy, or why nothing is bought now."""
     hopeless = given_up(history, version(spec), history.by_clock(intent.retried_at))
@@ -131,12 +132,11 @@ def _chosen(
         in_vain += 1
     ended = history.record(GATEWAY_SLOT, last)
     pause_s = min(LONGEST_PAUSE_S, PAUSE_S * 2**in_vain) if in_vain else 0.0
-    if ended is not None and 0 <= now - ended.closed_at < pause_s:
+    if ended is not None and 0 <= observed.now - ended.closed_at < pause_s:
         return None, None
     offer = good[in_vain % len(good)]
-    cap = spec.max_usd_per_hour
-    if cap is not None and offer.usd_per_hour > cap:
-        return None, Reason(
-            Cause.OVER_BUDGET, usd_per_hour=offer.usd_per_hour, limit_usd_per_hour=cap
-        )
+    left = left_usd(spec, observed)
+    if left is not None and offer.usd_per_hour > left:
+        dear = Reason(Cause.OVER_BUDGET, usd_per_hour=offer.usd_per_hour, limit_usd_per_hour=left)
+        return None, dear
     return offer, None

@@ -124,7 +124,7 @@ def _under_way(pool_uid: str, inputs: Inputs, decided: Plan) -> Inputs:
 def plan_once(inputs: Inputs, health: Health) -> Plan:
     spec, intent, observed, history = inputs
     if observed.machines is None:
-        known = size(inputs).total if observed.offers else intent.wanted(spec)
+        known = size(inputs).total if observed.offers else intent.wanted(spec, observed.wall_clock)
         return Plan(known, notes=(Reason(Cause.CLOUD_UNREACHABLE),))
     if intent.stopping:
         left = [judged.id for judged in health.replicas if judged.id not in observed.ending]

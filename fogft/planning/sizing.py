@@ -13,7 +13,7 @@ from fogft.model.groups import Group, groups_of, shares
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
-from fogft.model.schedule import Wish, wish
+from fogft.model.schedule import wish
 from fogft.model.spec import PoolSpec
 from fogft.planning.availability import expected, full_together, replicas_needed, unavailability_of
 from fogft.planning.listing import Listing, Scale, catalogue
@@ -55,22 +55,24 @@ def size(inputs: Inputs, running: int = 0) -> Size:
     """
     spec, intent, observed, _ = inputs
     groups = groups_of(spec)
-    usual = Wish(spec.replicas, spec.max_usd_per_hour)
-    notes: list[Reason] = []
-    clock = observed.now - observed.doubt_s
-    now = usual if spec.schedule is None else wish(spec.schedule, clock, usual)
-    if now.ahead:
-        notes.append(Reason(Cause.SCHEDULED_AHEAD))
+    now = wish(spec, observed.wall_clock)
+    notes = [Reason(Cause.SCHEDULED_AHEAD)] if now.ahead else []
     cap = observed.below(now.max_usd_per_hour)
-    total = now.replicas
-    if intent.stopping:
-        total = 0
-    elif intent.is_scaled(spec):
-        total = intent.wanted(spec)
-    elif spec.availability and now.replicas == spec.replicas:
+    total = intent.wanted(spec, observed.wall_clock)
+    if spec.availability and total == now.replicas == spec.replicas and not intent.is_scaled(spec):
         total, unmet = _for_target(inputs, spec.availability, cap, running)
         notes += because(unmet)
     return Size(groups, shares(groups, total), cap, tuple(notes))
+
+
+def left_usd(spec: PoolSpec, observed: Observed) -> float | None:
+    """Return the US dollars per hour that the cap leaves for further machines; None for no cap."""
+    cap = observed.below(wish(spec, observed.wall_clock).max_usd_per_hour)
+    if cap is None:
+        return None
+    today = {offer.placement: offer.usd_per_hour for offer in observed.offers}
+    runs = (today.get(m.placement, m.usd_per_hour) for m in observed.machines or ())
+    return max(0.0, cap - sum(runs))
 
 
 def spot_sold(inputs: Inputs) -> list[Placement]:

@@ -7,6 +7,7 @@ Not here: who stands in, and when (`fallback`).
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 from fogft.model.groups import group_of, groups_of, is_current, is_stand_in
 from fogft.model.reason import Cause, Reason
@@ -14,14 +15,20 @@ from fogft.model.replica import Observed, Offer, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.planner import PlannedEnd
+from fogft.planning.sizing import Inputs
 
 
 def started(
-    spec: PoolSpec, launches: Iterable[PlannedLaunch], observed: Observed
+    inputs: Inputs, launches: Iterable[PlannedLaunch], slack_usd: float | None = None
 ) -> Mapping[int, PlannedLaunch]:
-    """Return, by the slot of a planned stand-in, the start of a standby in its place."""
+    """Return, by the slot of a planned stand-in, the start of a standby in its place.
+
+    It may be of a type that came instead of the one ordered, where all types of a location are
+    about as dear. By `slack_usd` an hour it may cost more than what was planned; None for any.
+    """
+    spec, intent, observed, _ = inputs
     groups = groups_of(spec)
-    prices = {(o.group, o.placement): o for o in observed.offers}
+    prices = {(o.group, o.placement.supply): o for o in observed.offers}
     left = [m for m in observed.standbys if m.id not in observed.ending and is_current(spec, m)]
     found: dict[int, PlannedLaunch] = {}
     for planned in launches:
@@ -29,11 +36,14 @@ def started(
             continue
         group = group_of(groups, planned.slot)
         for machine in left:
-            offer = prices.get((group.name, machine.placement))
-            if group.owns(machine.id.slot) and offer is not None:
+            offer, place = prices.get((group.name, machine.placement.supply)), machine.placement
+            suits = group.owns(machine.id.slot) and not intent.is_excluded(place.location)
+            if offer is None or not suits:
+                continue
+            if slack_usd is None or offer.usd_per_hour <= planned.offer.usd_per_hour + slack_usd:
                 left.remove(machine)
-                id, why = machine.id, planned.reason
-                found[planned.slot] = PlannedLaunch(id.slot, id.generation, offer, why)
+                id, offer = machine.id, replace(offer, placement=place)
+                found[planned.slot] = PlannedLaunch(id.slot, id.generation, offer, planned.reason)
                 break
     return found
 

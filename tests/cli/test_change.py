@@ -12,7 +12,7 @@ import pytest
 from fogft import disk
 from fogft.cli import main, progress
 from fogft.pool.commands.status import Seen
-from tests.fakes.pools import FILE, REPLICA, STATUS, alive, lay_down
+from tests.fakes.pools import FILE, REPLICA, SPEC, STATUS, alive, lay_down
 
 
 def wish(paths):
@@ -88,6 +88,17 @@ def test_exclude_and_include(home, capsys):
         assert wish(paths)["excluded"] == []
         assert main.run(["include", "local/us-west-2"]) == 1
     assert "is not excluded" in capsys.readouterr().err
+
+
+def test_a_place_that_only_a_group_uses_is_excluded(home):
+    paths = lay_down(home)
+    groups = (
+        "  groups: [{name: a, replicas: 1, resources: {infra: local/us-west-1}},"
+        " {name: b, replicas: 2, resources: {infra: local/us-east-1}}]\n"
+    )
+    paths.spec.write_text(SPEC.replace("  replicas: 3\n", groups) + "resources: {infra: local}\n")
+    assert main.run(["exclude", "local/us-east-1"]) == 0
+    assert wish(paths)["excluded"] == ["local/us-east-1"]
 
 
 def test_retry_is_written_down(home, capsys):

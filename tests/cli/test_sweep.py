@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -72,6 +73,16 @@ def test_what_a_living_manager_owns_is_left_alone(home, machines, capsys):
     assert line.endswith("pool `planner` has no manager")
     assert "`fogft sweep --end` ends them" in err
     assert machines.machine(id), "nothing is ended unasked"
+
+
+def test_the_machines_of_a_pool_that_was_exported_are_left_to_who_manages_it_now(
+    home, machines, capsys
+):
+    paths = pool(home, machines)
+    id = machines.launch()
+    os.replace(paths.identity, paths.exported)
+    assert run(capsys, "--end", "--yes")[0] == []
+    assert machines.machine(id)
 
 
 def test_a_machine_whose_pool_was_lost_is_found_and_ended(home, machines, capsys, tmp_path):

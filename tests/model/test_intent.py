@@ -10,9 +10,12 @@ from hypothesis import strategies as st
 
 from fogft.errors import FogftError, StateError
 from fogft.model import intent as intents
+from fogft.model.choices import ScheduleSpec, WindowSpec
 from fogft.model.intent import Intent
 from fogft.model.plain import from_plain, stored, to_plain
 from tests.planning.pool_worlds import spec
+
+NOON = 43_200.0  # UTC
 
 counts = st.one_of(st.none(), st.integers(0, 16))
 made = st.builds(
@@ -52,33 +55,44 @@ def test_scale_adds_up_within_bounds(replicas: int, changes: list[int]) -> None:
     intent, wanted = Intent(), replicas
     for change in changes:
         try:
-            intent = intents.scale(intent, spec(replicas), change)
+            intent = intents.scale(intent, spec(replicas), change, NOON)
         except FogftError:
             assert not 1 <= wanted + change <= 16
         else:
             wanted += change
-        assert intent.wanted(spec(replicas)) == wanted
+        assert intent.wanted(spec(replicas), NOON) == wanted
+
+
+def test_within_a_window_scale_counts_from_what_runs_and_back_to_the_window_is_the_files():
+    """`scale up` never ends a replica, `scale down` never launches one."""
+    window = WindowSpec(frozenset(range(7)), 0, 86_400, 3, None)
+    pool = spec(1, schedule=ScheduleSpec("UTC", (window,)))
+    more = intents.scale(Intent(), pool, 1, NOON)
+    assert more.wanted(pool, NOON) == 4
+    fewer = intents.scale(more, pool, -3, NOON)
+    assert fewer.wanted(pool, NOON) == 1, "though the file says so"
+    assert intents.scale(fewer, pool, 2, NOON) == Intent()
 
 
 def test_scale_stays_until_the_files_own_number_changes() -> None:
     """Editing anything else keeps it; another `replicas` ends it for good."""
-    intent = intents.scale(Intent(), spec(2), 3)
+    intent = intents.scale(Intent(), spec(2), 3, NOON)
     edited = intents.file_changed(intent, spec(2), spec(2, task={"run": "other"}))
-    assert edited.wanted(spec(2)) == 5
+    assert edited.wanted(spec(2), NOON) == 5
     changed = intents.file_changed(edited, spec(2), spec(4))
-    assert changed.wanted(spec(4)) == 4
-    assert intents.file_changed(changed, spec(4), spec(2)).wanted(spec(2)) == 2
+    assert changed.wanted(spec(4), NOON) == 4
+    assert intents.file_changed(changed, spec(4), spec(2)).wanted(spec(2), NOON) == 2
 
 
 def test_scale_gives_way_even_if_nobody_told_it_of_the_change() -> None:
     """The number that it was scaled from must still stand in the file."""
-    assert intents.scale(Intent(), spec(2), 3).wanted(spec(4)) == 4
+    assert intents.scale(Intent(), spec(2), 3, NOON).wanted(spec(4), NOON) == 4
 
 
 def test_scale_below_one_is_refused_with_a_hint() -> None:
     """A pool without replicas is what `down` is for."""
     with pytest.raises(FogftError, match="the minimum is 1") as caught:
-        intents.scale(Intent(), spec(2), -2)
+        intents.scale(Intent(), spec(2), -2, NOON)
     assert "fogft down" in caught.value.hint
 
 
@@ -112,5 +126,5 @@ def test_what_is_no_location_is_refused(text: str) -> None:
 def test_stopping_wants_nothing_and_up_revives() -> None:
     """`down` wants none; a later `up` of the file takes that back."""
     stopping = replace(Intent(), stopping=True)
-    assert stopping.wanted(spec(2)) == 0
-    assert intents.file_changed(stopping, spec(2), spec(2)).wanted(spec(2)) == 2
+    assert stopping.wanted(spec(2), NOON) == 0
+    assert intents.file_changed(stopping, spec(2), spec(2)).wanted(spec(2), NOON) == 2

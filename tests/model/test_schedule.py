@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from fogft.model.choices import ScheduleSpec, WindowSpec
 from fogft.model.schedule import Wish, next_change, window_at, wish, zone
+from tests.planning.pool_worlds import spec
 
 HOUR = 3600
 PACIFIC = "America/Los_Angeles"
@@ -18,6 +19,11 @@ WORK = WindowSpec(frozenset(range(5)), 8 * HOUR, 18 * HOUR, 4, 3.0)
 NIGHT = WindowSpec(frozenset({4}), 22 * HOUR, 6 * HOUR, 1, 0.5)
 SCHEDULE = ScheduleSpec(PACIFIC, (WORK, NIGHT), prelaunch_s=600)
 USUAL = Wish(2, 1.0)
+
+
+def wished(schedule, now: float, usual: Wish = USUAL) -> Wish:
+    cap = usual.max_usd_per_hour
+    return wish(spec(usual.replicas, schedule=schedule, max_usd_per_hour=cap), now)
 
 
 def at(day: str, clock: str, tz: str = PACIFIC) -> float:
@@ -43,7 +49,7 @@ def at(day: str, clock: str, tz: str = PACIFIC) -> float:
     ],
 )
 def test_what_is_wanted_when(day, clock, replicas, cap, ahead):
-    assert wish(SCHEDULE, at(day, clock), USUAL) == Wish(replicas, cap, ahead)
+    assert wished(SCHEDULE, at(day, clock)) == Wish(replicas, cap, ahead)
 
 
 @pytest.mark.parametrize("day", ["2024-03-11", "2024-11-04"])  # after both changes of the clocks
@@ -56,8 +62,8 @@ def test_a_lower_cap_ahead_does_not_hold_yet():
     """Ahead of a window the higher of both caps holds: what runs is not to be ended for it."""
     thrifty = WindowSpec(frozenset(range(7)), 8 * HOUR, 18 * HOUR, 4, 0.5)
     schedule = ScheduleSpec("UTC", (thrifty,), prelaunch_s=600)
-    assert wish(schedule, at("2024-06-03", "07:55", "UTC"), USUAL) == Wish(4, 1.0, True)
-    assert wish(schedule, at("2024-06-03", "07:55", "UTC"), Wish(2, None)) == Wish(4, None, True)
+    assert wished(schedule, at("2024-06-03", "07:55", "UTC")) == Wish(4, 1.0, True)
+    assert wished(schedule, at("2024-06-03", "07:55", "UTC"), Wish(2, None)) == Wish(4, None, True)
 
 
 windows = st.builds(
@@ -80,7 +86,7 @@ def test_a_pool_is_asked_for_before_its_window_opens(found, now, prelaunch_s):
     schedule = ScheduleSpec("Europe/Berlin", tuple(found), prelaunch_s)
     later = window_at(schedule, now + prelaunch_s)
     wanted = USUAL.replicas if later is None or later.replicas is None else later.replicas
-    assert wish(schedule, now, USUAL).replicas >= wanted
+    assert wished(schedule, now).replicas >= wanted
 
 
 @given(
@@ -94,11 +100,11 @@ def test_nothing_changes_before_the_next_change(replicas, tz, minute, prelaunch_
     window = WindowSpec(frozenset(range(7)), 20 * HOUR, 6 * HOUR, replicas, None)
     schedule = ScheduleSpec(tz, (window,), prelaunch_s)
     now = at("2024-06-03", "00:00:00", tz) + 60 * minute
-    told = wish(schedule, now, USUAL)
+    told = wished(schedule, now)
     moment = now
     while moment + 60 < next_change(schedule, now):
         moment += 60
-        assert wish(schedule, moment, USUAL) == told
+        assert wished(schedule, moment) == told
 
 
 def test_an_unknown_zone_is_an_error():

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from fogft.model.choices import ScheduleSpec, WindowSpec
 from fogft.model.groups import GATEWAY_SLOT
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
@@ -47,9 +48,14 @@ def history(*events: tuple[float, EventKind, int], reason: Reason | None = None)
 
 
 def step(
-    *machines: Machine, past: History | None = None, intent=NOTHING, pool=POOL, up_at=None
+    *machines: Machine,
+    past: History | None = None,
+    intent=NOTHING,
+    pool=POOL,
+    up_at=None,
+    replicas: tuple[Machine, ...] = (),
 ) -> GatewayPlan:
-    observed = Observed(NOW, (), gateway=machines)
+    observed = Observed(NOW, replicas, gateway=machines)
     return plan_gateway(pool, intent, observed, past or History(), (CHEAP, DEAR), up_at=up_at)
 
 
@@ -60,6 +66,17 @@ def test_the_cheapest_is_bought_and_replicas_wait_for_its_address():
     assert step(machine(phase=MachinePhase.PROVISIONING, endpoint=None)).host == ""
     there = step(machine(), up_at=NOW)
     assert (there.host, there.launch, there.ends) == ("203.0.113.7", None, ())
+
+
+def test_the_cap_that_holds_now_is_for_replicas_and_gateway_together():
+    runs = (replace(machine(), id=ReplicaId(UID, 0, 1), usd_per_hour=0.05),)
+    for cap, bought in ((0.16, True), (0.14, False)):
+        found = step(pool=replace(POOL, max_usd_per_hour=cap), replicas=runs)
+        assert (found.launch is not None) is bought
+    assert found.note is not None
+    assert found.note.limit_usd_per_hour == pytest.approx(0.09)
+    window = WindowSpec(frozenset(range(7)), 0, 86_400, None, 0.05)
+    assert step(pool=replace(POOL, schedule=ScheduleSpec("UTC", (window,)))).launch is None
 
 
 def test_its_machine_is_small_and_where_the_replicas_may_be():

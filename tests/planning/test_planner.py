@@ -312,7 +312,7 @@ def test_budget_lets_a_silent_machine_make_room() -> None:
 
 def test_scale_up_fills_free_slots() -> None:
     """More replicas take the lowest free slots, all at once."""
-    intent = intents.scale(Intent(), spec(2), 2)
+    intent = intents.scale(Intent(), spec(2), 2, NOW)
     world = World(spec(2), intent=intent).having(replica(0), replica(2))
     assert launches(world) == ["1.1", "3.1"]
 

@@ -8,10 +8,13 @@ import pytest
 
 from fogft.model.choices import OnDemandSpec
 from fogft.model.groups import STAND_INS
+from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, Observed, Offer, Placement
 from fogft.planning.buying import PlannedLaunch
+from fogft.planning.observed.history import History
 from fogft.planning.planner import PlannedEnd
+from fogft.planning.sizing import Inputs
 from fogft.planning.standbys import started, stopped, superfluous
 from tests.planning.pool_worlds import NOW, ON_DEMAND, PLACES, UID, replica, spec
 
@@ -39,18 +42,22 @@ def bought(number: int = 1, generation: int = 7) -> PlannedLaunch:
     return PlannedLaunch(STAND_INS + number, generation, ON_DEMAND[1], NEEDED)
 
 
+def begun(launches, seen: Observed, given: Intent | None = None, slack_usd: float | None = None):
+    return started(Inputs(pool(2), given or Intent(), seen, History()), launches, slack_usd)
+
+
 # -- started ----------------------------------------------------------------------------------
 
 
 def test_what_stands_by_is_started_in_place_of_a_machine_that_would_be_bought():
     """Under its own id, at today's price of where it is."""
-    found = started(pool(), [bought()], observed(stands_by=(machine(),)))
+    found = begun([bought()], observed(stands_by=(machine(),)))
     assert found == {STAND_INS + 1: PlannedLaunch(STAND_INS, 1, ON_DEMAND[0], NEEDED)}
 
 
 def test_each_is_started_once_and_the_rest_is_bought():
     launches = [bought(1), bought(2), bought(3)]
-    found = started(pool(2), launches, observed(stands_by=(machine(0), machine(5))))
+    found = begun(launches, observed(stands_by=(machine(0), machine(5))))
     assert {slot: start.slot for slot, start in found.items()} == {
         STAND_INS + 1: STAND_INS,
         STAND_INS + 2: STAND_INS + 5,
@@ -59,7 +66,10 @@ def test_each_is_started_once_and_the_rest_is_bought():
 
 @pytest.mark.parametrize(
     "why",
-    ["another version", "is being ended", "its place is not offered", "a spot machine is wanted"],
+    [
+        *("another version", "is being ended", "its place is not offered"),
+        *("its place is excluded", "a spot machine is wanted"),
+    ],
 )
 def test_what_would_not_be_the_same_is_bought(why):
     standby = machine(
@@ -68,7 +78,18 @@ def test_what_would_not_be_the_same_is_bought(why):
     )
     ending = frozenset({standby.id} if why == "is being ended" else ())
     launch = bought()._replace(slot=0) if why == "a spot machine is wanted" else bought()
-    assert started(pool(), [launch], observed(stands_by=(standby,), ending=ending)) == {}
+    given = Intent(excluded=frozenset({"east"} if why == "its place is excluded" else ()))
+    assert begun([launch], observed(stands_by=(standby,), ending=ending), given) == {}
+
+
+def test_one_of_a_type_that_came_instead_is_started_too_within_the_cap():
+    """Its place may be dearer than what was planned, by so much at most."""
+    standby = machine(at=replace(on_demand(), instance="m6i.metal"))
+    seen = observed(stands_by=(standby,))
+    cheap = bought()._replace(offer=replace(ON_DEMAND[1], usd_per_hour=0.2))
+    [start] = begun([cheap], seen, slack_usd=0.11).values()
+    assert start.offer.placement == standby.placement
+    assert begun([cheap], seen, slack_usd=0.09) == {}
 
 
 # -- stopped ----------------------------------------------------------------------------------

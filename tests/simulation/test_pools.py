@@ -128,8 +128,8 @@ def kill_the_manager(world: World) -> None:
 def scale(world: World) -> None:
     store = world.store
     change = world.random.choice([-1, 1])
-    if 1 <= store.the_intent.wanted(store.the_spec) + change <= 5:
-        store.the_intent = intents.scale(store.the_intent, store.the_spec, change)
+    if 1 <= store.the_intent.wanted(store.the_spec, 0.0) + change <= 5:
+        store.the_intent = intents.scale(store.the_intent, store.the_spec, change, 0.0)
 
 
 def drain(world: World) -> None:

@@ -93,7 +93,7 @@ def test_a_cloud_that_cannot_tell_is_asked_again_and_nothing_is_concluded() -> N
 def test_a_machine_lost_while_it_is_set_up_is_noticed() -> None:
     """It never answered, so no silence tells: it is asked about from time to time."""
     world = whole_world(5, replicas=1)
-    world.store.the_intent = intents.scale(world.store.the_intent, world.spec, 1)
+    world.store.the_intent = intents.scale(world.store.the_intent, world.spec, 1, 0.0)
     world.tick()
     young = max(ours(world), key=lambda m: m.launched_at)
     world.frozen.add(young.id)  # it is set up, and nothing listens yet

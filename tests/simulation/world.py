@@ -241,7 +241,7 @@ class World:
     # -- laws ---------------------------------------------------------------------------------
 
     def wanted(self) -> int:
-        return self.store.the_intent.wanted(self.store.the_spec)
+        return self.store.the_intent.wanted(self.store.the_spec, self.now)
 
     def check_launch(self, order: Launch) -> None:
         assert order.id not in self._ordered, f"generation {order.id.short} is used twice"

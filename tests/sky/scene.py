@@ -22,6 +22,7 @@ class Scene:
     def __init__(self, folder: Path, *, with_provider: bool = True) -> None:
         self.folder = folder
         self.now = 1000.0
+        self.set_s = 0.0  # by so much the clock was set
         self.provider = ScriptedProvider()
         self.sky = ScriptedSky(self.provider)
         self._with_provider = with_provider
@@ -37,7 +38,8 @@ class Scene:
             self.sky,
             [self.provider] if self._with_provider else [],
             owner="ann@robot",
-            clock=lambda: self.now,
+            clock=lambda: self.now + self.set_s,
+            steady=lambda: self.now,
             submit=lambda run: self.pending_work.append(run),
             repeat=lambda step: self.repeated_work.append(step),
             sleep=self.pass_s,

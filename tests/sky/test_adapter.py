@@ -702,6 +702,7 @@ def test_a_process_killed_before_skypilot_heard_leaves_a_failed_launch_not_a_los
         scene.cloud.launch(scene.order())
     scene.cloud = scene.another_process()
     assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.work()
     scene.pass_s(ASK_LIMIT_S)
     scene.work()
     assert scene.machine().phase is MachinePhase.FAILED
@@ -912,11 +913,23 @@ def test_the_links_port_is_the_orders_and_survives_a_lost_journal(scene: Scene):
     assert (scene.machines(scene.another_process())[0].endpoint or "").endswith(":9000")
 
 
+@pytest.mark.parametrize("by_s", [3600.0, -3600.0])
+def test_a_clock_that_is_set_ends_no_launch_and_delays_the_end_of_none(scene: Scene, by_s):
+    scene.cloud.launch(scene.order())
+    scene.work()
+    scene.set_s += by_s
+    scene.work()
+    assert scene.machine().phase is MachinePhase.PROVISIONING
+    scene.pass_s(LAUNCH_LIMIT_S)
+    scene.work()
+    assert scene.machine().phase is MachinePhase.FAILED
+
+
 def test_a_failed_setup_is_seen_soon_though_the_clock_was_set_back(scene: Scene):
     scene.cloud.launch(scene.order())
     scene.sky.finish(NAME, JobState.SETTING_UP)
     scene.work(LOOKED_AT)
-    scene.pass_s(-3600.0)
+    scene.set_s -= 3600.0
     scene.sky.jobs[NAME] = JobState.SETUP_FAILED
     scene.work(LOOKED_AT)
     assert scene.machine().failure.cause is Cause.SETUP

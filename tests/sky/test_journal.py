@@ -50,6 +50,21 @@ def test_a_closed_entry_is_not_brought_back_by_an_update(tmp_path: Path):
     assert not journal.files(replica()).exists()
 
 
+def test_files_that_could_not_be_written_belong_to_an_entry_that_is_listed(tmp_path, monkeypatch):
+    """Else the key of a launch that was cut short would lie there for ever."""
+    journal = Journal(tmp_path)
+
+    def full(*_args, **_options):
+        raise StateError("no space is left")
+
+    monkeypatch.setattr("fogft.cloud.sky.journal.write_whole", full)
+    with pytest.raises(StateError):
+        journal.open(entry(), {"replica.key": b"k"})
+    [left] = journal.entries()
+    journal.close(left.id)
+    assert not journal.files(replica()).exists()
+
+
 def test_entries_of_one_pool(tmp_path: Path):
     journal = Journal(tmp_path)
     other = replica(uid="00000000000000bb")

@@ -160,6 +160,9 @@ def test_a_location_sells_its_cheapest_type_and_remembers_four_others(market: Ma
     within = market.prices.instead(offer.placement, 0.075 + MORE)
     assert [o.placement.instance for o in within] == ["m0.large", "m2.large"]
     assert market.prices.instead(WEST, None) == []
+    market.sky.sold = market.sky.sold[-1:]
+    market.prices.offers({"infra": "aws", "instance_type": "m7.large"})
+    assert market.prices.instead(offer.placement, None) == [], "who asked for it alone gets it"
 
 
 def test_what_the_accounts_quota_forbids_is_not_offered_and_the_quota_is_named(market: Market):

@@ -82,6 +82,7 @@ class SkyCloud:
     _: KW_ONLY
     owner: str  # whose machines these are, for their labels
     clock: Callable[[], float] = time.time
+    steady: Callable[[], float] = time.monotonic
     submit: Callable[[Callable[[], None]], object] = _on_thread
     repeat: Callable[[Callable[[], bool]], object] = _each_second  # until it returns False
     sleep: Callable[[float], object] = time.sleep
@@ -100,7 +101,9 @@ class SkyCloud:
         # The provider is asked where it can be: SkyPilot's own refresh waits.
         self.refresh = seen.refresh
         self._ending = Ending(sky, journal, self._census, self.sleep, clock)
-        self._following = Following(sky, journal, self._ending, clock, seen.clusters.forget)
+        self._following = Following(
+            sky, journal, self._ending, clock, self.steady, seen.clusters.forget
+        )
         self._prices = Prices(sky, by_name, clock, submit)
         self.left_out = self._prices.left_out
         self._lock = threading.Lock()

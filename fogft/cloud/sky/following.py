@@ -1,7 +1,8 @@
 """Follow a launch from the order to the running job, one level-triggered step at a time.
 
 A step can be lost, repeated, or made by another process after a crash. A launch that fails or hangs
-is taken down at once: a machine that was made before would cost money.
+is taken down at once: a machine that was made before would cost money. Time limits count from when
+this process first saw the launch.
 """
 
 import logging
@@ -42,28 +43,33 @@ class Following:
     journal: Journal
     ending: Ending
     clock: Callable[[], float]
+    steady: Callable[[], float]  # seconds that pass, however the clock is set
     on_move: Callable[[], None]
-    _job_not_before: dict[ReplicaId, float] = field(default_factory=dict, init=False)
+    # Of each launch under way: when this process first saw it so far, or may ask about its job.
+    _times: dict[ReplicaId, dict[str, float]] = field(default_factory=dict, init=False)
 
     def step(self, id: ReplicaId) -> bool:
         """Move a launch on; return whether there is more. CloudUnreachable: nothing was learned."""
+        steps = {
+            Stage.ASKING: self._asking,
+            Stage.LAUNCHING: self._launching,
+            Stage.SETTING_UP: self._setting_up,
+        }
         entry = self.journal.get(id)
-        if entry is None or entry.stage not in UNDER_WAY:
-            return False
-        if entry.stage is Stage.ASKING:
-            self._asking(entry)
-        elif entry.stage is Stage.LAUNCHING:
-            self._launching(entry)
-        else:
-            self._setting_up(entry)
-        entry = self.journal.get(id)
-        return entry is not None and entry.stage in UNDER_WAY
+        if entry is not None and (step := steps.get(entry.stage)) is not None:
+            self._times.setdefault(id, {}).setdefault("ordered", self.steady())
+            step(entry)
+            entry = self.journal.get(id)
+        if entry is not None and entry.stage in UNDER_WAY:
+            return True
+        self._times.pop(id, None)
+        return False
 
     def _asking(self, entry: Entry) -> None:
         requests = self.sky.launches(cluster_name(entry.id))
         if requests:
             self._move(entry, stage=Stage.LAUNCHING, request=requests[-1].id)
-        elif self._age(entry) > ASK_LIMIT_S:
+        elif self._lasts_s(entry) > ASK_LIMIT_S:
             self._fail(entry, Reason(Cause.ERROR, words="SkyPilot has no record of this launch"))
 
     def _launching(self, entry: Entry) -> None:
@@ -71,12 +77,10 @@ class Following:
         if request is None:
             self._lost(entry)
         elif request.queued:  # behind others, which takes them no time limit of its own
-            if self._age(entry) > SETUP_LIMIT_S:
+            if self._lasts_s(entry) > SETUP_LIMIT_S:
                 self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "queued"))
         elif request.active:
-            if not entry.begun_at:
-                self._move(entry, begun_at=self.clock())
-            elif self.clock() - entry.begun_at > LAUNCH_LIMIT_S:
+            if self._lasts_s(entry, "begun") > LAUNCH_LIMIT_S:
                 self._fail(entry, self._hung(entry, LAUNCH_LIMIT_S, "launching"))
             elif not entry.placement.spot and not entry.endpoint:
                 # Once its provider lists it: it is to end itself, and not merely stop.
@@ -114,9 +118,9 @@ class Following:
             self._fail(entry, Reason(Cause.ERROR, words="SkyPilot lost this launch"))
 
     def _setting_up(self, entry: Entry) -> None:
-        asked_at = self.clock()
-        not_before = self._job_not_before.setdefault(entry.id, asked_at + JOB_PAUSE_S)
-        if asked_at < not_before <= asked_at + _JOB_PAUSE_LIMIT_S:  # later: the clock was set back
+        asked_at = self.steady()
+        times = self._times[entry.id]
+        if asked_at < times.setdefault("job", asked_at + JOB_PAUSE_S):
             return
         self._find_endpoint(entry)
         try:
@@ -125,9 +129,9 @@ class Following:
             log.info("job_unknown replica=%s reason=%r", entry.id.short, str(error))
             job = JobState.PENDING
         finally:
-            now = self.clock()
+            now = self.steady()
             pause_s = max(JOB_PAUSE_S, 3 * (now - asked_at))
-            self._job_not_before[entry.id] = now + min(pause_s, _JOB_PAUSE_LIMIT_S)
+            times["job"] = now + min(pause_s, _JOB_PAUSE_LIMIT_S)
         if job is JobState.RUNNING:
             self._move(entry, stage=Stage.RUNNING, set_up_at=self.clock())
         elif job is JobState.SETUP_FAILED:
@@ -137,7 +141,9 @@ class Following:
         elif job is JobState.ENDED:
             words = "`fogft serve` exited on the machine" + self._job_tail(entry)
             self._fail(entry, Reason(Cause.ERROR, words=words))
-        elif self._age(entry) > SETUP_LIMIT_S:  # it was asked: who hears nothing concludes nothing
+        elif (
+            self._lasts_s(entry) > SETUP_LIMIT_S
+        ):  # it was asked: who hears nothing concludes nothing
             self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "setting up"))
 
     def _fail(self, entry: Entry, failure: Reason) -> None:
@@ -182,5 +188,6 @@ class Following:
             log.info("launch_moved replica=%s stage=%s", entry.id.short, moved.stage.value)
             self.on_move()
 
-    def _age(self, entry: Entry) -> float:
-        return self.clock() - entry.launched_at
+    def _lasts_s(self, entry: Entry, since: str = "ordered") -> float:
+        """Return for how long this process has seen a launch so far: a set clock ends none."""
+        return self.steady() - self._times[entry.id].setdefault(since, self.steady())

@@ -51,7 +51,6 @@ class Entry:
     request: str = ""  # SkyPilot's id of the launch request; empty until it is known
     # SkyPilot's number of the job that runs the server proxy; None until known
     job: int | None = None
-    begun_at: float = 0.0  # when a worker of SkyPilot's had begun; 0 while it is queued
     failure: Reason | None = None  # as in `Machine.failure`
     running_at: float = 0.0  # when SkyPilot said that the machine runs
     set_up_at: float = 0.0  # when the job was seen to run
@@ -76,9 +75,9 @@ class Journal:
                 return False
             folder = self.files(entry.id)
             make_folder(folder)
+            write_json(self._path(entry.id), to_plain(entry))  # first: what it lists is removed
             for name, content in files.items():
                 write_whole(folder / name, content)
-            write_json(self._path(entry.id), to_plain(entry))
             return True
 
     def update(self, id: ReplicaId, **changes: Any) -> Entry | None:

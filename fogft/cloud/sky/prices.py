@@ -73,9 +73,9 @@ class Prices:
 
     def instead(self, placement: Placement, limit: float | None) -> Sequence[Offer]:
         """Return what else would do for at most `limit` US dollars per hour, the cheapest first."""
-        found: Sequence[Offer] = ()
-        for sold in self._answers():
-            found = sold.instead.get(placement, found)
+        asked = [s.instead[placement] for s in self._answers() if placement in s.instead]
+        allowed = [{offer.placement for offer in others} for others in asked]  # by each who asked
+        found = [o for o in asked[0] if all(o.placement in a for a in allowed)] if asked else []
         return [offer for offer in found if limit is None or offer.usd_per_hour <= limit]
 
     def left_out(self) -> Sequence[str]:

@@ -18,7 +18,7 @@ from fogft.pool.commands.status import read, slots
 from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import PoolStore
-from fogft.pool.manager import configuration
+from fogft.pool.manager import configuration, offers
 from fogft.pool.manager.process_control import wait_for
 from fogft.poolfile.tree import nearest
 
@@ -48,8 +48,7 @@ def drain(store: PoolStore, slot: int, now: float) -> int:
 def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
     """Exclude a location; return whether that is new."""
     identity, place = store.identity(), intent.checked_location(location)
-    resources = store.spec().task.get("resources") or {}
-    sold = [offer.placement for offer in cloud.offers(resources)]
+    sold = [offer.placement for offer in offers.ask(cloud, store.spec())]
     known = {name for p in sold for name in (p.cloud, f"{p.cloud}/{p.region}", p.location)}
     if place not in known:
         meant = [f"{cloud}/{place}" for cloud in sorted({p.cloud for p in sold})]

@@ -15,7 +15,7 @@ from fogft.errors import CloudError, FogftError, PoolNotFound, StateError
 from fogft.model.replica import Machine
 from fogft.pool.commands.composition import LOCAL, SKY, make_cloud, pools
 from fogft.pool.folder.paths import PoolPaths, home
-from fogft.pool.folder.store import read_identity
+from fogft.pool.folder.store import Identity, read_identity
 
 _NAMED = 5  # in a sentence
 
@@ -101,8 +101,11 @@ def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
 
 
 def _pools() -> dict[str, tuple[str, bool]]:
-    """Return uid -> name and whether it has a manager, of the pools here."""
+    """Return uid -> name and whether it has a manager, of the pools here and those exported."""
     found = {}
+    for path in (home() / "pools").glob("*/exported.json"):
+        if (moved := disk.read_as(Identity, path)) is not None:
+            found[moved.uid] = (moved.name, True)
     for name in pools():
         paths = PoolPaths.of(name)
         try:

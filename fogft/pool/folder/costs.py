@@ -105,14 +105,20 @@ class CostBook:
             return
         self._looked_at = now
         spots = {m.placement for m in machines if m.placement.spot}
-        prices = {o.placement: o.usd_per_hour for o in offers if o.placement in spots}
+        prices = {
+            o.placement: o.usd_per_hour
+            for o in offers
+            if o.placement in spots and o.usd_per_hour >= 0.0
+        }
         seen: dict[str, Running] = {}
         gone = dict(self._running)
         for machine in machines:
             name, place = machine.id.short, machine.placement
             last = gone.pop(name, None)
             if machine.failure is not None and machine.failure.cause in _COST_NOTHING:
-                self._days = {key: one for key, one in self._days.items() if key[1] != name}
+                charged_h = sum(one.hours for key, one in self._days.items() if key[1] == name)
+                if charged_h * 3600 <= now - machine.launched_at + LOOK_EVERY_S:  # else it has run
+                    self._days = {key: one for key, one in self._days.items() if key[1] != name}
                 continue
             price = prices.get(place, machine.usd_per_hour)
             begun = last.until if last is not None else machine.launched_at or now

@@ -31,7 +31,6 @@ from fogft.model.replica import (
     ReplicaId,
     by_id,
 )
-from fogft.model.schedule import Wish, wish
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import certified
 from fogft.planning import lifetime, standbys
@@ -41,7 +40,7 @@ from fogft.planning.observed.history import EventKind, History, fault_of
 from fogft.planning.observed.refresh import Silent
 from fogft.planning.planner import Plan, PlannedLaunch, plan
 from fogft.planning.rollout import Update
-from fogft.planning.sizing import Inputs
+from fogft.planning.sizing import Inputs, left_usd
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import offers
 from fogft.pool.manager.event_recorder import EventRecorder
@@ -166,7 +165,8 @@ class Reconciler:
         over = lifetime.is_over(spec, begun_at, observed.now)
         if over:
             intent = replace(intent, stopping=True)
-        decided = plan(identity.uid, Inputs(spec, intent, observed, history), health=health)
+        inputs = Inputs(spec, intent, observed, history)
+        decided = plan(identity.uid, inputs, health=health)
         if over:
             reason = Reason(Cause.MAX_HOURS)
             ends = tuple(end._replace(reason=reason) for end in decided.terminations)
@@ -182,7 +182,7 @@ class Reconciler:
             awaited = self._tend_gateway(spec, intent, observed, history)
             if awaited is not None:
                 decided = decided._replace(launches=(), notes=(awaited, *decided.notes))
-            self._apply(identity, spec, observed, decided, history)
+            self._apply(identity, inputs, decided)
         return Tick(
             identity, spec, intent, observed, decided, self._membership, over, update, trial.file
         )
@@ -288,17 +288,17 @@ class Reconciler:
         if step.launch is not None:
             generation = history.generations[GATEWAY_SLOT] + 1
             order = self.gateway.order(spec, step.launch, generation)
-            self._order(order, Reason(Cause.NEW_SLOT))
+            limit = left_usd(spec, observed)
+            self._order(replace(order, limit_usd_per_hour=limit), Reason(Cause.NEW_SLOT))
         there = step.host and spec.dial_in == spec.gateway.endpoints(step.host)[2]
         return None if there or not spec.gateway.launch else step.note
 
-    def _apply(
-        self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan, history: History
-    ) -> None:
+    def _apply(self, identity: Identity, inputs: Inputs, plan: Plan) -> None:
+        spec, _, observed, history = inputs
         self._mark_draining(plan, observed, history)
         self._publish(identity, spec, observed, plan)
         slack = _slack(spec, observed, plan)
-        starts = standbys.started(spec, plan.launches, observed)
+        starts = standbys.started(inputs, plan.launches, slack)
         stops = standbys.stopped(spec, plan.terminations, observed) if self._stopping else {}
         for planned in plan.launches:
             started = starts.get(planned.slot)
@@ -427,14 +427,11 @@ class Reconciler:
 
 def _slack(spec: PoolSpec, observed: Observed, plan: Plan) -> float | None:
     """Return by how much each launch may cost more than planned; None where there is no cap."""
-    usual = Wish(spec.replicas, spec.max_usd_per_hour)
-    now = wish(spec.schedule, observed.now, usual) if spec.schedule is not None else usual
-    cap = observed.below(now.max_usd_per_hour)
-    if cap is None or not plan.launches:
+    left = left_usd(spec, observed)
+    if left is None or not plan.launches:
         return None
-    spent = sum(machine.usd_per_hour for machine in observed.machines or ())
-    spent += sum(planned.offer.usd_per_hour for planned in plan.launches)
-    return max(0.0, cap - spent) / len(plan.launches)
+    left -= sum(planned.offer.usd_per_hour for planned in plan.launches)
+    return max(0.0, left) / len(plan.launches)
 
 
 def _refusal(error: Exception) -> Cause | None:

@@ -45,12 +45,12 @@ def test_a_changed_file_is_applied_and_keeps_the_scale(scene: Scene) -> None:
     """A change elsewhere keeps `scale`; the file's own `replicas` ends it."""
     scene.write(replicas=2)
     store = scene.store
-    store.write_intent(intents.scale(store.intent(), store.spec(), 1))
+    store.write_intent(intents.scale(store.intent(), store.spec(), 1, 0.0))
     scene.write(replicas=2, timeout_s=9.0)
     assert store.spec().services[0].timeout_s == 9.0
-    assert store.intent().wanted(store.spec()) == 3
+    assert store.intent().wanted(store.spec(), 0.0) == 3
     scene.write(replicas=4)
-    assert store.intent().wanted(store.spec()) == 4
+    assert store.intent().wanted(store.spec(), 0.0) == 4
 
 
 def test_a_changed_file_never_looks_to_a_manager_as_if_scale_was_forgotten(
@@ -59,16 +59,16 @@ def test_a_changed_file_never_looks_to_a_manager_as_if_scale_was_forgotten(
     """It looks at each file that changes: the old file alone would have it end three replicas."""
     scene.write(replicas=2)
     store, write, seen = scene.store, disk.write_whole, set[int]()
-    store.write_intent(intents.scale(store.intent(), store.spec(), 3))
+    store.write_intent(intents.scale(store.intent(), store.spec(), 3, 0.0))
 
     def written(*given: Any, **how: Any) -> None:
         write(*given, **how)
-        seen.add(store.intent().wanted(store.spec()))
+        seen.add(store.intent().wanted(store.spec(), 0.0))
 
     monkeypatch.setattr(disk, "write_whole", written)
     scene.write(replicas=6)
     assert seen <= {5, 6}
-    assert store.intent().wanted(store.spec()) == 6
+    assert store.intent().wanted(store.spec(), 0.0) == 6
 
 
 def test_the_same_name_from_another_file_is_refused(scene: Scene) -> None:

@@ -63,6 +63,20 @@ def test_what_was_refused_costs_nothing(tmp_path: Path):
     assert kept.usd > 0.1
 
 
+def test_a_machine_that_has_run_has_cost_something_though_its_restart_is_refused(tmp_path: Path):
+    kept = book(tmp_path)
+    kept.look(NOON + 3600, [machine(0, STEADY)], [], 600.0)
+    full = Reason(Cause.CAPACITY, words="full")
+    kept.look(NOON + 3660, [machine(0, STEADY, launched_at=NOON + 3630, failure=full)], [], 600.0)
+    assert kept.usd == pytest.approx(0.1)
+
+
+def test_a_price_that_is_no_number_is_not_charged(tmp_path: Path):
+    kept = book(tmp_path)
+    kept.look(NOON + 3600, [machine(0)], [Offer(SPOT, float("nan"), "live")], 600.0)
+    assert kept.usd == pytest.approx(0.1)
+
+
 def test_a_clock_that_goes_back_charges_nothing_twice(tmp_path: Path):
     kept = book(tmp_path)
     kept.look(NOON + 3600, [machine(0)], [], 600.0)

@@ -47,7 +47,7 @@ def fill(home: Path) -> Path:
 
 
 def scaled_by(scene: Scene, more: int) -> None:
-    scene.store.write_intent(intent.scale(scene.store.intent(), scene.store.spec(), more))
+    scene.store.write_intent(intent.scale(scene.store.intent(), scene.store.spec(), more, 0.0))
 
 
 def beats(scene: Scene) -> int | None:

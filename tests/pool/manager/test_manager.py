@@ -98,7 +98,7 @@ def test_scale_and_file_change_reach_a_running_manager(scene: Scene) -> None:
     scene.write(replicas=1)
     scene.start_manager()
     scene.wait(lambda: scene.whole(1))
-    scene.store.write_intent(intents.scale(scene.store.intent(), scene.store.spec(), 2))
+    scene.store.write_intent(intents.scale(scene.store.intent(), scene.store.spec(), 2, 0.0))
     scene.wait(lambda: scene.whole(3))
     assert "timeout_s: 5.0" in scene.paths.proxy_config.read_text()
     scene.write(replicas=2, timeout_s=7.0)
