@@ -23,6 +23,7 @@ from fogft.link.port import (
     Peer,
     SendOptions,
 )
+from fogft.model import topic
 from fogft.model.choices import UplinkPolicy
 from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import LinkState
@@ -117,7 +118,8 @@ class UplinksLink:
         """Take one attempt, or return False when no uplink takes it. Never blocks."""
         attempt = _Attempt(service, payload, time.monotonic() + remaining_s, handling)
         with self._lock:
-            if self._closed or request_id in self._attempts:
+            overtakes = self._again and service.startswith(topic.PREFIX)
+            if self._closed or overtakes or request_id in self._attempts:
                 return False
             self._attempts[request_id] = attempt
         if self._send(request_id, attempt):

@@ -6,6 +6,7 @@ All methods are called under the dispatcher's lock, but `late`, which has its ow
 import bisect
 import threading
 from collections import defaultdict, deque
+from collections.abc import Collection
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -14,6 +15,7 @@ from fogft.model.refusal import Effect, Refusal
 from fogft.model.replica import short
 
 _LATENCIES_KEPT = 2000
+_GONE_KEPT = 100  # replicas
 # Upper bounds of the histogram's buckets, seconds: from a local call to a planner that thinks.
 BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 OUTCOMES_COUNTED = (
@@ -79,6 +81,11 @@ class Outcomes:
         """Count a valid response whose `ok_field` was false."""
         self.count["rejected"] += 1
         self.of[replica].ill += 1
+
+    def keep(self, replicas: Collection[int]) -> None:
+        """Note that there are only these replicas: of the others the latest are remembered."""
+        for gone in [key for key in self.of if key not in replicas][:-_GONE_KEPT]:
+            del self.of[gone]
 
     def late(self) -> None:
         """Count an answer that came too late to be used. Any thread; takes no other lock."""

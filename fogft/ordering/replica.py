@@ -84,11 +84,6 @@ class OrderedReplica(Generic[T]):
         """Whether it has the current state: it joined, and has caught up since."""
         return self.joined and self.serving and self.position.index >= self.goal
 
-    @property
-    def busy(self) -> bool:
-        """Whether the service is working on a request."""
-        return self._work is not None
-
     def works_on(self, serial: int) -> bool:
         """Whether the call with this serial was begun last, and has not ended."""
         return self._work is not None and self._work.serial == serial
@@ -113,6 +108,8 @@ class OrderedReplica(Generic[T]):
         self, op: Op, epoch: int, index: int, payload: bytes, *, robot: str, to: T
     ) -> list[Effect[T]]:
         """Take an order; `to` identifies the sender to answer."""
+        if self.robot not in ("", robot):  # whoever else knows the term
+            return [Refuse(to, Refusal.HELD, self.robot[:48])]
         if op is Op.CLAIM:
             return self._claim(epoch, robot, to)
         if epoch != self.promised:
@@ -134,8 +131,6 @@ class OrderedReplica(Generic[T]):
     def _claim(self, epoch: int, robot: str, to: T) -> list[Effect[T]]:
         if not self.serving:
             return [Refuse(to, Refusal.NOT_READY)]
-        if self.robot not in ("", robot):
-            return [Refuse(to, Refusal.HELD, self.robot[:48])]
         if epoch < self.promised:
             return [self._fenced(to)]
         out: list[Effect[T]] = []
@@ -152,7 +147,7 @@ class OrderedReplica(Generic[T]):
     def _join(self, payload: bytes, to: T) -> list[Effect[T]]:
         if not self.joined:
             at, goal = orders.decode_join(payload)
-            if not self.sound or self.busy or at != self.position:
+            if not self.sound or self._work is not None or at != self.position:
                 return [Refuse(to, Refusal.NOT_JOINED)]
             self.joined, self.goal = True, goal
             if at.epoch != self.promised:

@@ -4,10 +4,14 @@ Messages are numbered by their publisher from 1. A robot asks for what comes aft
 that it has, so whatever is lost on the way is asked for again.
 """
 
+import math
 from collections import deque
 from collections.abc import Iterable
+from enum import Enum, auto
 
 Numbered = tuple[int, bytes]
+_KNOWN = 64  # numbers of which it is known whether they were published
+_MASK = (1 << _KNOWN) - 1
 
 
 class Ring:
@@ -106,18 +110,61 @@ class Outbox:
         self._waiting = deque(sorted([*back, *self._waiting]))
 
 
-class Seen:
-    """Detects duplicate and reordered messages at a replica, by robot and its start."""
+class Judgement(Enum):
+    """What becomes of a robot's message at a replica."""
 
-    robots = 256  # that are remembered; the one that is longest silent is forgotten
+    NEW = auto()  # to be published
+    KNOWN = auto()  # it was published
+    LATE = auto()  # a later one was published: it never will be
+    EARLY = auto()  # an earlier one was refused, and comes again
+
+
+class _Start:
+    """A robot's messages since one of its starts."""
 
     def __init__(self) -> None:
-        self._last: dict[bytes, int] = {}
+        self.last = self.published = 0  # the last one's number; a bit for each, `last` the lowest
+        self.refused, self.until = math.inf, 0.0
 
-    def is_new(self, publisher: bytes, number: int) -> bool:
-        """Whether to publish a message; if so, it counts as seen."""
-        last = self._last.pop(publisher, 0)
-        self._last[publisher] = max(last, number)
-        if len(self._last) > self.robots:
-            del self._last[next(iter(self._last))]
-        return number > last
+
+class Seen:
+    """Judges the messages of one topic at a replica, by robot and its start."""
+
+    robots, starts = 256, 4  # that are remembered; those longest silent are forgotten
+    wait_s = 2.0  # so long later ones wait for one that was refused: its robot may have dropped it
+
+    def __init__(self) -> None:
+        self._of: dict[str, dict[bytes, _Start]] = {}
+
+    def judge(self, robot: str, session: bytes, number: int, now: float) -> Judgement:
+        """Return what to do with a message; if it is new, it counts as published."""
+        start = self._start(robot, session)
+        if self.is_early(robot, session, number, now):
+            return Judgement.EARLY
+        if number >= start.refused:
+            start.refused = math.inf
+        ahead = number - start.last
+        if ahead <= 0:
+            return Judgement.KNOWN if start.published >> -ahead & 1 else Judgement.LATE
+        start.published = (start.published << min(ahead, _KNOWN) | 1) & _MASK
+        start.last = number
+        return Judgement.NEW
+
+    def is_early(self, robot: str, session: bytes, number: int, now: float) -> bool:
+        """Whether an earlier one was refused, and will come again."""
+        start = self._start(robot, session)
+        return start.refused < number and now < start.until
+
+    def refused(self, robot: str, session: bytes, number: int, now: float) -> None:
+        """Note that a message was refused and comes again: none after it may overtake it."""
+        start = self._start(robot, session)
+        if number > start.last:
+            start.refused, start.until = min(start.refused, number), now + self.wait_s
+
+    def _start(self, robot: str, session: bytes) -> _Start:
+        starts = self._of[robot] = self._of.pop(robot, {})
+        start = starts[session] = starts.pop(session, _Start())
+        for of, most in ((self._of, self.robots), (starts, self.starts)):
+            if len(of) > most:
+                del of[next(iter(of))]  # type: ignore[arg-type]
+        return start

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from fogft.link.port import Answer, Peer
 from fogft.link.uplinks import UplinkDialer, choose
+from fogft.model import topic
 from fogft.model.choices import Freshness, UplinkPolicy, is_interface
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
@@ -165,6 +166,17 @@ def test_what_was_on_a_lost_uplink_goes_out_on_the_other():
     assert scene.uplinks[1].offered[0][2] == b"payload"
     scene.end(1, b"a")
     assert [a.payload for a in scene.owner.answers] == [b"a"]
+
+
+def test_no_message_of_a_topic_overtakes_what_waits_to_go_out_again():
+    """A request may: it is answered by itself."""
+    scene = Scene("prefer")
+    scene.offer()
+    scene.lose(0)
+    assert not scene.link.offer(f"{topic.PREFIX}/t", b"j" * 16, b"m", 5.0)
+    assert scene.offer(b"k" * 16)
+    scene.link.flush()
+    assert scene.link.offer(f"{topic.PREFIX}/t", b"j" * 16, b"m", 5.0)
 
 
 def test_with_no_uplink_left_it_is_lost_once():

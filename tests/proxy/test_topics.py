@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import threading
 from dataclasses import replace
@@ -16,7 +17,7 @@ from fogft.model.topic import Origin, Select, TopicSpec
 from fogft.proxy.replica.topics import HOLD_S, TopicsOnReplica
 from fogft.proxy.robot.topics import TopicsOnRobot
 from fogft.requests.load import Handling
-from fogft.topics.frames import encode_batch
+from fogft.topics.frames import encode_batch, encode_message
 from tests.fakes.proxy import Clock, FakeLink
 from tests.nightly import by_day
 
@@ -135,9 +136,9 @@ class World:
 
     def publish_all(self, slot: int) -> None:
         """Do what the replica's thread does, here."""
-        replica = self.replicas[slot]
-        replica.queue.put(None)
-        replica.publish()
+        for inbox in self.replicas[slot].inboxes:
+            inbox.close()
+            inbox.run()
 
 
 @pytest.fixture(autouse=True)
@@ -257,9 +258,52 @@ def test_a_robot_that_pulls_without_end_has_only_its_own_pulls_answered_early():
         greedy = Carried(world, 0, world.links[0], offered)
         greedy.robot = "eve"
         world.replicas[0].request(greedy)
+    world.publish_all(0)
     ours = world.links[0].offered[-1][1]
     assert len(world.answers) > 100
     assert ours not in {answer.request_id for _, answer in world.answers}
+
+
+def asked_by(world: World, robot: str, number: int, size: int) -> Carried:
+    payload = encode_message(robot.encode().ljust(8), number, bytes(size))
+    made = Carried(world, 0, world.links[0], (TO.key_name, os.urandom(16), payload, 10.0))
+    made.robot = robot
+    world.replicas[0].request(made)
+    return made
+
+
+@pytest.mark.parametrize("size", [10, 8 << 20])
+def test_what_waits_to_be_published_is_bounded_and_one_robot_cannot_have_all_of_it(size):
+    """What was refused comes again, and nothing after it is published before."""
+    world = World(TO)
+    eves = [asked_by(world, "eve", number, size) for number in range(1, 1100)]
+    assert 0 < sum(one.ended for one in eves) < len(eves)
+    ours = [asked_by(world, "ann", number, size) for number in range(1, 2 if size > 10 else 9)]
+    assert not any(one.ended for one in ours)
+    refused = min(number for number, one in enumerate(eves, 1) if one.ended)
+    world.publish_all(0)
+    assert {answer.refusal for _, answer in world.answers} == {None, Refusal.OVERLOADED}
+    published = len(world.nodes[0].published["/to"])
+    assert published < len(eves)
+    world.answers.clear()
+    later, again = asked_by(world, "eve", 2000, 1), asked_by(world, "eve", refused, 1)
+    world.publish_all(0)
+    ends = {answer.request_id: answer.refusal for _, answer in world.answers}
+    assert ends == {later.request_id: Refusal.OVERLOADED, again.request_id: None}
+    assert len(world.nodes[0].published["/to"]) == published + 1
+
+
+def test_while_messages_are_under_way_none_overtakes_them_by_a_new_connection():
+    world = World(TO)
+    say, link = world.robot_node.heard["/to"], world.links[0]
+    say(b"one")
+    before = link.offer
+    link.offer = lambda *words, **named: before(*words, **named)
+    say(b"two")
+    assert len(link.offered) == 1
+    world.carry()
+    world.carry()
+    assert world.nodes[0].published["/to"] == [b"one", b"two"]
 
 
 def test_who_comes_later_gets_what_is_latched_and_nothing_else():
@@ -363,6 +407,7 @@ def test_noise_from_a_peer_harms_nobody():
     back = World(BACK)
     request = Carried(back, 0, back.links[0], ("topic /back", b"i" * 16, b"noise", 5.0))
     back.replicas[0].request(request)
+    back.publish_all(0)
     assert back.answers[0][1].refusal == Refusal.MALFORMED
     back.answers.clear()
     back.robot.tick()

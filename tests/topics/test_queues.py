@@ -6,7 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.topics.queues import Outbox, Ring, Seen
+from fogft.topics.queues import Judgement, Outbox, Ring, Seen
+
+TWO_STARTS = ((b"a", 5), (b"a", 5), (b"a", 4), (b"b", 1))
+
+
+def is_new(seen: Seen, number: int, robot: str = "robot") -> bool:
+    return seen.judge(robot, b"start", number, 0.0) is Judgement.NEW
 
 
 @given(
@@ -71,7 +77,7 @@ def test_a_replica_gets_each_message_once_and_in_order(depth, window, steps):
             gone += outbox.put(put, b"%d" % put)
         elif step == "send" and (one := outbox.next()) is not None:
             under_way.append(one[0])
-            if seen.is_new(b"robot", one[0]):
+            if is_new(seen, one[0]):
                 got.append(one[0])
             assert len(under_way) <= window
         elif step == "confirm" and under_way:
@@ -85,7 +91,7 @@ def test_a_replica_gets_each_message_once_and_in_order(depth, window, steps):
     assert got == sorted(set(got))
     outbox.returned(under_way)
     while (one := outbox.next()) is not None:
-        if seen.is_new(b"robot", one[0]):
+        if is_new(seen, one[0]):
             got.append(one[0])
         outbox.confirmed(one[0])
     assert got == sorted(set(got))
@@ -101,13 +107,22 @@ def test_what_waits_for_a_replica_is_bounded_in_bytes_but_the_newest_stays():
 
 def test_a_robot_that_starts_anew_is_another_publisher():
     seen = Seen()
-    seen.robots = 2
-    assert [seen.is_new(b"a", 5), seen.is_new(b"a", 5), seen.is_new(b"a", 4)] == [
-        True,
-        False,
-        False,
-    ]
-    assert seen.is_new(b"b", 1)
+    judged = [seen.judge("r", session, number, 0.0) for session, number in TWO_STARTS]
+    assert judged == [Judgement.NEW, Judgement.KNOWN, Judgement.LATE, Judgement.NEW]
+
+
+def test_what_overtakes_a_refused_message_waits_for_it_but_not_for_ever():
+    seen = Seen()
+    assert seen.judge("r", b"a", 1, 0.0) is Judgement.NEW
+    seen.refused("r", b"a", 2, 0.0)
+    assert seen.judge("r", b"a", 4, 0.1) is Judgement.EARLY
+    for number in (2, 3, 4):
+        assert seen.judge("r", b"a", number, 0.2) is Judgement.NEW
+    seen.refused("r", b"a", 5, 1.0)
+    assert seen.judge("r", b"a", 7, 1.1) is Judgement.EARLY
+    assert seen.judge("r", b"a", 7, 3.0) is Judgement.NEW, "5 was dropped for newer ones"
+    assert seen.judge("r", b"a", 6, 3.0) is Judgement.LATE
+    assert seen.judge("r", b"a", 1 << 62, 3.0) is Judgement.NEW
 
 
 @pytest.mark.parametrize("latched", [False, True])
@@ -186,9 +201,12 @@ def test_an_earlier_one_that_is_under_way_holds_nothing_up():
 def test_the_robots_that_spoke_last_are_remembered():
     """One that is forgotten may begin anew: that is better than to remember all for ever."""
     seen = Seen()
-    seen.robots = 2
-    for robot, number in ((b"a", 9), (b"b", 9), (b"a", 10), (b"c", 9)):
-        assert seen.is_new(robot, number)
-    assert not seen.is_new(b"a", 10)
-    assert not seen.is_new(b"c", 9)
-    assert seen.is_new(b"b", 9), "it was silent for longest"
+    seen.robots, seen.starts = 2, 2
+    for robot, number in (("a", 9), ("b", 9), ("a", 10), ("c", 9)):
+        assert is_new(seen, number, robot)
+    assert not is_new(seen, 10, "a")
+    assert not is_new(seen, 9, "c")
+    assert is_new(seen, 9, "b"), "it was silent for longest"
+    for start in (b"1", b"2", b"3"):
+        assert seen.judge("b", start, 1, 0.0) is Judgement.NEW
+    assert not is_new(seen, 9, "c"), "who starts often puts out only itself"

@@ -14,7 +14,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 
-from fogft.byte_limit import ByteLimit
+from fogft.byte_limit import SharedByteLimit
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
@@ -37,8 +37,8 @@ _ONE_DEATH_S = 1.0
 class _Open:
     """A goal that has no answer yet."""
 
-    def __init__(self, payload: bytes) -> None:
-        self.payload = payload
+    def __init__(self, goal: bytes, robot: str, payload: bytes) -> None:
+        self.goal, self.robot, self.payload = goal, robot, payload
         self.size = len(payload)
         self.begun_at: float | None = None  # when the action server was given it
         self.unheard = False  # we would not hear its answer
@@ -57,11 +57,18 @@ class _ActionServer:
     def __init__(self) -> None:
         self.death = "", -math.inf  # what part was seen to be gone, and when
         self.open: dict[bytes, _Open] = {}  # oldest first
+        self.served: dict[str, float] = {}  # when each robot's latest goal was passed on
         self.accepted: OrderedDict[bytes, bytes] = OrderedDict()
 
     @property
-    def queue(self) -> list[bytes]:
-        return [goal for goal, known in self.open.items() if known.begun_at is None]
+    def queue(self) -> list[_Open]:
+        return [known for known in self.open.values() if known.begun_at is None]
+
+    def next(self) -> _Open | None:
+        """Return the oldest of the robot that was served least recently."""
+        return min(
+            self.queue, key=lambda known: self.served.get(known.robot, -math.inf), default=None
+        )
 
     def at_work(self, now: float) -> int:
         return sum(known.holds(now) for known in self.open.values())
@@ -113,7 +120,7 @@ class GoalsOnce:
             if answer is None and reason is None:
                 known = server.open.get(goal)
                 if known is None:
-                    known = server.open[goal] = _Open(incoming.payload)
+                    known = server.open[goal] = _Open(goal, incoming.robot, incoming.payload)
                 known.waiting.append((self._clock() + incoming.remaining_s, incoming))
         if answer is not None:
             incoming.reply(answer)
@@ -129,15 +136,16 @@ class GoalsOnce:
             return Refusal.EXPIRED
         if not self._is_ready(incoming.service) or incoming.service not in self._clients:
             return Refusal.NOT_READY
-        large = ByteLimit(_BYTES_LIMIT)
+        large = SharedByteLimit(_BYTES_LIMIT)
         for other in self._servers.values():
             for open in other.open.values():
-                large.add(open.size * max(len(open.waiting), 1))
-        if not large.has_room(len(incoming.payload)):
+                large.hold(open.robot, open.size * max(len(open.waiting), 1))
+        if not large.has_room_for(incoming.robot, len(incoming.payload)):
             return Refusal.OVERLOADED
         known = server.open.get(goal)
         if known is None:
-            return Refusal.OVERLOADED if len(server.queue) >= _QUEUE_LIMIT else None
+            own = sum(open.robot == incoming.robot for open in server.queue)
+            return Refusal.OVERLOADED if own >= _QUEUE_LIMIT else None
         return Refusal.OVERLOADED if len(known.waiting) >= _COPIES_LIMIT else None
 
     # -- to the action server -------------------------------------------------------------
@@ -147,12 +155,10 @@ class GoalsOnce:
         server = self._servers[service]
         while True:
             with self._lock:
-                now, queue = self._clock(), server.queue
-                if not queue or server.at_work(now) >= self.outstanding:
+                now, known = self._clock(), server.next()
+                if known is None or server.at_work(now) >= self.outstanding:
                     return
-                goal = queue[0]
-                known = server.open[goal]
-                known.begun_at = now
+                goal, known.begun_at, server.served[known.robot] = known.goal, now, now
                 payload, known.payload = known.payload, b""
                 client = self._clients.get(service)  # of this life: after a crash it is sent anew
             if client is None:
@@ -243,7 +249,7 @@ class GoalsOnce:
         """Note that our own node was lost: pending answers never come, and are not asked again."""
         for name, server in self._servers.items():
             with self._lock:
-                unbegun = [server.open.pop(goal) for goal in server.queue]
+                unbegun = [server.open.pop(known.goal) for known in server.queue]
                 for known in server.open.values():
                     known.unheard = True
             self._refuse(name, unbegun, Refusal.NOT_READY)

@@ -6,9 +6,9 @@ owner's lock.
 """
 
 import heapq
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 
-from fogft.byte_limit import SMALL_BYTES, ByteLimit
+from fogft.byte_limit import SharedByteLimit
 from fogft.proxy.replica.service_queue import Job
 
 COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
@@ -33,12 +33,7 @@ class KnownRequests:
         self._kept: OrderedDict[bytes, Job] = OrderedDict()
         self._kept_bytes = 0
         self.held = 0  # how many jobs are open
-        self.large = ByteLimit(held_bytes)
-        self._large_of: Counter[str] = Counter()  # how many large ones, by robot
-
-    def has_room(self, robot: str, size: int) -> bool:
-        """Whether a request fits: each robot may have one large one, whatever others hold."""
-        return size <= SMALL_BYTES or self.large.has_room(size) or not self._large_of[robot]
+        self.large = SharedByteLimit(held_bytes)
 
     def __len__(self) -> int:
         """Return how much is remembered: requests, answered ones included, and deadlines."""
@@ -66,16 +61,12 @@ class KnownRequests:
             self._deadlines = [due for due, job in live if job and job.deadline == due[0]]
             heapq.heapify(self._deadlines)
         self.held += 1
-        if job.size > SMALL_BYTES:
-            self.large.add(job.size)
-            self._large_of[job.robot] += 1
+        self.large.hold(job.robot, job.size)
 
     def end(self, job: Job, answer: bytes | None = None) -> None:
         """Note that a job is done; its answer is kept for copies, within the bounds."""
         self.held -= 1
-        if job.size > SMALL_BYTES:
-            self.large.remove(job.size)
-            self._large_of -= Counter((job.robot,))  # which forgets those who have none
+        self.large.let_go(job.robot, job.size)
         if answer is None:
             return
         job.answer = answer

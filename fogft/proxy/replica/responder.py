@@ -190,7 +190,7 @@ class Responder:
         deadline = now + remaining_s
         full = queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s)
         size = len(incoming.payload)
-        if full or not self.known.has_room(incoming.robot, size):
+        if full or not self.known.large.has_room_for(incoming.robot, size):
             return Refusal.OVERLOADED, None
         if queue.waiting() + queue.at_work < self.held_limit:
             return None, None
@@ -310,7 +310,8 @@ class Responder:
             if job is None or job.waiting is None:
                 return
             self.known.end(job)
-            self.known.forget(job)
+            if reason is not Refusal.EXPIRED or not job.passed_on:  # else it is still at work
+                self.known.forget(job)
             waiting, job.waiting = job.waiting, None
             queue = self._queues[job.service]
             queue.remove(job)

@@ -6,21 +6,25 @@ Design: docs/design/topics.md.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from itertools import count
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
 
+from fogft.byte_limit import SharedByteLimit
 from fogft.errors import FrameError, RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, TopicSpec
+from fogft.requests.fair_queue import FairQueue
 from fogft.topics import frames
-from fogft.topics.queues import Ring, Seen
+from fogft.topics.queues import Judgement, Ring, Seen
 
 if TYPE_CHECKING:
     from fogft.ros.node import SerialisedNode
@@ -32,6 +36,8 @@ HOLD_S = 2.0
 LOOK_EVERY_S = 2.0  # whether publishers are heard
 _HELD_LIMIT = 64  # pulls of one topic; beyond it one of whom has most is answered with nothing
 _BATCH_BYTES = 8 << 20
+_WAITING_LIMIT = 1024  # messages that wait to be published, or pulls to be answered
+_WAITING_BYTES = 64 << 20
 
 
 class _Pull(NamedTuple):
@@ -97,6 +103,52 @@ class _Outgoing:
         pull.incoming.reply(frames.encode_batch(self._session, last, found))
 
 
+class _Inbox:
+    """What robots have sent, for a thread of its own: robots in turns, each in its order."""
+
+    def __init__(
+        self, take: Callable[[Incoming], None], refuse: Callable[[Incoming], None]
+    ) -> None:
+        self._take, self._refuse = take, refuse
+        self._lock = threading.Lock()
+        self._waiting: FairQueue[Incoming] = FairQueue()
+        self._large = SharedByteLimit(_WAITING_BYTES)
+        self._count = count()
+        self._due: SimpleQueue[bool] = SimpleQueue()  # an entry for each that was put in
+
+    def put(self, incoming: Incoming) -> None:
+        """Take in a message or a pull; refuse it, or another one, where there is no room."""
+        robot, size = incoming.robot, len(incoming.payload)
+        excess: Incoming | None = None
+        with self._lock:
+            if not self._large.has_room_for(robot, size):
+                excess = incoming
+            elif self._waiting.size() >= _WAITING_LIMIT:
+                excess = self._waiting.evict(robot, 0.0) or incoming
+            if excess is not incoming:
+                self._large.hold(robot, size)
+                self._waiting.put(b"%d" % next(self._count), robot, 0.0, incoming)
+                self._due.put(True)
+            if excess is not None and excess is not incoming:
+                self._large.let_go(excess.robot, len(excess.payload))
+        if excess is not None:
+            self._refuse(excess)
+
+    def run(self) -> None:
+        """Take what comes until closed."""
+        while self._due.get():
+            with self._lock:
+                incoming = self._waiting.take()
+                if incoming is not None:
+                    self._large.let_go(incoming.robot, len(incoming.payload))
+            if incoming is not None:
+                self._take(incoming)
+
+    def close(self) -> None:
+        """End `run`, once what waits now has been taken."""
+        self._due.put(False)
+
+
 class TopicsOnReplica:
     """The topics of one replica."""
 
@@ -106,6 +158,7 @@ class TopicsOnReplica:
         self._topics = {topic.key_name: topic for topic in topics}
         self.types = {name: topic.type for name, topic in self._topics.items()}
         self._clock = clock
+        self._lock = threading.Lock()  # of `_seen`
         session = os.urandom(frames.SESSION_BYTES)
         self._outgoing = {
             name: _Outgoing(topic, session, clock)
@@ -122,9 +175,9 @@ class TopicsOnReplica:
             name: Ring(topic.depth if topic.latched else 0, latched=True)
             for name, topic in self._topics.items()
         }
-        # Publishing may block for a moment, and the wire's threads must not.
-        self.queue: SimpleQueue[Incoming | None] = SimpleQueue()
-        self._thread: threading.Thread | None = None
+        # Publishing may block for a moment, and answers are copied: the wire's threads must not.
+        self.inboxes = _Inbox(self._publish, self._turn_away), _Inbox(self._answer, _overloaded)
+        self._running = False
 
     def __bool__(self) -> bool:
         return bool(self._topics)
@@ -142,9 +195,10 @@ class TopicsOnReplica:
         self._publishers, self._subscriptions = {}, {}
         if node is None:
             return
-        if self._thread is None:
-            self._thread = threading.Thread(target=self.publish, name="fogft-topics", daemon=True)
-            self._thread.start()
+        if not self._running:
+            self._running = True
+            for inbox in self.inboxes:
+                threading.Thread(target=inbox.run, name="fogft-topics", daemon=True).start()
         for name, topic in self._topics.items():
             try:
                 if topic.origin is Origin.ROBOT:
@@ -176,12 +230,22 @@ class TopicsOnReplica:
 
     def request(self, incoming: Incoming) -> None:
         """Take a message or a pull from the link. Never blocks."""
-        outgoing = self._outgoing.get(incoming.service)
-        if outgoing is None:
-            self.queue.put(incoming)
+        asks = incoming.service in self._outgoing
+        if not asks and self._is_early(incoming):
+            incoming.refuse(Refusal.OVERLOADED)
             return
+        self.inboxes[asks].put(incoming)
+
+    def _is_early(self, incoming: Incoming) -> bool:
+        with contextlib.suppress(FrameError), self._lock:
+            place = frames.decode_place(incoming.payload)
+            seen = self._seen[incoming.service]
+            return seen.is_early(incoming.robot, *place, self._clock())
+        return False
+
+    def _answer(self, incoming: Incoming) -> None:
         try:
-            outgoing.pulled(incoming)
+            self._outgoing[incoming.service].pulled(incoming)
         except FrameError:
             incoming.refuse(Refusal.MALFORMED)
 
@@ -195,27 +259,48 @@ class TopicsOnReplica:
             for name, subscription in self._subscriptions.items():
                 self._note(name, subscription.mismatch())
 
-    def publish(self) -> None:
-        """Publish queued messages, and confirm them to the robots, until closed."""
-        while (incoming := self.queue.get()) is not None:
-            try:
-                session, number, message = frames.decode_message(incoming.payload)
-                publisher = self._publishers.get(incoming.service)
-                if publisher is None:
-                    incoming.refuse(Refusal.NOT_READY)
-                    continue
-                publisher.check(message)
-                if self._seen[incoming.service].is_new(session, number):
-                    self._latched[incoming.service].put(message)
-                    publisher.publish(message)
-                incoming.reply(b"")
-            except (FrameError, Unreadable) as error:
-                log.warning("message_refused topic=%s reason=%r", incoming.service, str(error))
-                incoming.refuse(Refusal.MALFORMED)
-            except Exception:
-                log.exception("message_not_published topic=%s", incoming.service)
-                incoming.refuse(Refusal.NOT_READY)
+    def _publish(self, incoming: Incoming) -> None:
+        """Publish a message, and confirm it to its robot."""
+        name, robot = incoming.service, incoming.robot
+        try:
+            session, number, message = frames.decode_message(incoming.payload)
+            publisher = self._publishers.get(name)
+            if publisher is None:
+                self._turn_away(incoming, Refusal.NOT_READY)
+                return
+            publisher.check(message)
+            with self._lock:
+                judged = self._seen[name].judge(robot, session, number, self._clock())
+            if judged is Judgement.EARLY:
+                incoming.refuse(Refusal.OVERLOADED)
+                return
+            if judged is Judgement.LATE:
+                raise FrameError("a later one was published")
+            if judged is Judgement.NEW:
+                self._latched[name].put(message)
+                publisher.publish(message)
+            incoming.reply(b"")
+        except (FrameError, Unreadable) as error:
+            log.warning("message_refused topic=%s reason=%r", name, str(error))
+            incoming.refuse(Refusal.MALFORMED)
+        except Exception:
+            log.exception("message_not_published topic=%s", name)
+            incoming.refuse(Refusal.NOT_READY)
+
+    def _turn_away(self, incoming: Incoming, reason: Refusal = Refusal.OVERLOADED) -> None:
+        """Refuse a message that its robot sends again; those after it wait for it."""
+        with contextlib.suppress(FrameError):
+            place = frames.decode_place(incoming.payload)
+            with self._lock:
+                seen = self._seen[incoming.service]
+                seen.refused(incoming.robot, *place, self._clock())
+        incoming.refuse(reason)
 
     def close(self) -> None:
         """Stop publishing."""
-        self.queue.put(None)
+        for inbox in self.inboxes:
+            inbox.close()
+
+
+def _overloaded(incoming: Incoming) -> None:
+    incoming.refuse(Refusal.OVERLOADED)

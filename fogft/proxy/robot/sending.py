@@ -76,7 +76,9 @@ class Sender:
             self._ledger.requests.left(self.links.keys() - routed.keys())
             self.links = routed
             if versions:
-                self._ledger.requests.choose.keep(routed.keys() | {id.key for id in versions})
+                members = routed.keys() | {id.key for id in versions}
+                self._ledger.requests.choose.keep(members)
+                self._ledger.outcomes.keep(members)
             if replication is None or not replication.sends_requests:
                 self.able = tuple(routed)
                 self._ledger.requests.came(added)

@@ -52,6 +52,7 @@ class _Way:
         self.session, self.after = frames.NO_SESSION, 0
         self.rest_until = self.pulled_at = 0.0
         self.out: dict[bytes, int] = {}  # request id -> a message's number; 0 for a pull
+        self.offer: Callable[..., bool] | None = None  # of the connection that they are on
 
 
 class RobotTopic:
@@ -164,6 +165,9 @@ class RobotTopic:
                 self._offer(way, link, 0, pull, _PULL_S)
 
     def _send_messages(self, way: _Way, link: Link) -> None:
+        if way.out and way.offer != link.offer:
+            return  # by a new connection they would be overtaken
+        way.offer = link.offer
         while (one := way.outbox.next()) is not None:
             frame = frames.encode_message(self._session, *one)
             if not self._offer(way, link, one[0], frame, _MESSAGE_S):

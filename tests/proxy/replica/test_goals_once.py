@@ -32,12 +32,18 @@ class Scene:
         return self.clients[SERVICE].calls
 
     def give(
-        self, goal: bytes, service: str = SERVICE, remaining_s: float = 5.0, more: bytes = b""
+        self,
+        goal: bytes,
+        service: str = SERVICE,
+        remaining_s: float = 5.0,
+        more: bytes = b"",
+        robot: str = "robot",
     ) -> FakeIncoming:
         """Every copy of a goal has another request id."""
         self.asked += 1
         id, payload = self.asked.to_bytes(16, "big"), HEADER + goal * 16 + b"5" + more
         incoming = FakeIncoming(id, payload, service=service, remaining_s=remaining_s)
+        incoming.robot = robot
         self.goals.request(incoming)
         return incoming
 
@@ -133,6 +139,21 @@ def test_no_more_are_given_at_once_than_its_queue_holds():
         scene.say(ACCEPTED, n)
     assert len(scene.calls) == 3
     assert scene.goals.in_flight == 0
+
+
+def test_one_robot_that_has_many_goals_keeps_no_other_out():
+    scene = Scene(outstanding=1)
+    for n in range(200):
+        scene.give(bytes([n]), more=b"%03d" % n, robot="eve", remaining_s=3600.0)
+    ours = scene.give(b"\xff", robot="ann")
+    scene.say(ACCEPTED)
+    assert scene.calls[-1][0].startswith(HEADER + b"\xff"), "robots take turns"
+    scene.say(ACCEPTED)
+    assert ours.outcome == [ACCEPTED]
+    large = Scene()
+    large.give(b"a", more=bytes(60 << 20), robot="eve")
+    assert large.give(b"b", more=bytes(5 << 20), robot="eve").outcome == ["refused overloaded"]
+    assert large.give(b"c", more=bytes(5 << 20), robot="ann").outcome == []
 
 
 def test_who_does_not_answer_for_long_is_given_others_and_may_answer_yet():

@@ -12,6 +12,7 @@ from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.state import StateService, StateSpec
+from fogft.ordering.orders import Op, decode, encode
 from fogft.ordering.peer import Peer
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.robot.dispatcher import Dispatcher
@@ -461,6 +462,20 @@ def test_an_order_of_another_robot_is_refused(scene):
     other.dispatcher.tick()
     assert "`r`" in other.dispatcher.report()["order"]["trouble"]
     assert scene.dispatcher.able
+
+
+@pytest.mark.parametrize("op", [op for op in Op if op is not Op.CLAIM])
+def test_who_knows_the_term_of_another_robot_can_neither_order_nor_read(scene, op):
+    scene.run()
+    scene.dispatcher.submit(b"secret", "h")
+    _, epoch, first = decode(scene.links[0].offered[-1][1])
+    scene.run()
+    calls = len(scene.clients[0].service.calls)
+    for index in (first, first + 1):
+        eves = Incoming(scene, scene.links[0], encode(op, epoch, index), b"evil", robot="x")
+        scene.responders[0].request(eves)
+        assert scene.answers[-1][1].refusal == Refusal.HELD
+    assert len(scene.clients[0].service.calls) == calls
 
 
 def test_noise_is_refused(scene):

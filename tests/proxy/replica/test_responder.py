@@ -41,6 +41,17 @@ class Scene:
         self.client.calls[n][1](payload)
 
 
+def test_a_copy_that_comes_after_the_deadline_of_the_first_is_not_run_beside_it():
+    """Of two uplinks the far one leaves a replica less time than the near one."""
+    scene = Scene()
+    first = scene.ask(A, remaining_s=0.7)
+    scene.clock.now += 0.75
+    scene.responder.tick()
+    assert first.outcome == ["refused expired"]
+    scene.ask(A, remaining_s=0.2)
+    assert len(scene.client.calls) == 1
+
+
 def test_a_request_is_run_and_answered():
     scene = Scene()
     incoming = scene.ask(A, payload=b"q")

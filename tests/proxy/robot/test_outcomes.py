@@ -34,3 +34,13 @@ def test_a_refusal_of_no_request_is_counted_and_held_against_nobody():
     outcomes.refusal(Refusal.CRASHED)
     assert outcomes.refused == {Refusal.CRASHED: 1}
     assert not outcomes.of
+
+
+def test_of_replicas_that_are_gone_the_latest_are_remembered():
+    outcomes = Outcomes()
+    for replica in range(5000):
+        outcomes.won(replica, 0.1, 1)
+        outcomes.keep({0, replica})
+    assert 100 <= len(outcomes.report()["won"]) <= 102
+    assert outcomes.of[0].won == 1
+    assert outcomes.count["answered"] == 5000

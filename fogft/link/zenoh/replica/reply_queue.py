@@ -73,6 +73,7 @@ def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
 
 
 REPLIES_LIMIT = 1024
+_REFUSALS_LIMIT = 4 * REPLIES_LIMIT  # with those that stand for dropped replies
 BYTES_LIMIT = 64 << 20
 _END_LOOK_S = 1.0  # nobody waits for an end
 
@@ -152,9 +153,9 @@ class ReplyQueues:
                 self.counters.add(counted)
                 return
         with self._lock:
-            if self._closed:
+            queue = None if self._closed else self._queue(token, robot)
+            if queue is None or queue.waiting >= _REFUSALS_LIMIT:
                 return
-            queue = self._queue(token, robot)
             dropped = queue.waiting >= REPLIES_LIMIT or not queue.large.has_room(size)
             if dropped:
                 reply.payload, reply.refusal, size = b"", Refusal.LOST, 0

@@ -27,6 +27,7 @@ from fogft.link.window import (
 )
 from fogft.link.zenoh.flow_watch import FlowWatch
 from fogft.link.zenoh.threads import join_at_exit
+from fogft.model import topic
 from fogft.model.refusal import Refusal
 from fogft.requests.load import Handling
 
@@ -332,7 +333,8 @@ class Attempts:
     def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
         compression, rate = self._compressions.get(attempt.service), self._progress.bytes_per_s
         packed = None
-        if compression is not None and rate is not None:
+        # Of a topic, one that is unpacked would be overtaken by the next.
+        if compression and rate is not None and not attempt.service.startswith(topic.PREFIX):
             packed = compression.pack(payload, rate)
         reads_packed = attempt.reads_packed = compression is not None
         self._unanswered.add(attempt)

@@ -54,3 +54,22 @@ def test_a_thread_that_cannot_be_started_costs_only_the_reply_it_was_for(monkeyp
     queues.put(b"token", "robot", reply, more=True)
     wait_for(lambda: sent == [reply])
     wait_for(lambda: len(queues) == 0)
+
+
+def test_a_robot_that_reads_slowly_has_so_many_refusals_waiting_and_no_more(monkeypatch):
+    queues, go_on = ReplyQueues(Counters()), threading.Event()
+    sent: list[Any] = []
+
+    def send(replies: list[Any], stamp: bytes) -> None:
+        go_on.wait(10.0)
+        sent.extend(replies)
+
+    monkeypatch.setattr(reply_queue, "send_together", send)
+    for _ in range(20_000):
+        queues.put(b"token", "eve", cast("Any", Reply()), more=True)
+    go_on.set()
+    wait_for(lambda: len(sent) >= 4096)
+    ours = cast("Any", Reply())
+    queues.put(b"other", "ann", ours, more=True)
+    wait_for(lambda: ours in sent)
+    assert len(sent) < 5000
