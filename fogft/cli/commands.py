@@ -4,6 +4,7 @@ A command's module is imported when the command is run or described.
 """
 
 import keyword
+import math
 import sys
 from collections import UserDict
 from collections.abc import Iterable, Mapping
@@ -138,6 +139,14 @@ class Command(TyperCommand):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **{**options, "rich_markup_mode": None})
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse as usual; "nan" passes the check of every range, and is no number to anybody."""
+        rest: list[str] = super().parse_args(ctx, args)
+        for one in self.get_params(ctx):
+            if isinstance(value := ctx.params.get(one.name), float) and math.isnan(value):
+                raise typer.BadParameter("`nan` is not a number", ctx, one)
+        return rest
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the parts of the usage line that follow the command's name."""

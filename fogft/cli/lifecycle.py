@@ -197,7 +197,7 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     from fogft.pool.manager import shutdown
     from fogft.ros import shared_memory
 
-    name = pool or named
+    name = options.one_pool(pool, named)
     if not composition.pools() and not (name and PoolPaths.of(name).exported.exists()):
         output.say("no pools on this machine")
         return

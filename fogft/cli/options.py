@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from fogft.errors import FogftError
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import PoolPaths
 
@@ -77,3 +78,10 @@ Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip confirmation.")]
 Plot = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Plot to a PNG, SVG or PDF file as well.")
 ]
+
+
+def one_pool(argument: str | None, option: str | None) -> str | None:
+    """Return the pool that is named in either way; FogftError for two."""
+    if argument and option and argument != option:
+        raise FogftError(f"two pools are named, `{argument}` and `--pool {option}`", "name one")
+    return argument or option

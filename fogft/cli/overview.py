@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fogft.cli import output
+from fogft.cli import options, output
 from fogft.cli.options import AsJson, PoolArgument, PoolOption
 from fogft.cli.status_text import age, price, show_table
 from fogft.errors import PoolNotFound, StateError
@@ -85,7 +85,7 @@ def events(
     """
     from fogft.model.plain import to_plain
 
-    store = composition.store_of(pool or named)
+    store = composition.store_of(options.one_pool(pool, named))
     if as_json:
         output.json_data([to_plain(one) for one in _last_events(store, count)])
         return
@@ -124,7 +124,7 @@ def cost(pool: PoolArgument = None, as_json: AsJson = False, named: PoolOption =
     """
     from fogft.pool.folder.costs import read_all
 
-    name = pool or named
+    name = options.one_pool(pool, named)
     found = [one for one in read_all(home() / "costs") if name in (None, one.pool)]
     if name is not None and not found:
         raise PoolNotFound(

@@ -104,7 +104,9 @@ def _show(report: Report) -> None:
         f"{scenario.days:.4g} days. A VM is the cheapest on-demand one; N is {scenario.replicas}."
     )
     best = report.cheapest
-    if best is None:
+    if not report.target:
+        output.data("No replica was ever ready: `fogft plan` says what is in the way.")
+    elif best is None:
         output.data(f"No policy reaches {percent(report.target)}.")
     else:
         costs = best.estimate("usd_per_hour").mean

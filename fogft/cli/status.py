@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import os
 import re
@@ -62,7 +63,7 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
 
         output.json_data(status_schema())
         return
-    pool = pool or named
+    pool = options.one_pool(pool, named)
     from fogft.pool.commands.status import checked, read, renewed
 
     paths = composition.paths_of(pool)
@@ -155,7 +156,7 @@ def logs(
     from fogft.pool.commands.logs import find
 
     slot = int(of) if of is not None and of.isdecimal() else None
-    store = composition.store_of(pool or (of if slot is None else None))
+    store = composition.store_of(options.one_pool(of if slot is None else None, pool))
     cloud = composition.cloud_of(store.identity())
     tails: dict[str, Tail] = {}
     begin: int | None = lines
@@ -172,21 +173,30 @@ def logs(
 
 
 _TIME = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?")
+_ROS_TIME = re.compile(r"\[[A-Z]+\] \[(\d{10}\.\d+)\]")
 
 
 def in_order(logs: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
     """Merge logs into (name, line), ordered by the timestamps of their lines.
 
-    A line without a time, such as a service's own, stays behind the one before it.
+    A line without a time stays behind the one before it; the first ones before what follows.
     """
     stamped: list[tuple[str, str, str]] = []
     for name, lines in logs.items():
-        latest = ""
-        for line in lines:
-            found = _TIME.match(line)
-            latest = found[0] if found else latest
+        timed = [(_time_of(line), line) for line in lines]
+        latest = next((at for at, _ in timed if at), "")
+        for at, line in timed:
+            latest = at or latest
             stamped.append((latest, name, line))
     return [(name, line) for _, name, line in sorted(stamped, key=lambda entry: entry[0])]
+
+
+def _time_of(line: str) -> str:
+    if found := _ROS_TIME.match(line):  # of a node
+        at = datetime.datetime.fromtimestamp(float(found[1]), datetime.timezone.utc)
+        return at.isoformat(timespec="milliseconds")
+    found = _TIME.match(line)
+    return found[0] if found else ""
 
 
 class Tail:

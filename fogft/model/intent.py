@@ -65,7 +65,9 @@ def scale(intent: Intent, spec: PoolSpec, change: int, now: float) -> Intent:
         limit = f"minimum is {least}" if wanted < least else f"maximum is {MAX_REPLICAS}"
         raise FogftError(
             f"cannot scale `{spec.name}` to {wanted} replicas: the {limit}",
-            "`fogft down` ends a pool"
+            ""
+            if wanted > least
+            else "`fogft down` ends a pool"
             if least == 1
             else "a service needs that `quorum`: change it in the pool file and run `fogft up`",
         )

@@ -270,7 +270,9 @@ def compare(
     rows = [Row(name, tuple(outcomes[name]), curves[name], same) for name in made]
     known = [bound(scenario, scenario.market(seed)) for seed in scenario.seeds]
     reached = tuple(outcome for outcome in known if outcome is not None)
-    if len(reached) == len(known) and scenario.spec.schedule is None:
+    # The bound knows one kind of machine, at list prices, and one number of them.
+    varies = scenario.prices or scenario.spec.schedule or scenario.spec.groups
+    if len(reached) == len(known) and not varies:
         rows.append(Row(BOUND, reached))
     return rows
 

@@ -127,11 +127,11 @@ def _number(key: str, text: str) -> float:
         value = float(text)
     except ValueError:
         raise FogftError(f"--model: `{key}` must be a number, not `{text:.40}`", HINT) from None
-    least = 1e-9 if key in _POSITIVE else 0.0
+    least = 1.0 if key in _POSITIVE else 0.0  # the simulation's step, seconds
     most = 1.0 if key in _SHARES else 1e12
     most = MAX_CORRELATION if key.startswith("correlation") else most
     if not least <= value <= most:
-        range_ = f"from {'above ' * bool(least)}0 to {most:g}"
+        range_ = f"from {least:g} to {most:g}"
         raise FogftError(f"--model: `{key}` must be {range_}, not `{text:.40}`", HINT)
     return value
 

@@ -72,6 +72,8 @@ def test_a_pool_is_named_in_the_same_ways_everywhere(home, capsys, words):
     assert main.run([*words, "--pool", "planner"]) == 0
     assert main.run([*words, "no-such"]) == 1
     assert "error: there is no pool `no-such`" in capsys.readouterr().err
+    assert main.run([*words, "planner", "--pool", "detector"]) == 1
+    assert "two pools are named, `planner` and `--pool detector`" in capsys.readouterr().err
 
 
 def test_what_was_spent_is_shown_by_day_and_replica(home: Path, capsys):

@@ -65,6 +65,41 @@ def test_json_holds_every_seed_and_what_was_assumed(file, capsys):
         assert 0 <= low <= row["available"]["mean"] <= high <= 1
 
 
+def test_no_bound_is_told_where_it_would_be_none(file, tmp_path, capsys):
+    """It knows one kind of machine, at list prices."""
+    prices = tmp_path / "prices"
+    prices.mkdir()
+    for zone in ("us-west-2a", "us-east-1b"):
+        value = {"metadata": {"gap_seconds": 600}, "data": [0.02] * 6}
+        (prices / f"{zone}_small.json").write_text(json.dumps(value))
+    groups = "  groups: [{name: a, replicas: 1}, {name: b, replicas: 1, resources: {cpus: 4+}}]\n"
+    grouped = tmp_path / "grouped.yaml"
+    grouped.write_text(POOL.replace("  replicas: 2\n", groups))
+    for words in ([str(file), "--prices", str(prices)], [str(grouped)]):
+        assert main.run(["simulate", *words, *SHORT, "--json"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert "omniscient" not in [row["policy"] for row in found["policies"]]
+        assert any("prices end before" in note for note in found["notes"]) is ("--prices" in words)
+    assert main.run(["simulate", str(file), *SHORT, "--json"]) == 0
+    assert '"omniscient"' in capsys.readouterr().out
+
+
+def test_a_pool_that_can_buy_nothing_is_not_called_the_cheapest(file, capsys):
+    file.write_text(POOL + "  max_usd_per_hour: 0.001\n")
+    assert main.run(["simulate", str(file), *SHORT]) == 0
+    out = capsys.readouterr().out
+    assert "Cheapest" not in out
+    assert "No replica was ever ready" in out
+
+
+@pytest.mark.parametrize(
+    "words", [["simulate", "x.yaml", "--days", "nan"], ["export", "x", "y", "--hours", "nan"]]
+)
+def test_what_is_no_number_is_refused_whatever_asks_for_one(words, capsys):
+    assert main.run(words) == 2
+    assert "`nan` is not a number" in capsys.readouterr().err
+
+
 def test_recorded_traces_are_replayed(file, traces, capsys):
     assert main.run(["simulate", str(file), *SHORT, "--traces", str(traces), "--json"]) == 0
     out, err = capsys.readouterr()
@@ -94,7 +129,7 @@ def test_a_plot_is_drawn(file, tmp_path, name, magic):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--model", "mttf_s=-1"], "`mttf_s` must be from above 0"),
+        (["--model", "mttf_s=-1"], "`mttf_s` must be from 1 to 1e+12"),
         (["--fit"], "`--fit` needs traces"),
         (["--traces", "nowhere"], "nowhere: is not a folder of traces"),
         (["--plot", "a.bmp"], "cannot draw a `.bmp` file"),

@@ -66,3 +66,10 @@ def test_logs_are_merged_by_time_and_lines_without_one_stay_in_place():
         ("0.1", "  of a service"),
         ("manager", manager[1]),
     ]
+
+
+def test_a_nodes_own_lines_have_its_clock_and_what_was_cut_off_before_them_goes_with_them():
+    node = ["  of a service", "[INFO] [1767225602.500000000] [planner]: b"]
+    manager = ["2026-01-01T00:00:01.000 INFO a", "2026-01-01T00:00:03.000 INFO c"]
+    merged = [line for _, line in in_order({"0.1": node, "manager": manager})]
+    assert merged == [manager[0], *node, manager[1]]

@@ -264,6 +264,26 @@ def test_a_robot_that_pulls_without_end_has_only_its_own_pulls_answered_early():
     assert ours not in {answer.request_id for _, answer in world.answers}
 
 
+def test_who_pulls_the_same_again_and_again_has_it_copied_once_in_a_while():
+    world = World(BACK)
+    for _ in range(2):
+        world.carry()
+    world.nodes[0].heard["/back"](b"m")
+    pull = world.links[0].offered[-1][2]
+    greedy = [
+        Carried(world, 0, world.links[0], (BACK.key_name, os.urandom(16), pull, 10.0))
+        for _ in range(20)
+    ]
+    for one in greedy:
+        one.robot = "eve"
+        world.replicas[0].request(one)
+    world.publish_all(0)
+    ends = [a.refusal for _, a in world.answers if a.request_id in {o.request_id for o in greedy}]
+    assert sorted(map(str, ends)) == sorted(["None"] + 19 * ["overloaded"])
+    world.carry()
+    assert world.robot_node.published["/back"] == [b"m"]
+
+
 def asked_by(world: World, robot: str, number: int, size: int) -> Carried:
     payload = encode_message(robot.encode().ljust(8), number, bytes(size))
     made = Carried(world, 0, world.links[0], (TO.key_name, os.urandom(16), payload, 10.0))

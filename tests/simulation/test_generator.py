@@ -92,8 +92,8 @@ def test_traces_that_never_change_cannot_be_fitted():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("mttf_s=0", "`mttf_s` must be from above 0"),
-        ("mttf_s=-3", "`mttf_s` must be from above 0"),
+        ("mttf_s=0", "`mttf_s` must be from 1 to"),
+        ("mttf_s=-3", "`mttf_s` must be from 1 to"),
         ("boot_s=soon", "`boot_s` must be a number, not `soon`"),
         ("boot_s=inf", "`boot_s` must be from 0 to .*, not `inf`"),
         ("correlation=1", "`correlation` must be from 0 to 0.95"),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fogft.cli import output
+from fogft.cli import options, output
 from fogft.cli.options import PoolArgument, PoolOption
 from fogft.cli.status_text import age, milliseconds, price, utc
 from fogft.errors import FogftError
@@ -50,7 +50,7 @@ def report(
     from fogft.simulation.plot import needs_matplotlib
 
     needs_matplotlib()
-    store = composition.store_of(pool or named)
+    store = composition.store_of(options.one_pool(pool, named))
     path = into or Path(f"{store.name}.html")
     try:
         path.write_text(_page(store, time.time()), encoding="utf-8")
@@ -66,6 +66,7 @@ def _page(store: Any, now: float) -> str:
 
     seen = read(store.paths, now)
     status = seen.status
+    now = min(now, status.observed_at or now)  # of what came later nobody knows
     spans = list(ready_spans(store.recent(sys.maxsize), now))
     known_s = now - min((at for _, at, _ in spans), default=now)
     costs = [one for one in read_all(home() / "costs") if one.uid == status.uid]

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from fogft.cli import output, status_text
+from fogft.cli import options, output, status_text
 from fogft.cli.options import PoolArgument, PoolOption
 from fogft.pool.commands import composition
 
@@ -34,7 +34,7 @@ def top(pool: PoolArgument = None, named: PoolOption = None) -> None:
 
     from fogft.pool.commands.status import read
 
-    store = composition.store_of(pool or named)
+    store = composition.store_of(options.one_pool(pool, named))
     latencies: dict[str, deque[float]] = {}
 
     def screen() -> RenderableType:

@@ -36,6 +36,7 @@ HOLD_S = 2.0
 LOOK_EVERY_S = 2.0  # whether publishers are heard
 _HELD_LIMIT = 64  # pulls of one topic; beyond it one of whom has most is answered with nothing
 _BATCH_BYTES = 8 << 20
+_AGAIN_S = 0.2
 _WAITING_LIMIT = 1024  # messages that wait to be published, or pulls to be answered
 _WAITING_BYTES = 64 << 20
 
@@ -55,6 +56,8 @@ class _Outgoing:
         self._clock = clock
         self._lock = threading.Lock()
         self._held: list[_Pull] = []
+        # By robot: the last message it was sent, and until when it gets that once only.
+        self._got: dict[str, tuple[int, float]] = {}
 
     def heard(self, message: bytes) -> None:
         with self._lock:
@@ -97,8 +100,16 @@ class _Outgoing:
             self._answer(pull)
 
     def _answer(self, pull: _Pull) -> None:
+        now, robot = self._clock(), pull.incoming.robot
         with self._lock:
             found = self._ring.after(pull.after, _BATCH_BYTES)[: frames.BATCH_LIMIT]
+            got, until = self._got.get(robot, (0, 0.0))
+            again = bool(found) and pull.after < got and now < until
+            if found and not again:
+                self._got[robot] = found[-1][0], now + _AGAIN_S
+        if again:
+            pull.incoming.refuse(Refusal.OVERLOADED)
+            return
         last = found[-1][0] if found else pull.after
         pull.incoming.reply(frames.encode_batch(self._session, last, found))
 

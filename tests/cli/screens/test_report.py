@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import time
 from collections import deque
 
 from fogft.cli import main
@@ -64,6 +65,15 @@ def test_a_page_tells_a_pools_life(home, capsys, tmp_path):
     assert "148 ms" in page
     assert not re.findall(r'(?:src|href)="https?:', page), "it needs no other file"
     assert "done: wrote" in capsys.readouterr().err
+
+
+@needs("matplotlib")
+def test_of_the_time_since_a_pools_last_word_a_page_says_nothing(home, tmp_path):
+    lay_down(home, age_s=86_400.0)
+    now = time.time()
+    composition.make_store("planner").append(Event(now - 90_010.0, EventKind.READY, 0, 1))
+    assert main.run(["report", "planner", "--into", str(tmp_path / "page.html")]) == 0
+    assert "of the last 1 h 0 min" in (tmp_path / "page.html").read_text()
 
 
 @needs("matplotlib", "browser")
