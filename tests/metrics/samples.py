@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 from prometheus_client import Metric, generate_latest
 
@@ -34,6 +35,7 @@ LINK = {
     "in_flight": 2,
     "reopened": 1,
     "restarts": 0,
+    "lease_left_s": 86_000.0,
 }
 CLIENT = {
     "services": {"/s": SERVICE},
@@ -66,6 +68,7 @@ RENDEZVOUS = {
     "offered": {"new": 1},
 }
 POOL = {"pool": "p"}
+KEYS_END = replace(STATUS, credentials_end_at=3600.0)
 
 
 def text(families: Iterable[Metric], labels: Labels) -> str:
@@ -94,6 +97,6 @@ PROCESSES = {
     "client proxy": lambda: text(proxies.of_client(CLIENT), POOL),
     "server proxy": lambda: text(proxies.of_server(SERVER), {**POOL, "slot": "0"}),
     "gateway": lambda: text(proxies.of_gateway(GATEWAY), POOL),
-    "manager": lambda: text(of_pool(STATUS, tally()), POOL),
+    "manager": lambda: text(of_pool(KEYS_END, tally()), POOL),
     "rendezvous": lambda: text(of_rendezvous(RENDEZVOUS), {"pool_uid": "0123456789012345"}),
 }
