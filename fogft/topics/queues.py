@@ -4,7 +4,6 @@ Messages are numbered by their publisher from 1. A robot asks for what comes aft
 that it has, so whatever is lost on the way is asked for again.
 """
 
-import math
 from collections import deque
 from collections.abc import Iterable
 from enum import Enum, auto
@@ -124,25 +123,23 @@ class _Start:
 
     def __init__(self) -> None:
         self.last = self.published = 0  # the last one's number; a bit for each, `last` the lowest
-        self.refused, self.until = math.inf, 0.0
+        self.refused, self.until = range(0), 0.0  # numbers, and until when that counts
 
 
 class Seen:
     """Judges the messages of one topic at a replica, by robot and its start."""
 
     robots, starts = 256, 4  # that are remembered; those longest silent are forgotten
-    wait_s = 2.0  # so long later ones wait for one that was refused: its robot may have dropped it
+    wait_s = 1.0  # so long later ones wait for one that was refused: its robot may have dropped it
 
     def __init__(self) -> None:
         self._of: dict[str, dict[bytes, _Start]] = {}
 
     def judge(self, robot: str, session: bytes, number: int, now: float) -> Judgement:
         """Return what to do with a message; if it is new, it counts as published."""
-        start = self._start(robot, session)
         if self.is_early(robot, session, number, now):
             return Judgement.EARLY
-        if number >= start.refused:
-            start.refused = math.inf
+        start = self._start(robot, session)
         ahead = number - start.last
         if ahead <= 0:
             return Judgement.KNOWN if start.published >> -ahead & 1 else Judgement.LATE
@@ -151,15 +148,24 @@ class Seen:
         return Judgement.NEW
 
     def is_early(self, robot: str, session: bytes, number: int, now: float) -> bool:
-        """Whether an earlier one was refused, and will come again."""
+        """Whether an earlier one was refused, and will come again: then it is refused, too.
+
+        One that comes again is the earliest that its robot still has.
+        """
         start = self._start(robot, session)
-        return start.refused < number and now < start.until
+        if now >= start.until or number < start.refused.start:
+            return False
+        if number in start.refused:
+            start.until = 0.0
+            return False
+        start.refused = range(start.refused.start, number + 1)
+        return True
 
     def refused(self, robot: str, session: bytes, number: int, now: float) -> None:
         """Note that a message was refused and comes again: none after it may overtake it."""
         start = self._start(robot, session)
-        if number > start.last:
-            start.refused, start.until = min(start.refused, number), now + self.wait_s
+        if number > start.last and not self.is_early(robot, session, number, now):
+            start.refused, start.until = range(number, number + 1), now + self.wait_s
 
     def _start(self, robot: str, session: bytes) -> _Start:
         starts = self._of[robot] = self._of.pop(robot, {})

@@ -313,6 +313,30 @@ def test_what_waits_to_be_published_is_bounded_and_one_robot_cannot_have_all_of_
     assert len(world.nodes[0].published["/to"]) == published + 1
 
 
+@pytest.mark.parametrize("depth", [1, 100])
+@pytest.mark.parametrize("reliable", [False, True])
+def test_a_topic_flows_again_at_once_after_a_replica_could_not_publish(reliable, depth):
+    """However few messages the robot keeps, and whether it sends any again."""
+    world = World(replace(TO, reliable=reliable, depth=depth))
+    node = world.nodes[0]
+    world.replicas[0].use(None)
+    said = [b"%02d" % number for number in range(40)]
+    for number, message in enumerate(said):
+        if number == 10:
+            world.replicas[0].use(node)
+        world.robot_node.heard["/to"](message)
+        world.carry()
+        world.clock.now += 0.05
+    for _ in range(20):
+        world.clock.now += 0.05
+        world.carry()
+    published = node.published["/to"]
+    assert published == sorted(published)
+    assert set(said[35:]) <= set(published)
+    if depth > 1 and reliable:
+        assert published == said
+
+
 def test_while_messages_are_under_way_none_overtakes_them_by_a_new_connection():
     world = World(TO)
     say, link = world.robot_node.heard["/to"], world.links[0]

@@ -115,13 +115,16 @@ def test_what_overtakes_a_refused_message_waits_for_it_but_not_for_ever():
     seen = Seen()
     assert seen.judge("r", b"a", 1, 0.0) is Judgement.NEW
     seen.refused("r", b"a", 2, 0.0)
-    assert seen.judge("r", b"a", 4, 0.1) is Judgement.EARLY
+    for number in (3, 4):
+        assert seen.judge("r", b"a", number, 0.1) is Judgement.EARLY
     for number in (2, 3, 4):
         assert seen.judge("r", b"a", number, 0.2) is Judgement.NEW
     seen.refused("r", b"a", 5, 1.0)
     assert seen.judge("r", b"a", 7, 1.1) is Judgement.EARLY
-    assert seen.judge("r", b"a", 7, 3.0) is Judgement.NEW, "5 was dropped for newer ones"
-    assert seen.judge("r", b"a", 6, 3.0) is Judgement.LATE
+    assert seen.judge("r", b"a", 7, 1.2) is Judgement.NEW, "5 and 6 were dropped for newer ones"
+    assert seen.judge("r", b"a", 6, 1.3) is Judgement.LATE
+    seen.refused("r", b"a", 8, 2.0)
+    assert seen.judge("r", b"a", 9, 3.0) is Judgement.NEW, "it comes no more"
     assert seen.judge("r", b"a", 1 << 62, 3.0) is Judgement.NEW
 
 

@@ -299,12 +299,12 @@ class TopicsOnReplica:
             incoming.refuse(Refusal.NOT_READY)
 
     def _turn_away(self, incoming: Incoming, reason: Refusal = Refusal.OVERLOADED) -> None:
-        """Refuse a message that its robot sends again; those after it wait for it."""
-        with contextlib.suppress(FrameError):
+        """Refuse a message; where its robot sends it again, those after it wait for it."""
+        name = incoming.service
+        with contextlib.suppress(FrameError), self._lock:
             place = frames.decode_place(incoming.payload)
-            with self._lock:
-                seen = self._seen[incoming.service]
-                seen.refused(incoming.robot, *place, self._clock())
+            if self._topics[name].reliable:
+                self._seen[name].refused(incoming.robot, *place, self._clock())
         incoming.refuse(reason)
 
     def close(self) -> None:
