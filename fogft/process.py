@@ -17,7 +17,8 @@ ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 def start_log() -> None:
-    """Log to standard error, one line each; lines of libraries from warnings on."""
+    """Log to standard error, one line each, in UTC; lines of libraries from warnings on."""
+    logging.Formatter.converter = time.gmtime
     logging.basicConfig(
         stream=sys.stderr,
         level=logging.WARNING,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from fogft.link.port import (
@@ -118,19 +118,24 @@ class UplinksLink:
         """Take one attempt, or return False when no uplink takes it. Never blocks."""
         attempt = _Attempt(service, payload, time.monotonic() + remaining_s, handling)
         with self._lock:
-            overtakes = self._again and service.startswith(topic.PREFIX)
-            if self._closed or overtakes or request_id in self._attempts:
+            # Of a topic, what follows by another uplink would overtake what is under way.
+            its = service.startswith(topic.PREFIX)
+            if self._closed or (its and self._again) or request_id in self._attempts:
                 return False
+            others = (one.on for one in self._attempts.values() if its and one.service == service)
+            by = frozenset(next(others, ()))
             self._attempts[request_id] = attempt
-        if self._send(request_id, attempt):
+        if self._send(request_id, attempt, by):
             return True
         with self._lock:  # unless it has ended meanwhile, which was told
             return self._attempts.pop(request_id, None) is None
 
-    def _send(self, request_id: bytes, attempt: _Attempt) -> bool:
+    def _send(
+        self, request_id: bytes, attempt: _Attempt, by: Collection[int] = frozenset()
+    ) -> bool:
         policy = self._dialer.policies.get(attempt.service, UplinkPolicy.PREFER)
         taken = False
-        usable = [i for i, link in enumerate(self._links) if link.usable]
+        usable = [i for i, link in enumerate(self._links) if link.usable and (not by or i in by)]
         while usable and not taken:
             chosen, current = choose(policy, usable, self._current)
             if policy is UplinkPolicy.FAILOVER:

@@ -18,7 +18,7 @@ from fogft.model.replica import Machine, MachinePhase, Observed, Offer, ReplicaI
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import History
 from fogft.planning.observed.launches import given_up
-from fogft.planning.sizing import left_usd
+from fogft.planning.sizing import cap_usd
 
 LOST_S = 60.0
 """Replaced when the robot's link to it was down for so long. Seconds."""
@@ -124,6 +124,11 @@ def _chosen(
     good = [o for o in offers if not intent.is_excluded(o.placement.location)]
     if not good:
         return None, Reason(Cause.NOTHING_OFFERED)
+    cap = cap_usd(spec, observed)  # replicas make room: without it nobody reaches them
+    if cap is not None and good[0].usd_per_hour > cap:
+        least = good[0].usd_per_hour
+        return None, Reason(Cause.OVER_BUDGET, usd_per_hour=least, limit_usd_per_hour=cap)
+    good = [offer for offer in good if cap is None or offer.usd_per_hour <= cap]
     last = history.generations[GATEWAY_SLOT]
     in_vain = 0
     while record := history.record(GATEWAY_SLOT, last - in_vain):
@@ -134,9 +139,4 @@ def _chosen(
     pause_s = min(LONGEST_PAUSE_S, PAUSE_S * 2**in_vain) if in_vain else 0.0
     if ended is not None and 0 <= observed.now - ended.closed_at < pause_s:
         return None, None
-    offer = good[in_vain % len(good)]
-    left = left_usd(spec, observed)
-    if left is not None and offer.usd_per_hour > left:
-        dear = Reason(Cause.OVER_BUDGET, usd_per_hour=offer.usd_per_hour, limit_usd_per_hour=left)
-        return None, dear
-    return offer, None
+    return good[in_vain % len(good)], None

@@ -57,7 +57,7 @@ def size(inputs: Inputs, running: int = 0) -> Size:
     groups = groups_of(spec)
     now = wish(spec, observed.wall_clock)
     notes = [Reason(Cause.SCHEDULED_AHEAD)] if now.ahead else []
-    cap = observed.below(now.max_usd_per_hour)
+    cap = cap_usd(spec, observed)
     total = intent.wanted(spec, observed.wall_clock)
     if spec.availability and total == now.replicas == spec.replicas and not intent.is_scaled(spec):
         total, unmet = _for_target(inputs, spec.availability, cap, running)
@@ -65,14 +65,9 @@ def size(inputs: Inputs, running: int = 0) -> Size:
     return Size(groups, shares(groups, total), cap, tuple(notes))
 
 
-def left_usd(spec: PoolSpec, observed: Observed) -> float | None:
-    """Return the US dollars per hour that the cap leaves for further machines; None for no cap."""
-    cap = observed.below(wish(spec, observed.wall_clock).max_usd_per_hour)
-    if cap is None:
-        return None
-    today = {offer.placement: offer.usd_per_hour for offer in observed.offers}
-    runs = (today.get(m.placement, m.usd_per_hour) for m in observed.machines or ())
-    return max(0.0, cap - sum(runs))
+def cap_usd(spec: PoolSpec, observed: Observed) -> float | None:
+    """Return what the cap that holds now leaves beside gateway and standbys; None for no cap."""
+    return observed.below(wish(spec, observed.wall_clock).max_usd_per_hour)
 
 
 def spot_sold(inputs: Inputs) -> list[Placement]:

@@ -150,12 +150,13 @@ class Seen:
     def is_early(self, robot: str, session: bytes, number: int, now: float) -> bool:
         """Whether an earlier one was refused, and will come again: then it is refused, too.
 
-        One that comes again is the earliest that its robot still has.
+        One that comes again is the earliest that its robot still has, and so is one that cannot
+        have been under way with what was refused.
         """
         start = self._start(robot, session)
         if now >= start.until or number < start.refused.start:
             return False
-        if number in start.refused:
+        if number in start.refused or number > start.refused.start + Outbox.window:
             start.until = 0.0
             return False
         start.refused = range(start.refused.start, number + 1)

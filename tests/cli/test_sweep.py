@@ -81,6 +81,9 @@ def test_the_machines_of_a_pool_that_was_exported_are_left_to_who_manages_it_now
     paths = pool(home, machines)
     id = machines.launch()
     os.replace(paths.identity, paths.exported)
+    damaged = PoolPaths.of("planned", home).exported
+    damaged.parent.mkdir()
+    damaged.write_text("{")
     assert run(capsys, "--end", "--yes")[0] == []
     assert machines.machine(id)
 

@@ -179,6 +179,20 @@ def test_no_message_of_a_topic_overtakes_what_waits_to_go_out_again():
     assert scene.link.offer(f"{topic.PREFIX}/t", b"j" * 16, b"m", 5.0)
 
 
+def test_messages_of_a_topic_stay_on_their_uplink_while_any_is_under_way():
+    """The preferred one that comes back would have them overtake those before."""
+    scene, name = Scene("prefer"), f"{topic.PREFIX}/t"
+    scene.uplinks[0].ready = frozenset()
+    assert scene.link.offer(name, b"1" * 16, b"m", 5.0)
+    scene.uplinks[0].ready = READY
+    assert scene.link.offer(name, b"2" * 16, b"m", 5.0)
+    assert scene.counts() == [0, 2]
+    for id in (b"1" * 16, b"2" * 16):
+        scene.end(1, b"", id=id)
+    assert scene.link.offer(name, b"3" * 16, b"m", 5.0)
+    assert scene.counts() == [1, 2]
+
+
 def test_with_no_uplink_left_it_is_lost_once():
     scene = Scene("all")
     scene.offer()

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fogft.cloud.sky.journal import Entry, Journal, Stage
+from fogft.disk import write_whole
 from fogft.errors import StateError
 from fogft.model.replica import ReplicaId
 from tests.fakes.sky import EAST, replica
@@ -52,13 +53,21 @@ def test_a_closed_entry_is_not_brought_back_by_an_update(tmp_path: Path):
 
 def test_files_that_could_not_be_written_belong_to_an_entry_that_is_listed(tmp_path, monkeypatch):
     """Else the key of a launch that was cut short would lie there for ever."""
-    journal = Journal(tmp_path)
+    journal, write = Journal(tmp_path), write_whole
 
-    def full(*_args, **_options):
+    def killed(*_args, **_options):
+        raise KeyboardInterrupt
+
+    def full(path, content):
+        write(path, content)
         raise StateError("no space is left")
 
     monkeypatch.setattr("fogft.cloud.sky.journal.write_whole", full)
     with pytest.raises(StateError):
+        journal.open(entry(), {"replica.key": b"k"})
+    assert (journal.entries(), journal.files(replica()).exists()) == ([], False)
+    monkeypatch.setattr("fogft.cloud.sky.journal.write_whole", killed)
+    with pytest.raises(KeyboardInterrupt):
         journal.open(entry(), {"replica.key": b"k"})
     [left] = journal.entries()
     journal.close(left.id)

@@ -163,6 +163,10 @@ def test_a_location_sells_its_cheapest_type_and_remembers_four_others(market: Ma
     market.sky.sold = market.sky.sold[-1:]
     market.prices.offers({"infra": "aws", "instance_type": "m7.large"})
     assert market.prices.instead(offer.placement, None) == [], "who asked for it alone gets it"
+    market.now += USABLE_S + 1
+    market.sky.sold = [Offer(kind, 0.05, "catalogue") for kind in kinds]
+    [offer] = market.offers()
+    assert market.prices.instead(offer.placement, None), "who asks no more limits nobody"
 
 
 def test_what_the_accounts_quota_forbids_is_not_offered_and_the_quota_is_named(market: Market):

@@ -124,7 +124,10 @@ def test_what_overtakes_a_refused_message_waits_for_it_but_not_for_ever():
     assert seen.judge("r", b"a", 7, 1.2) is Judgement.NEW, "5 and 6 were dropped for newer ones"
     assert seen.judge("r", b"a", 6, 1.3) is Judgement.LATE
     seen.refused("r", b"a", 8, 2.0)
-    assert seen.judge("r", b"a", 9, 3.0) is Judgement.NEW, "it comes no more"
+    assert seen.judge("r", b"a", 8 + Outbox.window, 2.1) is Judgement.EARLY
+    assert seen.judge("r", b"a", 9 + Outbox.window, 2.2) is Judgement.NEW, "so many are never on"
+    seen.refused("r", b"a", 30, 2.3)
+    assert seen.judge("r", b"a", 31, 3.3) is Judgement.NEW, "it comes no more"
     assert seen.judge("r", b"a", 1 << 62, 3.0) is Judgement.NEW
 
 

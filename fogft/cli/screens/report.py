@@ -66,8 +66,10 @@ def _page(store: Any, now: float) -> str:
 
     seen = read(store.paths, now)
     status = seen.status
-    now = min(now, status.observed_at or now)  # of what came later nobody knows
-    spans = list(ready_spans(store.recent(sys.maxsize), now))
+    events = list(store.recent(sys.maxsize))
+    last = max((event.at for event in events), default=0.0)
+    now = min(now, max(last, status.observed_at or now))  # of what came later nobody knows
+    spans = list(ready_spans(events, now))
     known_s = now - min((at for _, at, _ in spans), default=now)
     costs = [one for one in read_all(home() / "costs") if one.uid == status.uid]
     days: dict[str, float] = {}

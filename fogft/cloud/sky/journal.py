@@ -15,6 +15,7 @@ from typing import Any
 
 from fogft.cloud.sky.naming import cluster_name, replica_of
 from fogft.disk import locked, make_folder, read_as, write_json, write_whole
+from fogft.errors import StateError
 from fogft.model.names import LINK_PORT
 from fogft.model.plain import to_plain
 from fogft.model.reason import Reason
@@ -76,8 +77,12 @@ class Journal:
             folder = self.files(entry.id)
             make_folder(folder)
             write_json(self._path(entry.id), to_plain(entry))  # first: what it lists is removed
-            for name, content in files.items():
-                write_whole(folder / name, content)
+            try:
+                for name, content in files.items():
+                    write_whole(folder / name, content)
+            except StateError:
+                self._remove(entry.id)
+                raise
             return True
 
     def update(self, id: ReplicaId, **changes: Any) -> Entry | None:
@@ -97,10 +102,13 @@ class Journal:
     def close(self, id: ReplicaId) -> None:
         """Forget a replica that is gone, and remove its files. Repeatable."""
         with locked(self._folder / "journal.lock"):
-            shutil.rmtree(self.files(id), ignore_errors=True)
-            for path in (self.provision_log(id), self._path(id)):
-                with contextlib.suppress(OSError):
-                    path.unlink()
+            self._remove(id)
+
+    def _remove(self, id: ReplicaId) -> None:
+        shutil.rmtree(self.files(id), ignore_errors=True)
+        for path in (self.provision_log(id), self._path(id)):
+            with contextlib.suppress(OSError):
+                path.unlink()
 
     def get(self, id: ReplicaId) -> Entry | None:
         """Return an entry, or None."""

@@ -57,6 +57,7 @@ class Prices:
 
     def __post_init__(self) -> None:
         self._kept: dict[str, Kept[_Sold]] = {}  # by what was asked
+        self._asked: dict[str, float] = {}  # when, by the same
         self._quotas: dict[tuple[str, str], tuple[float, float | None]] = {}
         self._unread: dict[str, str] = {}  # cloud -> why its quotas cannot be read
 
@@ -69,11 +70,14 @@ class Prices:
                 *(FRESH_S, USABLE_S, self.clock, self.submit),
                 failed=lambda error: log.warning("prices_not_renewed reason=%r", error.message),
             )
+        self._asked[key] = self.clock()
         return self._kept[key].get().offers
 
     def instead(self, placement: Placement, limit: float | None) -> Sequence[Offer]:
         """Return what else would do for at most `limit` US dollars per hour, the cheapest first."""
-        asked = [s.instead[placement] for s in self._answers() if placement in s.instead]
+        lately = self.clock() - USABLE_S
+        used = [kept.answer for key, kept in self._kept.items() if self._asked[key] >= lately]
+        asked = [sold.instead[placement] for sold in used if sold and placement in sold.instead]
         allowed = [{offer.placement for offer in others} for others in asked]  # by each who asked
         found = [o for o in asked[0] if all(o.placement in a for a in allowed)] if asked else []
         return [offer for offer in found if limit is None or offer.usd_per_hour <= limit]

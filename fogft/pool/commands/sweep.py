@@ -6,6 +6,7 @@ listed costs money that nobody watches.
 Not here: what exists (`fogft.cloud`, past every memory) and asking the user (`fogft.cli`).
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -104,8 +105,9 @@ def _pools() -> dict[str, tuple[str, bool]]:
     """Return uid -> name and whether it has a manager, of the pools here and those exported."""
     found = {}
     for path in (home() / "pools").glob("*/exported.json"):
-        if (moved := disk.read_as(Identity, path)) is not None:
-            found[moved.uid] = (moved.name, True)
+        with contextlib.suppress(StateError):
+            if (moved := disk.read_as(Identity, path)) is not None:
+                found[moved.uid] = (moved.name, True)
     for name in pools():
         paths = PoolPaths.of(name)
         try:

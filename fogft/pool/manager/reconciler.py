@@ -40,7 +40,7 @@ from fogft.planning.observed.history import EventKind, History, fault_of
 from fogft.planning.observed.refresh import Silent
 from fogft.planning.planner import Plan, PlannedLaunch, plan
 from fogft.planning.rollout import Update
-from fogft.planning.sizing import Inputs, left_usd
+from fogft.planning.sizing import Inputs, cap_usd
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import offers
 from fogft.pool.manager.event_recorder import EventRecorder
@@ -288,7 +288,7 @@ class Reconciler:
         if step.launch is not None:
             generation = history.generations[GATEWAY_SLOT] + 1
             order = self.gateway.order(spec, step.launch, generation)
-            limit = left_usd(spec, observed)
+            limit = cap_usd(spec, observed)
             self._order(replace(order, limit_usd_per_hour=limit), Reason(Cause.NEW_SLOT))
         there = step.host and spec.dial_in == spec.gateway.endpoints(step.host)[2]
         return None if there or not spec.gateway.launch else step.note
@@ -427,11 +427,13 @@ class Reconciler:
 
 def _slack(spec: PoolSpec, observed: Observed, plan: Plan) -> float | None:
     """Return by how much each launch may cost more than planned; None where there is no cap."""
-    left = left_usd(spec, observed)
-    if left is None or not plan.launches:
+    cap = cap_usd(spec, observed)
+    if cap is None or not plan.launches:
         return None
-    left -= sum(planned.offer.usd_per_hour for planned in plan.launches)
-    return max(0.0, left) / len(plan.launches)
+    today = {offer.placement: offer.usd_per_hour for offer in observed.offers}
+    spent = sum(today.get(m.placement, m.usd_per_hour) for m in observed.machines or ())
+    spent += sum(planned.offer.usd_per_hour for planned in plan.launches)
+    return max(0.0, cap - spent) / len(plan.launches)
 
 
 def _refusal(error: Exception) -> Cause | None:

@@ -56,7 +56,7 @@ class _Outgoing:
         self._clock = clock
         self._lock = threading.Lock()
         self._held: list[_Pull] = []
-        # By robot: the last message it was sent, and until when it gets that once only.
+        # By robot: the last message it was sent, and until when it gets none of them again.
         self._got: dict[str, tuple[int, float]] = {}
 
     def heard(self, message: bytes) -> None:
@@ -104,9 +104,10 @@ class _Outgoing:
         with self._lock:
             found = self._ring.after(pull.after, _BATCH_BYTES)[: frames.BATCH_LIMIT]
             got, until = self._got.get(robot, (0, 0.0))
-            again = bool(found) and pull.after < got and now < until
+            repeats = bool(found) and pull.after < got
+            again = repeats and now < until
             if found and not again:
-                self._got[robot] = found[-1][0], now + _AGAIN_S
+                self._got[robot] = max(got, found[-1][0]), now + _AGAIN_S if repeats else until
         if again:
             pull.incoming.refuse(Refusal.OVERLOADED)
             return
@@ -152,8 +153,11 @@ class _Inbox:
                 incoming = self._waiting.take()
                 if incoming is not None:
                     self._large.let_go(incoming.robot, len(incoming.payload))
-            if incoming is not None:
-                self._take(incoming)
+            try:
+                if incoming is not None:
+                    self._take(incoming)
+            except Exception:  # the others go on
+                log.exception("message_not_taken")
 
     def close(self) -> None:
         """End `run`, once what waits now has been taken."""
