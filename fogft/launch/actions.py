@@ -33,6 +33,7 @@ from fogft.errors import FogftError
 from fogft.launch.pool_file import NodeCommand, pool_tree, run_text
 from fogft.launch.run_pool import READY
 from fogft.pool.folder.paths import home
+from fogft.pool.manager.configuration import absolute
 
 _END_LIMIT_S = 900  # how long launch waits for `fogft down` before it kills
 # What a node on another machine cannot do, and what to do instead.
@@ -165,11 +166,9 @@ def _tree(asked: Mapping[str, Any], nodes: Sequence[NodeCommand]) -> dict[str, A
         base = yaml.safe_load(_text_of(str(file)))
         if not isinstance(base, dict):
             raise FogftError(f"`{file}` is not a pool file", "see `fogft init`")
-        if isinstance(base.get("workdir"), str):
-            base["workdir"] = str(file.parent / base["workdir"])
-    task = {key: asked[key] for key in ("resources", "setup") if asked[key]}
-    if asked["workdir"]:
-        task["workdir"] = str(Path(asked["workdir"]).absolute())
+        base = absolute(base, file.parent)
+    given = {key: asked[key] for key in ("resources", "setup", "workdir") if asked[key]}
+    task = absolute(given, Path())
     ours = dict(asked["fogft"] or {})
     ours |= {key: asked[key] for key in ("replicas", "services") if asked[key]}
     return pool_tree(base, name=asked["name"], run=run_text(nodes), task=task, fogft=ours)

@@ -8,6 +8,7 @@ Not here: what is exchanged then (`exchange`).
 
 import asyncio
 import os
+import secrets
 import socket
 import ssl
 from pathlib import Path
@@ -74,7 +75,8 @@ async def _attempt(endpoint: str) -> socket.socket:
     found = await asyncio.wait_for(
         loop.getaddrinfo(host, port, type=socket.SOCK_STREAM), _ATTEMPT_TIMEOUT_S
     )
-    family, kind, protocol, _, address = found[0]
+    # Any of its addresses: the next attempt may take another.
+    family, kind, protocol, _, address = secrets.choice(found)
     raw = socket.socket(family, kind, protocol)
     try:
         raw.setblocking(False)

@@ -22,7 +22,7 @@ from fogft.model.names import PoolUid
 from fogft.model.plain import Count
 
 VERSION = 2
-BODY_LIMIT = 64 << 10
+BODY_LIMIT = 180 << 10  # a frame holds it as text
 CERTIFICATE_LIMIT = 4 << 10
 SIGNATURE_LIMIT = 256
 _SIGNED_PREFIX = b"fogft record 1\n"  # a signature for this purpose is good for no other

@@ -20,6 +20,10 @@ class FallbackTimer:
         self.failed = self._handed.discard  # it could not be asked: once more at the deadline
         self._awaited: dict[bytes, tuple[float, Pending]] = {}  # past the deadline: until when
 
+    def not_asked(self) -> None:
+        """Note that the fallback is another one now: it is asked at the deadline."""
+        self._handed.clear()
+
     def __len__(self) -> int:
         """Count the requests past their deadline whose fallback is awaited."""
         return len(self._awaited)

@@ -21,7 +21,7 @@ class Quorum(Decide):
     `newly_flagged` is told who has disagreed once too often, and how often.
     """
 
-    kept = 256  # final answers, to judge late ballots by
+    kept, kept_bytes = 256, 16 << 20  # final answers, to judge late ballots by
 
     def __init__(
         self,
@@ -66,7 +66,8 @@ class Quorum(Decide):
             return Means.UNDECIDED
         del self._open[id]
         self._final[id] = reading
-        if len(self._final) > self.kept:
+        kept = min(self.kept, max(1, self.kept_bytes // (len(payload) or 1)))
+        while len(self._final) > kept:
             self._final.popitem(last=False)
         for voter in ballots:
             self._judge(voter, agrees=voter in agreeing)

@@ -25,6 +25,7 @@ from fogft.ros.serialised import ClientEnd, ServiceEnd
 
 log = logging.getLogger(__name__)
 
+_PENDING_LIMIT = 16_384  # calls of one client that have no answer
 BURST = 128  # messages taken from one entity before the others get their turn
 _ASK_EVERY_S, _ASK_LIMIT_S = 0.5, 5.0
 
@@ -238,6 +239,8 @@ class Client:
                 raise RosError(f"the client of `{self._client.srv_name}` is closed")
             ticket = self._end.send(payload)
             self._pending[ticket] = on_response
+            if len(self._pending) > _PENDING_LIMIT:  # who never answers must not fill the memory
+                del self._pending[next(iter(self._pending))]
         return ticket
 
     def forget(self, ticket: int) -> None:

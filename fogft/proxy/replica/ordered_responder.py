@@ -5,6 +5,7 @@ decision is made, never while something is sent.
 """
 
 import logging
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ from fogft.ros.state_bytes import StateBytes
 
 log = logging.getLogger(__name__)
 
-_SNAPSHOT_LIMIT_S = 30.0
+_LIMITS_S = {Op.SNAPSHOT: 30.0, Op.RESTORE: 300.0}
 
 
 class Clients(NamedTuple):
@@ -188,5 +189,5 @@ class OrderedResponder:
             waited_s = self.clock() - self._begun_at
         if again is not None:
             self._begin(again)
-        elif begun is not None and begun.op is Op.SNAPSHOT and waited_s > _SNAPSHOT_LIMIT_S:
-            self._failed(begun, RosError(f"no answer for {_SNAPSHOT_LIMIT_S:.0f} s"))
+        elif begun is not None and waited_s > _LIMITS_S.get(begun.op, math.inf):
+            self._failed(begun, RosError(f"no answer for {waited_s:.0f} s"))

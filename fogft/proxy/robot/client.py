@@ -84,7 +84,7 @@ class ClientProxy:
         with self._lock:
             wanted = {spec.name: spec for spec in specs}
             for name in [n for n in self._services if n not in wanted]:
-                self._services.pop(name).close()
+                self._services.pop(name).end()
             keys_changed = False
             for spec in wanted.values():
                 try:

@@ -23,6 +23,7 @@ from fogft.link.zenoh import threads
 from fogft.link.zenoh.flow_watch import THIN_BYTES_PER_S
 from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_streams import Stream
+from fogft.link.zenoh.settings import MESSAGE_BYTES_LIMIT
 from fogft.model.refusal import Refusal
 from fogft.requests.load import Load
 
@@ -73,6 +74,7 @@ def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
 
 
 REPLIES_LIMIT = 1024
+_HEAD_BYTES = 4096
 _REFUSALS_LIMIT = 4 * REPLIES_LIMIT  # with those that stand for dropped replies
 BYTES_LIMIT = 64 << 20
 _END_LOOK_S = 1.0  # nobody waits for an end
@@ -156,9 +158,11 @@ class ReplyQueues:
             queue = None if self._closed else self._queue(token, robot)
             if queue is None or queue.waiting >= _REFUSALS_LIMIT:
                 return
-            dropped = queue.waiting >= REPLIES_LIMIT or not queue.large.has_room(size)
+            too_large = size > MESSAGE_BYTES_LIMIT - _HEAD_BYTES
+            dropped = queue.waiting >= REPLIES_LIMIT or not queue.large.has_room(size) or too_large
             if dropped:
-                reply.payload, reply.refusal, size = b"", Refusal.LOST, 0
+                refusal = Refusal.MALFORMED.text("too large") if too_large else Refusal.LOST
+                reply.payload, reply.refusal, size = b"", refusal, 0
             queue.waiting += 1
             queue.large.add(size)
             queue.replies.put(reply)
