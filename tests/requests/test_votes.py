@@ -114,3 +114,13 @@ def test_final_answers_are_kept_for_a_while_only():
     for number in range(100):
         vote(votes, bytes([number]), 0, 1.0)
     assert sum(votes.hears_out(bytes([n])) for n in range(100)) == 10
+
+
+def test_of_large_answers_few_are_kept():
+    votes = of(1)
+    votes.kept_bytes = 1000
+    for number in range(100):
+        votes.judge(bytes([number]), 0, bytes(300), 1.0, PENDING)
+    assert sum(votes.hears_out(bytes([n])) for n in range(100)) == 3
+    votes.judge(b"x", 0, bytes(5000), 1.0, PENDING)
+    assert votes.hears_out(b"x")

@@ -98,11 +98,12 @@ def test_every_change_is_published_and_the_next_manager_goes_on(paths, place):
     }
 
 
-def test_revocations_are_published(paths, place):
-    gone = Holder(Role.ROBOT, "eve", 1, UID).common_name
+@pytest.mark.parametrize("count", [1, 4000])
+def test_revocations_are_published_however_many(paths, place, count):
+    gone = [Holder(Role.ROBOT, "eve", number, UID).common_name for number in range(1, count + 1)]
     manager = ManagerRecords(paths, UID, 1)
-    manager.look((place.endpoint,), membership(1, 1, 0, revoked=(gone,)), LEASE)
-    wait_for(lambda: place.records.revoked == {gone})
+    manager.look((place.endpoint,), membership(1, 1, 0, revoked=gone), LEASE)
+    wait_for(lambda: place.records.revoked == set(gone))
     manager.close()
 
 

@@ -12,7 +12,7 @@ from fogft.link.port import Answer
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.state import StateService, StateSpec
-from fogft.ordering.orders import Op, decode, encode
+from fogft.ordering.orders import Op, decode, encode, encode_snapshot
 from fogft.ordering.peer import Peer
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.robot.dispatcher import Dispatcher
@@ -312,6 +312,16 @@ def test_a_new_replica_is_restored_before_it_is_ready(scene):
     scene.run()
     assert scene.responders[1].ready
     assert not scene.clients[1].service.calls, "nothing is applied twice"
+
+
+def test_a_restore_that_is_never_answered_is_told_and_given_up(scene):
+    scene.run()
+    _, epoch = scene.dispatcher.submit(b"q", "h"), decode(scene.links[0].offered[-1][1])[1]
+    late = Incoming(scene, scene.links[1], encode(Op.RESTORE, epoch, 9), encode_snapshot(9, b"s"))
+    scene.responders[1].request(late)
+    scene.clock.now += 301.0
+    scene.responders[1].tick(alive=True)
+    assert "the restore of `/s` failed: no answer for 301 s" in scene.responders[1].detail
 
 
 def test_a_failed_restore_is_told_and_tried_again(scene):

@@ -476,3 +476,16 @@ def test_a_request_whose_service_changes_its_kind_ends_as_at_its_deadline():
     server = scene.node.servers["/s"]
     scene.proxy.serve([replace(base, quorum=2)])
     assert server.responses == [("caller", b"empty")]
+
+
+def test_the_requests_of_a_service_that_is_removed_end_as_its_file_says():
+    scene = Scene("/t")
+    spec = ServiceSpec("/s", SET_BOOL, timeout_s=5.0, on_timeout=OnTimeout.EMPTY)
+    scene.proxy.serve([spec])
+    scene.follow(member(0))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    server, link = scene.node.servers["/s"], scene.dialer.links[-1]
+    scene.proxy.serve([])
+    assert [payload for _, payload in server.responses] == [b"empty"]
+    assert len(link.forgotten) == 1, "replicas stop working on them"

@@ -300,3 +300,16 @@ def test_every_request_ends_once_and_is_handed_to_the_fallback_once(steps, after
     assert len(handles) == ends[0] + ends[1]
     assert len(scene.local.calls) <= asked
     assert scene.count("pending", "pending_bytes") == [0, 0]
+
+
+def test_another_fallback_is_asked_at_the_deadline_for_what_the_old_one_has():
+    """The old one's client is closed: its answer never comes."""
+    scene, other = Scene(after_s=1.0, limit_s=2.0), FakeClient()
+    scene.ask()
+    scene.pass_time(1.1)
+    assert len(scene.local.calls) == 1
+    scene.dispatcher.adopt(scene.spec, other)
+    scene.pass_time(4.0)
+    [(_, on_response)] = other.calls
+    on_response(b"a")
+    assert [payload for _, payload in scene.responses] == [b"a"]

@@ -73,3 +73,14 @@ def test_a_robot_that_reads_slowly_has_so_many_refusals_waiting_and_no_more(monk
     queues.put(b"other", "ann", ours, more=True)
     wait_for(lambda: ours in sent)
     assert len(sent) < 5000
+
+
+def test_a_reply_that_is_larger_than_its_robot_takes_is_refused_for_good(monkeypatch):
+    monkeypatch.setattr(reply_queue, "MESSAGE_BYTES_LIMIT", 10_000)
+    queues, sent = ReplyQueues(Counters()), []
+    monkeypatch.setattr(reply_queue, "send_together", lambda replies, stamp: sent.extend(replies))
+    reply = cast("Any", Reply())
+    reply.payload = bytes(9_000)
+    queues.put(b"token", "robot", reply, more=True)
+    wait_for(lambda: sent == [reply])
+    assert (reply.payload, reply.refusal) == (b"", "malformed:too large")
