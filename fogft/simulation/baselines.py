@@ -167,14 +167,15 @@ class Rule:
     """A rule for where the next spot machine is ordered: cheapest first, fewest replicas first."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
-        self._active = self._spot = spot
+        self._spot = spot
         self._failed: dict[str, int] = {}
+        self._preempted: set[str] = set()
 
     def place(self, taken: Sequence[Offer]) -> Offer:
         """Return the offer to order, given those in use; ties go to the oldest failure."""
         used = Counter(o.placement.location for o in taken)
         return min(
-            self._active,
+            (o for o in self._spot if o.placement.location not in self._preempted),
             key=lambda o: (
                 used[o.placement.location],
                 self._failed.get(o.placement.location, 0),
@@ -217,18 +218,12 @@ class ActiveZones(Rule):
     ready; when fewer than two are active, all are.
     """
 
-    def __init__(self, spot: Sequence[Offer]) -> None:
-        super().__init__(spot)
-        self._preempted: set[str] = set()
-
     def lost(self, offer: Offer) -> None:
         """Make a location inactive."""
         self._preempted.add(offer.placement.location)
         if len({o.placement.location for o in self._spot} - self._preempted) < 2:
             self._preempted.clear()
-        self._active = [o for o in self._spot if o.placement.location not in self._preempted]
 
     def ready(self, offer: Offer) -> None:
         """Make a location active."""
         self._preempted.discard(offer.placement.location)
-        self._active = [o for o in self._spot if o.placement.location not in self._preempted]
