@@ -67,7 +67,6 @@ class OrderedReplica(Generic[T]):
         self.serving = False  # whether the service and its two state services are there
         self.promised, self.robot = 0, ""  # the term, and whose
         self.goal = 0  # with this number it has caught up with the time when it joined
-        self.applied = 0  # how many requests were applied here
         self._serial = 0
         self._work: _Work[T] | None = None
         # By number: the request, and whom to answer.
@@ -256,7 +255,6 @@ class OrderedReplica(Generic[T]):
         self._work = None
         out: list[Effect[T]]
         if work.op is Op.APPLY:
-            self.applied += 1
             self.position = Position(work.epoch, work.index)
             self._keep(work.index, answer)
             out = [self._answer(to, answer) for to in work.waiting]
