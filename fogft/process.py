@@ -93,6 +93,11 @@ def _sleeps(pid: int | None) -> str:
     return ""
 
 
+def on_thread(run: Callable[[], object]) -> None:
+    """Run a function on a thread that does not keep the process alive."""
+    threading.Thread(target=run, daemon=True).start()
+
+
 def stop_on_signal() -> threading.Event:
     """Return an event that SIGTERM, SIGINT and SIGHUP set."""
     stop = threading.Event()

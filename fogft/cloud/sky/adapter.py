@@ -37,6 +37,7 @@ from fogft.disk import read_bytes, write_whole
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
 from fogft.model.reason import Cause
 from fogft.model.replica import Machine, Offer, ReplicaId
+from fogft.process import on_thread
 
 log = logging.getLogger(__name__)
 
@@ -46,16 +47,12 @@ MACHINE_ID = Path("/etc/machine-id")
 _ENDS_FRESH_S = 60.0
 
 
-def _on_thread(run: Callable[[], None]) -> None:
-    threading.Thread(target=run, name="sky", daemon=True).start()
-
-
 def _each_second(step: Callable[[], bool]) -> None:
     def run() -> None:
         while step():
             time.sleep(1.0)
 
-    _on_thread(run)
+    on_thread(run)
 
 
 def make(folder: Path) -> SkyCloud:
@@ -83,7 +80,7 @@ class SkyCloud:
     owner: str  # whose machines these are, for their labels
     clock: Callable[[], float] = time.time
     steady: Callable[[], float] = time.monotonic
-    submit: Callable[[Callable[[], None]], object] = _on_thread
+    submit: Callable[[Callable[[], None]], object] = on_thread
     repeat: Callable[[Callable[[], bool]], object] = _each_second  # until it returns False
     sleep: Callable[[float], object] = time.sleep
     make_wheel: Callable[[Path], Path] = wheel.make

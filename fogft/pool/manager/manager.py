@@ -50,7 +50,7 @@ from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 from fogft.pool.manager.reconciler import Reconciler, Tick
 from fogft.pool.manager.tally import Tally, of_pool
-from fogft.process import Watchdog, notify, start_log, stop_on_signal
+from fogft.process import Watchdog, notify, on_thread, start_log, stop_on_signal
 from fogft.records.roster import ServingLease
 
 log = logging.getLogger(__name__)
@@ -61,11 +61,6 @@ WATCH_S = 0.05
 CERTIFY_EVERY_S = 3600.0
 RUN_ENDED_S = 300.0  # from the end of `run` to that of its machine
 LEAVE_LIMIT_S = 60.0  # then it is tried again in the next round
-
-
-def on_thread(run: Callable[[], object]) -> None:
-    """Run a function on a thread that does not keep the process alive."""
-    threading.Thread(target=run, daemon=True).start()
 
 
 @dataclass(eq=False)
