@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import Any
 
 _STEP_S = 2.0
 ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
@@ -93,9 +94,11 @@ def _sleeps(pid: int | None) -> str:
     return ""
 
 
-def on_thread(run: Callable[[], object]) -> None:
-    """Run a function on a thread that does not keep the process alive."""
-    threading.Thread(target=run, daemon=True).start()
+def on_thread(run: Callable[..., object], *arguments: Any, name: str = "") -> threading.Thread:
+    """Start a thread that does not keep the process alive. RuntimeError: there can be no more."""
+    thread = threading.Thread(target=run, args=arguments, name=name or None, daemon=True)
+    thread.start()
+    return thread
 
 
 def stop_on_signal() -> threading.Event:

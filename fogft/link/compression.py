@@ -15,6 +15,8 @@ import zlib
 from collections import deque
 from collections.abc import Callable
 
+from fogft.process import on_thread
+
 log = logging.getLogger(__name__)
 
 # What a replica reads, and finds out by itself for answers: robots of 0.2.0 ask for these words.
@@ -117,9 +119,7 @@ class Unpacker:
                 waiting.append((packed, done))
                 return True
             try:
-                threading.Thread(
-                    target=self._run, args=(peer,), name=f"fogft-unpack-{peer}", daemon=True
-                ).start()
+                on_thread(self._run, peer, name=f"fogft-unpack-{peer}")
             except RuntimeError:
                 return False
             self._waiting[peer] = deque(((packed, done),))

@@ -10,12 +10,12 @@ from __future__ import annotations
 import logging
 import math
 import platform
-import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING
 
 import fogft
+from fogft.process import on_thread
 
 if TYPE_CHECKING:
     from wsgiref.simple_server import WSGIServer
@@ -128,8 +128,7 @@ class Scrape:
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))
             return
-        serve = self._server.serve_forever
-        threading.Thread(target=serve, name="fogft-metrics", daemon=True).start()
+        on_thread(self._server.serve_forever, name="fogft-metrics")
         log.info("metrics_served endpoint=%s", self.endpoint)
 
     def close(self) -> None:

@@ -11,11 +11,11 @@ import contextlib
 import json
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
+from fogft.process import on_thread
 from fogft.ros import environment
 
 _LIMIT_S = 5.0
@@ -44,8 +44,7 @@ def answer(name: str) -> int:
     """Offer a service until stdin is closed."""
     with _node(name) as (_, executor):
         print(json.dumps({"offering": name}), flush=True)
-        reader = threading.Thread(target=sys.stdin.read, daemon=True)
-        reader.start()
+        reader = on_thread(sys.stdin.read)
         while reader.is_alive():
             executor.spin_once(timeout_sec=0.1)
     return 0

@@ -26,11 +26,11 @@ import fcntl
 import os
 import re
 import struct
-import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
+from fogft.process import on_thread
 from fogft.ros import spdp
 
 SETTLED_S = 2.0
@@ -161,8 +161,7 @@ class PortWatch:
         with contextlib.suppress(AttributeError):  # no Linux
             self._watch = self._libc.inotify_init1(os.O_CLOEXEC)
             self._id = self._libc.inotify_add_watch(self._watch, bytes(FOLDER), _IN_DELETE)
-        self._thread = threading.Thread(target=self._run, name="ros-ports", daemon=True)
-        self._thread.start()
+        self._thread = on_thread(self._run, name="ros-ports")
 
     def _run(self) -> None:
         looked_at, (ports, _) = time.monotonic(), reopen_ports()

@@ -13,8 +13,9 @@ import os
 import re
 import socket
 import struct
-import threading
 import time
+
+from fogft.process import on_thread
 
 PREFIX_BYTES = 12
 _FAST_DDS, _CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # who else keeps to this is not known
@@ -105,8 +106,7 @@ class Introduction:
     def __init__(self, domain_id: int) -> None:
         self._domain_id = domain_id
         self._closed = False
-        self._thread = threading.Thread(target=self._run, name="introduction", daemon=True)
-        self._thread.start()
+        self._thread = on_thread(self._run, name="introduction")
 
     def close(self) -> None:
         """Return once it has ended, which it does soon by itself as well. Repeatable."""

@@ -18,6 +18,7 @@ from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
 from fogft.link.dial_out.tunnel import GREETING_TIMEOUT_S, Tunnels, hang_up, keep_alive
 from fogft.model.names import host_and_port
+from fogft.process import on_thread
 from fogft.records import frames
 from fogft.records.record import Sign
 
@@ -54,12 +55,8 @@ class DialOut:
                 self._targets[door] = threading.Event()
         for door in new:
             for number in range(WAITING):
-                threading.Thread(
-                    target=self._keep_waiting,
-                    args=(door, self._targets[door]),
-                    name=f"fogft-dial-out-{number}",
-                    daemon=True,
-                ).start()
+                stop, name = self._targets[door], f"fogft-dial-out-{number}"
+                on_thread(self._keep_waiting, door, stop, name=name)
 
     def close(self) -> None:
         """Close all connections. Repeatable."""

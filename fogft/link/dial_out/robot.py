@@ -27,6 +27,7 @@ from fogft.link.dial_out.tunnel import (
 )
 from fogft.model.credentials import Role, holder_of
 from fogft.model.replica import ReplicaId
+from fogft.process import on_thread
 from fogft.records import frames
 from fogft.records.accepting import listening, oldest_of_most
 from fogft.records.record import RecordError, Verify
@@ -77,7 +78,7 @@ class DialIn:
         self._door = listening(self.listen)
         host, port = self.listen.rpartition(":")[0], self._door.getsockname()[1]
         self.endpoint = f"{host}:{port}"
-        threading.Thread(target=self._accept, name="fogft-dial-in", daemon=True).start()
+        on_thread(self._accept, name="fogft-dial-in")
 
     # -- replicas come in ---------------------------------------------------------------------
 
@@ -97,9 +98,7 @@ class DialIn:
                     self._count("greeting_crowded", self._greeting.pop(crowd))
                     shut_down(crowd)  # its thread closes it
                 self._greeting[link] = host
-            threading.Thread(
-                target=self._attend, args=(link, host), name="fogft-greet", daemon=True
-            ).start()
+            on_thread(self._attend, link, host, name="fogft-greet")
 
     def _attend(self, link: socket.socket, host: str) -> None:
         try:
@@ -192,9 +191,7 @@ class DialIn:
             port = self._local.get(id)
             if port is None:
                 port = self._local[id] = listening("127.0.0.1:0")
-                threading.Thread(
-                    target=self._accept_local, args=(id, port), name="fogft-door", daemon=True
-                ).start()
+                on_thread(self._accept_local, id, port, name="fogft-door")
             return f"127.0.0.1:{port.getsockname()[1]}"
 
     def keep(self, ids: Collection[ReplicaId]) -> None:

@@ -10,6 +10,7 @@ import threading
 import time
 from typing import Any
 
+from fogft.process import on_thread
 from fogft.records import frames
 
 GREETING_TIMEOUT_S = 5.0
@@ -81,9 +82,7 @@ class Tunnels:
             self._open.update(ends)
         left = [other, one]  # directions that go on; list.pop is atomic
         for source, target in (ends, ends[::-1]):
-            threading.Thread(
-                target=self._carry, args=(source, target, left), name="fogft-tunnel", daemon=True
-            ).start()
+            on_thread(self._carry, source, target, left, name="fogft-tunnel")
 
     def _carry(
         self, source: socket.socket, target: socket.socket, left: list[socket.socket]

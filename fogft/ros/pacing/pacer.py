@@ -19,6 +19,7 @@ from operator import itemgetter
 from typing import Any
 
 from fogft.errors import RosError
+from fogft.process import on_thread
 from fogft.ros.pacing.pace import EVERY_S, ClientPace, Pace, Probing
 from fogft.ros.port import NotFoundYet, RosClient
 
@@ -160,9 +161,8 @@ class Pacer:
 
     def _begin(self) -> None:
         if self._thread is None:
-            thread = threading.Thread(target=self._run, name="ros-pacer", daemon=True)
-            thread.start()  # where that fails, the next response tries it again
-            self._thread = thread
+            # Where that fails, the next response tries it again.
+            self._thread = on_thread(self._run, name="ros-pacer")
         self._wake.notify()
 
     def _run(self) -> None:

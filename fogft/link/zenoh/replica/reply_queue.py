@@ -25,6 +25,7 @@ from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_streams import Stream
 from fogft.link.zenoh.settings import MESSAGE_BYTES_LIMIT
 from fogft.model.refusal import Refusal
+from fogft.process import on_thread
 from fogft.requests.load import Load
 
 log = logging.getLogger(__name__)
@@ -184,10 +185,8 @@ class ReplyQueues:
         if queue is not None:
             return queue
         queue = ReplyQueue()
-        queue.thread = threading.Thread(
-            target=self._run, args=(token, queue), name=f"fogft-reply-{robot}", daemon=True
-        )
-        queue.thread.start()  # where that fails, the next reply tries it again
+        # Where that fails, the next reply tries it again.
+        queue.thread = on_thread(self._run, token, queue, name=f"fogft-reply-{robot}")
         self._queues[token] = queue
         return queue
 
