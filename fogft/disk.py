@@ -323,11 +323,11 @@ def version(path: Path) -> tuple[int, int, int] | None:
 
 
 class Watched:
-    """Watches a file for being replaced."""
+    """Watches a file for being replaced; what is there `from_now` on is no change."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, from_now: bool = False) -> None:
         self.path = path
-        self._seen: tuple[int, int, int] | None = None
+        self._seen = version(path) if from_now else None
 
     def changed(self) -> bool:
         """Return whether the file is there and is not the one seen at the last call."""

@@ -82,8 +82,7 @@ class _Gateway:
         self._revoked: frozenset[str] = frozenset()
         self._listener: ZenohListener | None = None
         self._holder = self._own_holder()
-        self._certificate = Watched(config.credentials.certificate)
-        self._certificate.changed()
+        self._certificate = Watched(config.credentials.certificate, from_now=True)
         self._scrape = Scrape(lambda: proxies.of_gateway(self._told()), {"pool": config.pool})
 
     def _own_holder(self) -> Holder:

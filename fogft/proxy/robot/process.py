@@ -260,10 +260,9 @@ class _Running:
         """
         proxy, config, folder = self.proxy, self.config, self.config_path.parent
         memory, watchdog = memory_tuning.Trimmer(), Watchdog()
-        watched_config = Watched(self.config_path)
-        watched_config.changed()
-        watched_certificate = Watched(config.credentials.certificate)  # written after its key
-        watched_certificate.changed()
+        watched_config = Watched(self.config_path, from_now=True)
+        # It is written after its key.
+        watched_certificate = Watched(config.credentials.certificate, from_now=True)
         announcements = Watched(config.announcements) if config.announcements else None
         started = reported = time.monotonic()
         looked = 0.0
