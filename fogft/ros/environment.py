@@ -100,10 +100,9 @@ def child_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]
         return child
     kept = [
         part
-        for part in child.get("LD_LIBRARY_PATH", "").split(os.pathsep)
+        for part in child.pop("LD_LIBRARY_PATH", "").split(os.pathsep)
         if part and not _added_by_wheels(Path(part))
     ]
-    child.pop("LD_LIBRARY_PATH", None)
     if kept:
         child["LD_LIBRARY_PATH"] = os.pathsep.join(kept)
     return child

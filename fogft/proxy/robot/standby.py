@@ -20,7 +20,7 @@ from fogft import disk
 from fogft.errors import PoolBusy, StateError
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.proxy_config import ClientProxyConfig
-from fogft.process import Watchdog, notify
+from fogft.process import Watchdog, notify, on_thread
 from fogft.proxy import middleware
 from fogft.proxy.robot.client import ClientProxy
 from fogft.records.signing import Signer
@@ -122,8 +122,7 @@ def _take(
                 log.error("lock_failed reason=%r", str(error))
                 time.sleep(LOOK_S)
 
-    taking, watchdog = threading.Thread(target=take, name="standby", daemon=True), Watchdog()
-    taking.start()
+    taking, watchdog = on_thread(take, name="standby"), Watchdog()
     notify("READY=1")
     while taking.is_alive() and not stop.is_set():
         taking.join(LOOK_S)
