@@ -14,17 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fogft import __version__
 from fogft.model.plain import Moment, from_plain, stored, to_plain
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
+from fogft.model.replica import LinkReport, LinkState, Machine, Phase, ReplicaId
 from fogft.model.topic import PREFIX, Origin
 from fogft.model.topology import Gateway, RobotRoute, Topology, trouble
-from fogft.planning.observed.history import OF_NO_REPLICA, Event, EventKind, History
+from fogft.planning.observed.history import OF_NO_REPLICA, Event, EventKind, History, Record
 from fogft.pool.manager.proxy_report import Counters, GatewayLink, ProxyReport, TopicCounted
 from fogft.reason_words import words
 
 if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
-    from fogft.model.replica import Machine
     from fogft.planning.observed.health import Assessment
-    from fogft.planning.observed.history import Record
     from fogft.pool.manager.reconciler import Tick
 
 VERSION = 1
