@@ -81,7 +81,7 @@ class Signer:
                 return
             raise CredentialError(f"`{self._key_path}` does not belong to its certificate")
         self._version, self._der, self._key = version, certificate.public_bytes(Encoding.DER), key
-        self._common_name = _attribute(certificate, "CN")
+        self._common_name = attribute(certificate, "CN")
 
 
 class Verifier:
@@ -118,7 +118,7 @@ class Verifier:
             key.verify(signature, message, ec.ECDSA(hashes.SHA256()))
         except InvalidSignature:
             raise RecordError("forged", "a signature that is wrong") from None
-        return Writer(_attribute(known, "OU"), _attribute(known, "CN"))
+        return Writer(attribute(known, "OU"), attribute(known, "CN"))
 
     def _judged(self, der: bytes) -> x509.Certificate:
         from cryptography import x509
@@ -144,7 +144,7 @@ class Verifier:
 
     def _check_time(self, certificate: x509.Certificate) -> None:
         now = datetime.datetime.now(datetime.timezone.utc)
-        name = _attribute(certificate, "CN")
+        name = attribute(certificate, "CN")
         if now < certificate.not_valid_before_utc:
             raise RecordError("expired", f"the certificate of `{name}` is not valid yet")
         if now >= certificate.not_valid_after_utc:
@@ -170,7 +170,8 @@ def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
     return True
 
 
-def _attribute(certificate: x509.Certificate, which: str) -> str:
+def attribute(certificate: x509.Certificate, which: str) -> str:
+    """Return a certificate's common name (``CN``) or unit (``OU``); empty unless it has one."""
     from cryptography import x509
 
     oids = {"CN": x509.NameOID.COMMON_NAME, "OU": x509.NameOID.ORGANIZATIONAL_UNIT_NAME}

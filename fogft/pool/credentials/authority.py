@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from fogft import disk
 from fogft.errors import CredentialError
 from fogft.model.credentials import Role
+from fogft.records.signing import attribute
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -111,11 +112,9 @@ def describe_pem(pem: bytes) -> Description:
 
 
 def _described(certificate: x509.Certificate) -> Description:
-    from cryptography import x509
-
     return Description(
-        common_name=_name(certificate, x509.NameOID.COMMON_NAME),
-        role=_name(certificate, x509.NameOID.ORGANIZATIONAL_UNIT_NAME),
+        common_name=attribute(certificate, "CN"),
+        role=attribute(certificate, "OU"),
         serial=f"{certificate.serial_number:x}",
         not_before=certificate.not_valid_before_utc,
         not_after=certificate.not_valid_after_utc,
@@ -230,8 +229,3 @@ def _load_certificate(path: Path) -> x509.Certificate:
 
 def _reason(error: Exception) -> str:
     return (error.strerror or str(error)) if isinstance(error, OSError) else "it is damaged"
-
-
-def _name(certificate: x509.Certificate, oid: x509.ObjectIdentifier) -> str:
-    attributes = certificate.subject.get_attributes_for_oid(oid)
-    return str(attributes[0].value) if attributes else ""
