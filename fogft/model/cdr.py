@@ -8,6 +8,7 @@ field stands at a multiple of its own size, counted from behind the header of fo
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from struct import Struct
 
 from fogft.model.type_definition import Fields
@@ -131,7 +132,8 @@ class Shape:
         if found := _STRING.fullmatch(kind):
             return _string(int(found["bound"] or 0))
         if found := _ARRAY.fullmatch(kind):
-            return _array(self._kind(found["of"], within), int(found["count"]))
+            of = self._kind(found["of"], within)
+            return _Kind(partial(_several, of, int(found["count"])), of.align, of.has_fixed_size)
         if found := _SEQUENCE.fullmatch(kind):
             return _sequence(self._kind(found["of"], within), int(found["bound"] or 0))
         return self._message(kind, within)
@@ -161,13 +163,6 @@ def _string(bound: int) -> _Kind:
         return data.skip(at, length)
 
     return _Kind(walk, 4, False)
-
-
-def _array(of: _Kind, count: int) -> _Kind:
-    def walk(data: _Bytes, at: int) -> int:
-        return _several(of, count, data, at)
-
-    return _Kind(walk, of.align, of.has_fixed_size)
 
 
 def _sequence(of: _Kind, bound: int) -> _Kind:
