@@ -48,13 +48,6 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         raise ValueError(f"`{spec.name}` has no parameter `{unknown[0]}`")
     if not news:
         return spec
-    if spec.part is not Part.NONE:
-        timeout_s = news["timeout_s"]
-        if isinstance(timeout_s, bool) or not isinstance(timeout_s, (int, float)):
-            raise ValueError("timeout_s: must be a number")
-        if not 0 < timeout_s <= LONGEST_S:
-            raise ValueError(f"timeout_s: must be a number above 0 and at most {LONGEST_S:g}")
-        return replace(spec, timeout_s=float(timeout_s))
     raw: dict[str, Any] = {**to_plain(spec, omit_defaults=True), **news}
     if raw.get("on_timeout") != OnTimeout.FALLBACK.value:
         raw.pop("fallback_service", None)
@@ -63,6 +56,8 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
     below = {key: raw.pop(key) for key in _ADVANCED & raw.keys()}
     section = Section("parameter", spec.name, tree({**raw, ADVANCED: below}))
     try:
+        if spec.part is not Part.NONE:  # no more of it is a parameter
+            return replace(spec, timeout_s=section.number("timeout_s", LONGEST_S, "seconds"))
         read: ServiceSpec = Reader(RULES).map(ServiceSpec, section)
     except SpecError as error:
         key = error.key.removeprefix(f"{spec.name}.").removeprefix(f"{ADVANCED}.")
