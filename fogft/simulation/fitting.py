@@ -118,7 +118,7 @@ def correlation(one: Timeline, other: Timeline) -> float | None:
     """Return the correlation of two locations' capacity over shared time; None if constant."""
     length_s = min(one.length_s, other.length_s)
     a, b = one.window(0, length_s), other.window(0, length_s)
-    mean_a, mean_b = a.room_s() / length_s, b.room_s() / length_s
+    mean_a, mean_b = (sum(s for room, s, _ in x.spells() if room) / length_s for x in (a, b))
     spread = mean_a * (1 - mean_a) * mean_b * (1 - mean_b)
     if spread <= 0:
         return None

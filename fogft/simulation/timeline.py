@@ -39,10 +39,6 @@ class Timeline:
         for index, ((at, room), end) in enumerate(zip(merged, ends, strict=True)):
             yield bool(room), end - at, index < len(merged) - 1
 
-    def room_s(self) -> float:
-        """Return for how long there was capacity, in seconds."""
-        return sum(seconds for room, seconds, _ in self.spells() if room)
-
 
 def of_samples(counts: Sequence[int], gap_s: float) -> Timeline:
     """Return the timeline of samples taken every `gap_s`: each holds until the next."""
