@@ -9,6 +9,8 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from operator import itemgetter
 
 UNLIMITED = 1 << 30
 PER_USD = 1_000_000  # a timeline of prices is in millionths of a US dollar per hour
@@ -52,8 +54,4 @@ def of_changes(changes: Iterable[tuple[float, int]], length_s: float) -> Timelin
 
 
 def _distinct(changes: Iterable[tuple[float, int]]) -> Iterator[tuple[float, int]]:
-    last: int | None = None
-    for at, value in changes:
-        if value != last:
-            yield at, value
-            last = value
+    return (next(same) for _, same in groupby(changes, itemgetter(1)))
