@@ -33,6 +33,8 @@ PROBED, PROBED_TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTyp
 EMPTY_LIST = b"\x00\x01\x00\x00" + bytes(4)  # of names of parameters
 KEPT = 64
 
+_Due = tuple[bytes, ClientPace, Any, bytes]  # a response to a client, by its id and handle
+
 
 class NodeProbes:
     """Probes of the nodes in one ROS domain, for the clients of all services. Any thread.
@@ -180,17 +182,14 @@ class Pacer:
                     self._try(id, client, handle, payload)
                 except RosError as error:
                     log.warning("response_refused reason=%r", error.message)
-            for id, count in probed:
-                for _ in range(count):
-                    self.probes.send(id, partial(self._answered, id))
+            for id in probed:
+                self.probes.send(id, partial(self._answered, id))
             for id in asked:
                 self._ask(id)
 
-    def _step(
-        self, now: float
-    ) -> tuple[list[tuple[bytes, ClientPace, Any, bytes]], list[tuple[bytes, int]], float | None]:
-        """Return what to send now, whom to probe how often, and how long to wait if nothing."""
-        due: list[tuple[bytes, ClientPace, Any, bytes]] = []
+    def _step(self, now: float) -> tuple[list[_Due], list[bytes], float | None]:
+        """Return what to send now, whom to probe, each as often, how long to wait if nothing."""
+        due: list[_Due] = []
         in_the_way: dict[bytes, ClientPace] = {}
         for id, client in list(self._held.items()):
             finding = client.finding_until is not None
@@ -206,9 +205,7 @@ class Pacer:
                 del self._held[id]
         probed = []
         for id, client in in_the_way.items():
-            count = client.probes_due(now, self._pace.sent)
-            if count:
-                probed.append((id, count))
+            probed += [id] * client.probes_due(now, self._pace.sent)
         if self._asked:
             return due, probed, _ASK_EVERY_S
         by_time = any(not client.strict for client in in_the_way.values())
