@@ -141,9 +141,7 @@ class Following:
         elif job is JobState.ENDED:
             words = "`fogft serve` exited on the machine" + self._job_tail(entry)
             self._fail(entry, Reason(Cause.ERROR, words=words))
-        elif (
-            self._lasts_s(entry) > SETUP_LIMIT_S
-        ):  # it was asked: who hears nothing concludes nothing
+        elif self._lasts_s(entry) > SETUP_LIMIT_S:  # asked: who hears nothing concludes nothing
             self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "setting up"))
 
     def _fail(self, entry: Entry, failure: Reason) -> None:
