@@ -67,11 +67,10 @@ class Operations(Generic[T]):
         error: Exception | None = None
         try:
             operation()
-        except FogftError as refused:
-            error = refused
-        except Exception as unexpected:
-            log.exception("operation_broke replica=%s", id.short)
-            error = unexpected
+        except Exception as failed:
+            if not isinstance(failed, FogftError):
+                log.exception("operation_broke replica=%s", id.short)
+            error = failed
         with self._lock:
             self._outcomes.append(Outcome(id, subject, error))
         del error  # its traceback holds this frame: neither is to keep the other alive
