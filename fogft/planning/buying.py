@@ -69,10 +69,7 @@ class Buyer:
 
     @property
     def _spent(self) -> float:
-        spent = self._spent_before
-        for launch in self.launches:
-            spent += launch.offer.usd_per_hour
-        return spent
+        return sum((launch.offer.usd_per_hour for launch in self.launches), self._spent_before)
 
     @cached_property
     def _backing_off(self) -> Mapping[str, Backoff]:
