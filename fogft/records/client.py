@@ -152,8 +152,7 @@ class RendezvousClient:
                     endpoint, self.credentials, self._signer, self._records.pool_uid
                 )
             except (FogftError, OSError, EOFError, ValueError, asyncio.TimeoutError) as error:
-                words = error.message if isinstance(error, FogftError) else str(error)
-                self._detail(endpoint, words or "it does not answer")
+                self._detail(endpoint, str(error) or "it does not answer")
             else:
                 self._seen_host = seen_host
                 self._detail(endpoint, "")
