@@ -217,8 +217,7 @@ class Auto(Learning):
             if load.waiting or self._demand.full:
                 self._demand.answered(load, now)
         known.answered(request, load, now)
-        if self._wanting:
-            self._released(replica, now)
+        self._released(replica, now)
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Note that an attempt ended without an answer."""
@@ -238,12 +237,11 @@ class Auto(Learning):
             self._replicas[replica].answered(request, None, now)
         else:
             self._replicas[replica].dropped(request)
-        if self._wanting:
-            self._released(replica, now)
+        self._released(replica, now)
 
     def _released(self, replica: int, now: float) -> None:
-        """Have a replica that has become free work on what waits for one."""
-        self.news = self.news or self._replicas[replica].free(now)
+        """Have a replica that has become free work on what waits for one, if anything does."""
+        self.news |= bool(self._wanting) and self._replicas[replica].free(now)
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False

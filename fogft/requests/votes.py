@@ -92,5 +92,4 @@ class Quorum(Decide):
 
     def report(self) -> dict[str, Any]:
         """Return how often replicas disagreed, by ``slot.generation``."""
-        disagreed = self.disagreed.items()
-        return {"disagreed": {short(key): n for key, n in disagreed}}
+        return {"disagreed": {short(key): n for key, n in self.disagreed.items()}}
