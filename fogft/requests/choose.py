@@ -172,7 +172,7 @@ class Failover(Learning):
                     self.look_at = min(self.look_at, overdue_at)
                 return ()
         self.hedges += bool(open)
-        self._failed = self._failed or self._current in open
+        self._failed |= self._current in open
         return self._asked(request, self._one_of(candidates), now)
 
     def _asked(self, request: bytes, chosen: Sequence[int], now: float) -> Sequence[int]:
@@ -198,14 +198,12 @@ class Failover(Learning):
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
         """Switch away from a replica that has no room, or too slow a path."""
         self._replicas[replica].dropped(request)
-        if full and replica == self._current:
-            self._failed = True
+        self._failed |= full and replica == self._current
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
         """Switch away from a replica that failed."""
         self._replicas[replica].dropped(request)
-        if replica == self._current:
-            self._failed = True
+        self._failed |= replica == self._current
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
         """Note that it works again."""
@@ -218,14 +216,12 @@ class Failover(Learning):
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
         """Switch away from a replica that missed a deadline: its service may hang."""
-        if expired and self._current in open:
-            self._failed = True
+        self._failed |= expired and self._current in open
 
     def hangs(self, replica: int) -> None:
         """Switch away from it, with all its requests."""
         super().hangs(replica)
-        if replica == self._current:
-            self._failed = True
+        self._failed |= replica == self._current
 
     def report(self) -> dict[str, Any]:
         """Return how often the replica changed, and how often another was asked as well."""
