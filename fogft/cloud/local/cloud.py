@@ -103,10 +103,8 @@ class LocalCloud:
     def log(self, id: ReplicaId) -> str | None:
         """Return the log of a machine, also for a while after its end."""
         folder = MachineFolder.under(self.machines_folder, id)
-        for path in (folder.log, ending.kept_log(self.root, id)):
-            if path.exists():
-                return str(path)
-        return None
+        paths = (folder.log, ending.kept_log(self.root, id))
+        return next((str(path) for path in paths if path.exists()), None)
 
     def folders(self) -> list[MachineFolder]:
         """Return the folders of all pools' machines, in any state, unordered."""
