@@ -25,18 +25,13 @@ def encode_message(session: bytes, number: int, message: bytes) -> bytes:
     return _HEAD.pack(session, number) + message
 
 
-def decode_place(frame: bytes) -> tuple[bytes, int]:
-    """Decode whose message of the robot it is, and its number. Raises FrameError."""
+def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
+    """Decode a message of the robot. Raises FrameError."""
     if len(frame) < _HEAD.size:
         raise FrameError(f"a message of {len(frame)} bytes")
     session, number = _HEAD.unpack_from(frame)
     _check(number)
-    return session, number
-
-
-def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
-    """Decode a message of the robot. Raises FrameError."""
-    return *decode_place(frame), frame[_HEAD.size :]
+    return session, number, frame[_HEAD.size :]
 
 
 def encode_pull(session: bytes, after: int) -> bytes:

@@ -115,63 +115,29 @@ class Judgement(Enum):
     NEW = auto()  # to be published
     KNOWN = auto()  # it was published
     LATE = auto()  # a later one was published: it never will be
-    EARLY = auto()  # an earlier one was refused, and comes again
-
-
-class _Start:
-    """A robot's messages since one of its starts."""
-
-    def __init__(self) -> None:
-        self.last = self.published = 0  # the last one's number; a bit for each, `last` the lowest
-        self.refused, self.until = range(0), 0.0  # numbers, and until when that counts
 
 
 class Seen:
     """Judges the messages of one topic at a replica, by robot and its start."""
 
     robots, starts = 256, 4  # that are remembered; those longest silent are forgotten
-    wait_s = 1.0  # so long later ones wait for one that was refused: its robot may have dropped it
 
     def __init__(self) -> None:
-        self._of: dict[str, dict[bytes, _Start]] = {}
+        # Of each start the last number that was published, and a bit for each up to it.
+        self._of: dict[str, dict[bytes, tuple[int, int]]] = {}
 
-    def judge(self, robot: str, session: bytes, number: int, now: float) -> Judgement:
+    def judge(self, robot: str, session: bytes, number: int) -> Judgement:
         """Return what to do with a message; if it is new, it counts as published."""
-        if self.is_early(robot, session, number, now):
-            return Judgement.EARLY
-        start = self._start(robot, session)
-        ahead = number - start.last
-        if ahead <= 0:
-            return Judgement.KNOWN if start.published >> -ahead & 1 else Judgement.LATE
-        start.published = (start.published << min(ahead, _KNOWN) | 1) & _MASK
-        start.last = number
-        return Judgement.NEW
-
-    def is_early(self, robot: str, session: bytes, number: int, now: float) -> bool:
-        """Whether an earlier one was refused, and will come again: then it is refused, too.
-
-        One that comes again is the earliest that its robot still has, and so is one that cannot
-        have been under way with what was refused.
-        """
-        start = self._start(robot, session)
-        if now >= start.until or number < start.refused.start:
-            return False
-        if number in start.refused or number > start.refused.start + Outbox.window:
-            start.until = 0.0
-            return False
-        start.refused = range(start.refused.start, number + 1)
-        return True
-
-    def refused(self, robot: str, session: bytes, number: int, now: float) -> None:
-        """Note that a message was refused and comes again: none after it may overtake it."""
-        start = self._start(robot, session)
-        if number > start.last and not self.is_early(robot, session, number, now):
-            start.refused, start.until = range(number, number + 1), now + self.wait_s
-
-    def _start(self, robot: str, session: bytes) -> _Start:
         starts = self._of[robot] = self._of.pop(robot, {})
-        start = starts[session] = starts.pop(session, _Start())
+        last, published = starts.pop(session, (0, 0))
+        ahead = number - last
+        if ahead > 0:
+            starts[session] = number, (published << min(ahead, _KNOWN) | 1) & _MASK
+        else:
+            starts[session] = last, published
         for of, most in ((self._of, self.robots), (starts, self.starts)):
             if len(of) > most:
                 del of[next(iter(of))]  # type: ignore[arg-type]
-        return start
+        if ahead > 0:
+            return Judgement.NEW
+        return Judgement.KNOWN if published >> -ahead & 1 else Judgement.LATE

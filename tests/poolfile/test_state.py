@@ -175,6 +175,6 @@ def test_a_quorum_that_can_be_reached_is_taken(more):
 
 def test_a_pool_is_not_scaled_below_a_quorum():
     spec = pool_file.parse(FILE + "      quorum: 2\n  replicas: 3\n", file="p.yaml")
-    fewer = scale(Intent(), spec, -1)
+    fewer = scale(Intent(), spec, -1, 0.0)
     with pytest.raises(FogftError, match="cannot scale `p` to 1 replicas: the minimum is 2"):
-        scale(fewer, spec, -1)
+        scale(fewer, spec, -1, 0.0)

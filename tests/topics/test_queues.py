@@ -12,7 +12,7 @@ TWO_STARTS = ((b"a", 5), (b"a", 5), (b"a", 4), (b"b", 1))
 
 
 def is_new(seen: Seen, number: int, robot: str = "robot") -> bool:
-    return seen.judge(robot, b"start", number, 0.0) is Judgement.NEW
+    return seen.judge(robot, b"start", number) is Judgement.NEW
 
 
 @given(
@@ -107,28 +107,9 @@ def test_what_waits_for_a_replica_is_bounded_in_bytes_but_the_newest_stays():
 
 def test_a_robot_that_starts_anew_is_another_publisher():
     seen = Seen()
-    judged = [seen.judge("r", session, number, 0.0) for session, number in TWO_STARTS]
+    judged = [seen.judge("r", session, number) for session, number in TWO_STARTS]
     assert judged == [Judgement.NEW, Judgement.KNOWN, Judgement.LATE, Judgement.NEW]
-
-
-def test_what_overtakes_a_refused_message_waits_for_it_but_not_for_ever():
-    seen = Seen()
-    assert seen.judge("r", b"a", 1, 0.0) is Judgement.NEW
-    seen.refused("r", b"a", 2, 0.0)
-    for number in (3, 4):
-        assert seen.judge("r", b"a", number, 0.1) is Judgement.EARLY
-    for number in (2, 3, 4):
-        assert seen.judge("r", b"a", number, 0.2) is Judgement.NEW
-    seen.refused("r", b"a", 5, 1.0)
-    assert seen.judge("r", b"a", 7, 1.1) is Judgement.EARLY
-    assert seen.judge("r", b"a", 7, 1.2) is Judgement.NEW, "5 and 6 were dropped for newer ones"
-    assert seen.judge("r", b"a", 6, 1.3) is Judgement.LATE
-    seen.refused("r", b"a", 8, 2.0)
-    assert seen.judge("r", b"a", 8 + Outbox.window, 2.1) is Judgement.EARLY
-    assert seen.judge("r", b"a", 9 + Outbox.window, 2.2) is Judgement.NEW, "so many are never on"
-    seen.refused("r", b"a", 30, 2.3)
-    assert seen.judge("r", b"a", 31, 3.3) is Judgement.NEW, "it comes no more"
-    assert seen.judge("r", b"a", 1 << 62, 3.0) is Judgement.NEW
+    assert seen.judge("r", b"a", 1 << 62) is Judgement.NEW
 
 
 @pytest.mark.parametrize("latched", [False, True])
@@ -214,5 +195,5 @@ def test_the_robots_that_spoke_last_are_remembered():
     assert not is_new(seen, 9, "c")
     assert is_new(seen, 9, "b"), "it was silent for longest"
     for start in (b"1", b"2", b"3"):
-        assert seen.judge("b", start, 1, 0.0) is Judgement.NEW
+        assert seen.judge("b", start, 1) is Judgement.NEW
     assert not is_new(seen, 9, "c"), "who starts often puts out only itself"

@@ -6,7 +6,6 @@ Design: docs/design/topics.md.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import threading
@@ -36,7 +35,7 @@ HOLD_S = 2.0
 LOOK_EVERY_S = 2.0  # whether publishers are heard
 _HELD_LIMIT = 64  # pulls of one topic; beyond it one of whom has most is answered with nothing
 _BATCH_BYTES = 8 << 20
-_AGAIN_S = 0.2
+_AGAIN_S = 0.2  # a robot rests for so long after a refusal
 _WAITING_LIMIT = 1024  # messages that wait to be published, or pulls to be answered
 _WAITING_BYTES = 64 << 20
 
@@ -173,7 +172,6 @@ class TopicsOnReplica:
         self._topics = {topic.key_name: topic for topic in topics}
         self.types = {name: topic.type for name, topic in self._topics.items()}
         self._clock = clock
-        self._lock = threading.Lock()  # of `_seen`
         session = os.urandom(frames.SESSION_BYTES)
         self._outgoing = {
             name: _Outgoing(topic, session, clock)
@@ -191,8 +189,13 @@ class TopicsOnReplica:
             for name, topic in self._topics.items()
         }
         # Publishing may block for a moment, and answers are copied: the wire's threads must not.
-        self.inboxes = _Inbox(self._publish, self._turn_away), _Inbox(self._answer, _overloaded)
+        self.inboxes = (
+            _Inbox(self._publish, self._turn_away),
+            _Inbox(self._answer, self._overloaded),
+        )
         self._running = False
+        # Until when a robot sends nothing on a topic, but for what was on its way as it was refused.
+        self._rests: dict[tuple[str, str], float] = {}
 
     def __bool__(self) -> bool:
         return bool(self._topics)
@@ -245,24 +248,24 @@ class TopicsOnReplica:
 
     def request(self, incoming: Incoming) -> None:
         """Take a message or a pull from the link. Never blocks."""
-        asks = incoming.service in self._outgoing
-        if not asks and self._is_early(incoming):
+        name = incoming.service
+        if name in self._outgoing:
+            self.inboxes[1].put(incoming)
+        elif self._clock() < self._rests.get((name, incoming.robot), 0.0):
             incoming.refuse(Refusal.OVERLOADED)
-            return
-        self.inboxes[asks].put(incoming)
-
-    def _is_early(self, incoming: Incoming) -> bool:
-        with contextlib.suppress(FrameError), self._lock:
-            place = frames.decode_place(incoming.payload)
-            seen = self._seen[incoming.service]
-            return seen.is_early(incoming.robot, *place, self._clock())
-        return False
+        elif name in self._publishers:
+            self.inboxes[0].put(incoming)
+        else:
+            self._turn_away(incoming, Refusal.NOT_READY)
 
     def _answer(self, incoming: Incoming) -> None:
         try:
             self._outgoing[incoming.service].pulled(incoming)
         except FrameError:
             incoming.refuse(Refusal.MALFORMED)
+
+    def _overloaded(self, incoming: Incoming) -> None:
+        incoming.refuse(Refusal.OVERLOADED)
 
     def tick(self) -> None:
         """Answer pulls at their time limit. Call at about 10 Hz."""
@@ -276,7 +279,7 @@ class TopicsOnReplica:
 
     def _publish(self, incoming: Incoming) -> None:
         """Publish a message, and confirm it to its robot."""
-        name, robot = incoming.service, incoming.robot
+        name = incoming.service
         try:
             session, number, message = frames.decode_message(incoming.payload)
             publisher = self._publishers.get(name)
@@ -284,11 +287,7 @@ class TopicsOnReplica:
                 self._turn_away(incoming, Refusal.NOT_READY)
                 return
             publisher.check(message)
-            with self._lock:
-                judged = self._seen[name].judge(robot, session, number, self._clock())
-            if judged is Judgement.EARLY:
-                incoming.refuse(Refusal.OVERLOADED)
-                return
+            judged = self._seen[name].judge(incoming.robot, session, number)
             if judged is Judgement.LATE:
                 raise FrameError("a later one was published")
             if judged is Judgement.NEW:
@@ -303,19 +302,11 @@ class TopicsOnReplica:
             incoming.refuse(Refusal.NOT_READY)
 
     def _turn_away(self, incoming: Incoming, reason: Refusal = Refusal.OVERLOADED) -> None:
-        """Refuse a message; where its robot sends it again, those after it wait for it."""
-        name = incoming.service
-        with contextlib.suppress(FrameError), self._lock:
-            place = frames.decode_place(incoming.payload)
-            if self._topics[name].reliable:
-                self._seen[name].refused(incoming.robot, *place, self._clock())
+        """Refuse a message, and those that are on their way behind it: they must not overtake it."""
+        self._rests[incoming.service, incoming.robot] = self._clock() + _AGAIN_S
         incoming.refuse(reason)
 
     def close(self) -> None:
         """Stop publishing."""
         for inbox in self.inboxes:
             inbox.close()
-
-
-def _overloaded(incoming: Incoming) -> None:
-    incoming.refuse(Refusal.OVERLOADED)
