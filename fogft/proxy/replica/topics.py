@@ -189,12 +189,10 @@ class TopicsOnReplica:
             for name, topic in self._topics.items()
         }
         # Publishing may block for a moment, and answers are copied: the wire's threads must not.
-        self.inboxes = (
-            _Inbox(self._publish, self._turn_away),
-            _Inbox(self._answer, self._overloaded),
-        )
+        messages = _Inbox(self._publish, self._turn_away)
+        self.inboxes = messages, _Inbox(self._answer, self._overloaded)
         self._running = False
-        # Until when a robot sends nothing on a topic, but for what was on its way as it was refused.
+        # Until when a robot sends nothing on a topic but what was on its way before.
         self._rests: dict[tuple[str, str], float] = {}
 
     def __bool__(self) -> bool:
@@ -302,7 +300,7 @@ class TopicsOnReplica:
             incoming.refuse(Refusal.NOT_READY)
 
     def _turn_away(self, incoming: Incoming, reason: Refusal = Refusal.OVERLOADED) -> None:
-        """Refuse a message, and those that are on their way behind it: they must not overtake it."""
+        """Refuse a message, and those on their way behind it: they must not overtake it."""
         self._rests[incoming.service, incoming.robot] = self._clock() + _AGAIN_S
         incoming.refuse(reason)
 
