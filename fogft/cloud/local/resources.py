@@ -30,7 +30,7 @@ def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer
     """Return each zone's cheapest instance that meets the resources. Raises `SpecError`: none."""
     best: dict[Placement, Offer] = {}
     for where, entry in alternatives(resources):
-        spot = use_spot(where, entry)
+        spot = bool(entry.get("use_spot"))
         instance = _instance(catalogue, where, entry, spot)
         for zone in _zones(catalogue, where, entry):
             price = instance.spot_usd_per_hour if spot else instance.usd_per_hour
@@ -40,27 +40,21 @@ def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer
 
 
 def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield each alternative, complete, with the path of its keys."""
+    """Yield each alternative, complete, with the path of its keys.
+
+    The form of the lists and of `use_spot` was checked with the pool file (`check_resources`).
+    """
     _check_keys("resources", resources, ("any_of", "ordered"))
-    lists = [key for key in ("any_of", "ordered") if resources.get(key) is not None]
-    if len(lists) == 2:
+    if resources.get("any_of") and resources.get("ordered"):
         raise SpecError.of_key(
             "resources.ordered", "cannot be combined with `any_of`", "keep one of them"
         )
-    entries = resources[lists[0]] if lists else [{}]
-    path = f"resources.{lists[0]}" if lists else "resources"
-    if not isinstance(entries, Sequence) or isinstance(entries, str) or not entries:
-        raise SpecError.of_key(path, "must be a list", "write `[{infra: local/us-west-1}]`")
-    for index, entry in enumerate(entries):
-        where = f"{path}[{index}]"
-        if not isinstance(entry, Mapping):
-            what = f"must be a map, not {shown(entry)}"
-            raise SpecError.of_key(where, what, "write `{infra: local/us-west-1}`")
-        _check_keys(where, entry, ())
-    yield from each(resources)
+    for where, entry in each(resources):
+        _check_keys(where, entry)
+        yield where, entry
 
 
-def _check_keys(where: str, entry: Mapping[str, Any], more: Sequence[str]) -> None:
+def _check_keys(where: str, entry: Mapping[str, Any], more: Sequence[str] = ()) -> None:
     for key in entry:
         if key not in _KNOWN and key not in more and not str(key).startswith("_"):
             hint = nearest(str(key), (*_KNOWN, *more))
@@ -94,15 +88,6 @@ def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Z
         here = f"region `{region}`" if region else "the local cloud"
         raise wrong("zone", f"{here} has no zone", name, {zone.name for zone in there})
     return found
-
-
-def use_spot(where: str, entry: Mapping[str, Any]) -> bool:
-    """Return whether an alternative asks for spot. Raises `SpecError` for what is neither."""
-    spot = entry.get("use_spot")
-    if spot is not None and not isinstance(spot, bool):
-        what = f"must be true or false, not {shown(spot)}"
-        raise SpecError.of_key(f"{where}.use_spot", what, "write `use_spot: true`")
-    return bool(spot)
 
 
 def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: bool) -> Instance:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft.cloud.local.catalogue import Instance
-from fogft.cloud.local.resources import alternatives, suffices, use_spot
+from fogft.cloud.local.resources import alternatives, suffices
 from fogft.errors import SpecError
 from fogft.model.replica import Offer, Placement
 from fogft.poolfile.named_clouds import sells
@@ -45,7 +45,7 @@ class PriceTable:
         """List of each place the cheapest machine that suits, the cheapest first."""
         best: dict[object, Offer] = {}
         for where, entry in alternatives(resources):
-            spot = use_spot(where, entry)
+            spot = bool(entry.get("use_spot"))
             named = {place for place in self._places if sells(entry, *place)}
             for row in self._rows:
                 price = row.instance.spot_usd_per_hour if spot else row.instance.usd_per_hour
