@@ -7,7 +7,8 @@ from pathlib import Path
 from fogft.errors import SpecError
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import yaml_tree
-from fogft.poolfile.pool import UNCHECKED, Checks, mistakes_in, pool_spec
+from fogft.poolfile.pool import UNCHECKED, Checks, pool_spec
+from fogft.poolfile.tree import Mistakes
 
 MAX_BYTES = 1 << 20
 
@@ -18,12 +19,15 @@ def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
 
 
 def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
-    """Return all mistakes in a pool file, by line; only the first if it is not YAML."""
+    """Return all mistakes in a pool file, by line; only the first if it is not YAML.
+
+    What depends on something that is wrong is not judged: that may still be wrong then.
+    """
     checks = replace(checks, workdir=partial(_no_folder, path.parent))
-    try:
-        return mistakes_in(yaml_tree.tree(read_text(path), str(path)), str(path), checks)
-    except SpecError as error:
-        return [error]
+    found = Mistakes(keep=True)
+    with found.step():
+        pool_spec(yaml_tree.tree(read_text(path), str(path)), str(path), checks, found)
+    return sorted(found.found, key=lambda error: error.line)
 
 
 def parse(

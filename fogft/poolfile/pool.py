@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import PurePath
 from typing import Any
 
-from fogft.errors import FogftError, SpecError
+from fogft.errors import FogftError
 from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
 from fogft.model.groups import MAX_GROUPS
 from fogft.model.names import NAMES_BYTES_LIMIT, POOL_NAME_PATTERN
@@ -40,17 +40,6 @@ class Checks:
 
 
 UNCHECKED = Checks()
-
-
-def mistakes_in(root: Node, file: str, checks: Checks = UNCHECKED) -> list[SpecError]:
-    """Return all mistakes in a pool file, by line.
-
-    What depends on something that is wrong is not judged: that may still be wrong then.
-    """
-    found = Mistakes(keep=True)
-    with found.step():
-        pool_spec(root, file, checks, found)
-    return sorted(found.found, key=lambda error: error.line)
 
 
 def pool_spec(

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from fogft.errors import SpecError
 from fogft.poolfile import yaml_tree
-from fogft.poolfile.pool import Checks, mistakes_in, pool_spec
+from fogft.poolfile.pool import Checks, pool_spec
+from fogft.poolfile.tree import Mistakes
 
 BAD = """\
 name: Pool!
@@ -44,7 +45,10 @@ ALL = [
 
 
 def found(text: str, **checks) -> list[SpecError]:
-    return mistakes_in(yaml_tree.tree(text, "p.yaml"), "p.yaml", Checks(**checks))
+    mistakes = Mistakes(keep=True)
+    with mistakes.step():
+        pool_spec(yaml_tree.tree(text, "p.yaml"), "p.yaml", Checks(**checks), mistakes)
+    return sorted(mistakes.found, key=lambda error: error.line)
 
 
 def test_every_mistake_is_found_with_its_line():
