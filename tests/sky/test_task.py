@@ -125,9 +125,6 @@ def test_files_of_the_user_are_kept_beside_those_of_fogft():
 @pytest.mark.parametrize(
     ("asked", "key"),
     [
-        ({"num_nodes": 2}, "num_nodes"),
-        ({"service": {}}, "service"),
-        ({"pool": {}}, "pool"),
         ({"resources": {"ports": 80}}, "resources.ports"),
         ({"resources": {"autostop": 5}}, "resources.autostop"),
         ({"resources": {"any_of": [{"job_recovery": "x"}]}}, r"resources.any_of\[0\].job_recovery"),

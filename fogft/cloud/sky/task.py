@@ -24,11 +24,6 @@ _CHOICES = (
     *("instance_type", "use_spot", "accelerators"),
 )
 FEATURES = ("use_spot", "ports", "autostop")  # what a cloud may lack, whatever it sells
-_REFUSED_TASK = {
-    "num_nodes": "a replica is one machine: ask for more under `fogft.replicas`",
-    "service": "that section is SkyServe's: the `fogft` section takes its place",
-    "pool": "that section is for SkyPilot's managed jobs",
-}
 _REFUSED_RESOURCES = {
     "ports": "only the link's port is opened; robots reach the services through it",
     "autostop": "a replica runs as long as its pool needs it",
@@ -37,10 +32,7 @@ _REFUSED_RESOURCES = {
 
 
 def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
-    """Raise `SpecError` for a field of a pool file's task that a pool decides itself."""
-    for key, reason in _REFUSED_TASK.items():
-        if key in task and not (key == "num_nodes" and task[key] == 1):
-            raise SpecError.of_key(key, "is not supported in a pool", reason)
+    """Raise `SpecError` for a field of a checked pool file's task that a pool decides itself."""
     for target in task.get("file_mounts") or {}:
         if os.path.normpath(str(target)).startswith(OURS):
             raise SpecError.of_key(f"file_mounts.{target}", f"`{OURS}` is fogft's own folder")
