@@ -38,7 +38,7 @@ def aws_action(body: str) -> Notice | None:
     action = value.get("action", "unknown")
     if action == "none":
         return None
-    at = _iso(value.get("time"))
+    at = moment(value.get("time"))
     return Notice(NoticeKind.PREEMPTION, at, "aws", f"spot instance action: {action}")
 
 
@@ -88,12 +88,13 @@ def _map(body: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
-def _iso(text: Any) -> float | None:
+def moment(text: Any) -> float | None:
+    """Return a time of AWS's in seconds since the epoch; None for what is none."""
     try:
-        when = datetime.strptime(str(text), "%Y-%m-%dT%H:%M:%SZ")
+        read = datetime.fromisoformat(str(text).replace("UTC", "+00:00").replace("Z", "+00:00"))
     except ValueError:
         return None
-    return when.replace(tzinfo=timezone.utc).timestamp()
+    return (read if read.tzinfo else read.replace(tzinfo=timezone.utc)).timestamp()
 
 
 def _http_date(text: Any) -> float | None:

@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+from fogft.cloud.notice_formats import moment
 from fogft.cloud.sky import naming
 from fogft.cloud.sky.failures import classify, plain
 from fogft.cloud.sky.provider import Instance, NotAllowedError
@@ -108,7 +109,7 @@ class Aws:
                 cache = Path("~/.aws/sso/cache").expanduser() / f"{name}.json"
                 token = json.loads(cache.read_text())
                 found.append("" if token.get("refreshToken") else str(token.get("expiresAt", "")))
-        return min((at for at in map(_moment, found) if at), default=None)
+        return min((at for at in map(moment, found) if at), default=None)
 
     def quota(self, region: str, code: str) -> float | None:
         """See `Provider`. By the code of AWS's Service Quotas."""
@@ -207,15 +208,6 @@ class Aws:
                     self.clients.clear()
                 hint = "renew the AWS credentials; `sky check aws` tests them"
             raise CloudUnreachable(f"AWS did not answer about `{region}`: {error}", hint) from error
-
-
-def _moment(text: str) -> float:
-    """Return a time of AWS's in seconds since the epoch; 0 for what is none."""
-    try:
-        read = datetime.datetime.fromisoformat(text.replace("UTC", "+00:00").replace("Z", "+00:00"))
-    except ValueError:
-        return 0.0
-    return (read if read.tzinfo else read.replace(tzinfo=datetime.timezone.utc)).timestamp()
 
 
 def _mighty(iam: Any) -> list[str] | None:
