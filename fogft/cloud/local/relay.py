@@ -67,7 +67,7 @@ class _Pipe:
     def __post_init__(self) -> None:
         self._chunks: asyncio.Queue[tuple[float, bytes]] = asyncio.Queue()
         self._has_room = asyncio.Event()
-        self.held_bytes = 0
+        self.held_bytes = 0  # received and not yet passed on
 
     def put(self, chunk: bytes) -> None:
         """Put a chunk on the path."""
@@ -115,22 +115,12 @@ class Relay:
         self._loop = asyncio.new_event_loop()
         self._passes = asyncio.Event()  # unless there is a blackhole
         self._passes.set()
-        self._connections: dict[asyncio.Task[None], tuple[_Pipe, ...]] = {}
+        self.connections: dict[asyncio.Task[None], tuple[_Pipe, ...]] = {}
         self._listener = socket.create_server(("127.0.0.1", 0), backlog=128)
         self._listener.setblocking(False)
         self.endpoint = f"127.0.0.1:{self._listener.getsockname()[1]}"  # where it listens
         self._accepting = self._loop.create_task(self._accept())
         self.reached = False  # whether the server has ever accepted a connection
-
-    @property
-    def connections(self) -> int:
-        """How many connections there are."""
-        return len(self._connections)
-
-    @property
-    def held_bytes(self) -> int:
-        """How much has been received and not yet passed on."""
-        return sum(pipe.held_bytes for pipes in self._connections.values() for pipe in pipes)
 
     def set_faults(self, faults: LinkFaults) -> None:
         """Change what is wrong with the path (deadlines already applied)."""
@@ -148,7 +138,7 @@ class Relay:
 
     def close(self) -> None:
         """End all connections and stop listening."""
-        tasks = [self._accepting, *self._connections]
+        tasks = [self._accepting, *self.connections]
         for task in tasks:
             task.cancel()
         self._loop.run_until_complete(asyncio.gather(*tasks, return_exceptions=True))
@@ -163,7 +153,7 @@ class Relay:
                 await asyncio.sleep(RETRY_S)
                 continue
             connection = self._loop.create_task(self._serve(client, host))
-            self._connections[connection] = ()
+            self.connections[connection] = ()
             self._young[connection] = host
             connection.add_done_callback(partial(self._forget, client))
             if len(self._young) > _YOUNG_LIMIT:
@@ -173,7 +163,7 @@ class Relay:
     def _forget(self, client: socket.socket, connection: asyncio.Task[None]) -> None:
         client.close()  # of one that was cancelled before it began
         self._young.pop(connection, None)
-        del self._connections[connection]
+        del self.connections[connection]
 
     async def _serve(self, client: socket.socket, host: str) -> None:
         client.setblocking(False)
@@ -229,7 +219,7 @@ class Relay:
         connection = asyncio.current_task()
         assert connection is not None
         self._young.pop(connection, None)
-        self._connections[connection] = pipes
+        self.connections[connection] = pipes
         ways = [asyncio.ensure_future(way) for p in pipes for way in (p.receive(), p.send())]
         try:
             await asyncio.gather(*ways)
