@@ -31,7 +31,6 @@ LEAF_DAYS = 365.0
 RENEW_BEFORE = datetime.timedelta(days=60)
 # Robots' clocks are wrong; a certificate that begins tomorrow, by their clock, is refused.
 BACKDATE = datetime.timedelta(hours=24)
-_COMMON_NAME_LIMIT = 64  # X.520's upper bound
 
 
 @dataclass(frozen=True)
@@ -76,8 +75,6 @@ def create_authority(folder: Path, pool_uid: str) -> None:
 
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
     """Certify a new key under a name of 1 to 64 characters, for some days or until the CA's end."""
-    if not 0 < len(common_name) <= _COMMON_NAME_LIMIT:
-        raise ValueError(f"a common name has 1 to {_COMMON_NAME_LIMIT} characters: {common_name!r}")
     certificate, key = _made(common_name, role=role, days=days, issuer=_load_authority(folder))
     return Credential(certificate, key, (folder / AUTHORITY_CERTIFICATE).read_bytes())
 

@@ -153,7 +153,7 @@ def test_a_key_is_shown_nowhere(authority: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "x" * 65])
 def test_a_name_that_fits_no_certificate_is_refused(authority: Path, name: str) -> None:
-    with pytest.raises(ValueError, match="common name"):
+    with pytest.raises(ValueError, match=r"empty|length"):
         credentials.issue(authority, name, role=Role.ROBOT)
 
 
