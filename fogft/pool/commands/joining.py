@@ -108,12 +108,7 @@ def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
 
 def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str, str]:
     identity, spec = store.identity(), store.spec()
-    stem = holder.role.value
-    folder = "" if holder.role in _FLAT else "credentials/"
-    files = {
-        f"{folder}ca.crt": credential.authority_pem.decode(),
-        f"{folder}{stem}.key": credential.key_pem.decode(),
-    }
+    files: dict[str, str] = {}
     if holder.role is Role.REPLICA:
         id = ReplicaId(identity.uid, int(holder.name), holder.generation)
         signed = store.paths.announcements
@@ -132,8 +127,10 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
         membership = store.membership()
         if membership is not None:
             files["membership.json"] = disk.to_json(to_dict(membership))
-    # Last: once it stands, all else does too.
-    return {**files, f"{folder}{stem}.crt": credential.certificate_pem.decode()}
+    # The certificate last: once it stands, all else does too.
+    folder = "" if holder.role in _FLAT else "credentials/"
+    own = credential.files(holder.role.value)
+    return {**files, **{f"{folder}{name}": text.decode() for name, text in own.items()}}
 
 
 def join(

@@ -41,6 +41,11 @@ class Credential:
     key_pem: bytes = field(repr=False)
     authority_pem: bytes = field(repr=False)
 
+    def files(self, stem: str) -> dict[str, bytes]:
+        """Return its files by name: ``ca.crt``, ``<stem>.key`` and, last, ``<stem>.crt``."""
+        pair = {f"{stem}.key": self.key_pem, f"{stem}.crt": self.certificate_pem}
+        return {AUTHORITY_CERTIFICATE: self.authority_pem, **pair}
+
 
 @dataclass(frozen=True)
 class Description:
@@ -80,11 +85,10 @@ def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS
 
 
 def write(credential: Credential, folder: Path, stem: str) -> None:
-    """Write ``<stem>.key``, ``ca.crt`` and, last, ``<stem>.crt`` to a folder (0700), each 0600."""
+    """Write its files to a folder (0700), each 0600."""
     disk.make_folder(folder)
-    disk.write_whole(folder / AUTHORITY_CERTIFICATE, credential.authority_pem)
-    disk.write_whole(folder / f"{stem}.key", credential.key_pem)
-    disk.write_whole(folder / f"{stem}.crt", credential.certificate_pem)
+    for name, content in credential.files(stem).items():
+        disk.write_whole(folder / name, content)
 
 
 def describe(path: Path) -> Description:

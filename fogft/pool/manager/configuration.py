@@ -132,9 +132,7 @@ def build_order(
         task=with_build(absolute(bare.task, Path(identity.file).parent)),
         files={
             "replica.yaml": config.encode(),
-            "ca.crt": issued.authority_pem,
-            "replica.crt": issued.certificate_pem,
-            "replica.key": issued.key_pem,
+            **issued.files("replica"),
             paths.announcements.name: signed,
         },
     )
@@ -168,9 +166,7 @@ def gateway_order(
         ("gateway", mine),
         ("rendezvous", replace(mine, role=Role.RENDEZVOUS)),
     ):
-        issued = ledger.issue(holder, days=days)
-        files["ca.crt"] = issued.authority_pem
-        files |= {f"{stem}.crt": issued.certificate_pem, f"{stem}.key": issued.key_pem}
+        files |= ledger.issue(holder, days=days).files(stem)
     listens, rendezvous, door = spec.gateway.endpoints("0.0.0.0")
     near = spec.gateway.endpoints("127.0.0.1")[1]
     gateway = ClientProxyConfig(
