@@ -45,8 +45,8 @@ class Launch:
     allow_from: tuple[str, ...] = ()
 
 
-class Cloud(Protocol):
-    """Where replicas run."""
+class Seller(Protocol):
+    """A source of offers: a cloud, or a price table."""
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
         """List what can be bought for a task's `resources`.
@@ -54,6 +54,10 @@ class Cloud(Protocol):
         They hold ``ports: []`` where the machines need to be reached by nobody. Raises
         `CloudUnreachable` where prices cannot be had now, `SpecError` for what can never be met.
         """
+
+
+class Cloud(Seller, Protocol):
+    """Where replicas run."""
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
         """List this pool's machines in any phase, by id. CloudUnreachable: conclude nothing."""

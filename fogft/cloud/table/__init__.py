@@ -34,7 +34,7 @@ class Row:
 
 
 class PriceTable:
-    """Offers from a table. Has the `offers` of `fogft.cloud.port.Cloud`, and nothing else of it."""
+    """Offers from a table (`fogft.cloud.port.Seller`)."""
 
     def __init__(self, file: Path) -> None:
         self._file = file

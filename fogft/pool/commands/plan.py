@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from fogft.cloud.port import RealCloud
+from fogft.cloud.port import RealCloud, Seller
 from fogft.cloud.table import PriceTable
 from fogft.errors import CloudError, PoolNotFound, SpecError
 from fogft.model.choices import TrafficSpec
@@ -21,7 +21,6 @@ from fogft.pool.commands.composition import LOCAL, make_cloud, make_store
 from fogft.pool.folder.paths import latency_file
 from fogft.pool.manager import launched_gateway, offers, proxy_report
 from fogft.pool.manager.distances import Distance, Latencies, regions_of
-from fogft.pool.manager.offers import Seller
 from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.poolfile import named_clouds
 from fogft.poolfile.file import parse, read_text

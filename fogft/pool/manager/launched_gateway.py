@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from fogft.cloud.port import Cloud, Launch
+from fogft.cloud.port import Cloud, Launch, Seller
 from fogft.errors import FogftError, told
 from fogft.model.groups import GATEWAY_SLOT
 from fogft.model.intent import Intent
@@ -17,7 +17,6 @@ from fogft.model.spec import PoolSpec
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.gateway import GatewayPlan, plan_gateway, resources
 from fogft.planning.observed.history import History
-from fogft.pool.manager.offers import Seller
 
 ASK_EVERY_S = 10.0
 

@@ -4,22 +4,14 @@ Owns: telling whose offer is whose.
 Not here: what a cloud sells (`fogft.cloud`) and which is chosen (`fogft.planning.placement`).
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
 
+from fogft.cloud.port import Seller
 from fogft.errors import SpecError
 from fogft.model.groups import sales
 from fogft.model.replica import Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.cost import GB, egress_bytes_per_s, egress_price
-
-
-class Seller(Protocol):
-    """A source of offers: a cloud, or a price table."""
-
-    def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """See `fogft.cloud.port.Cloud`."""
 
 
 def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
