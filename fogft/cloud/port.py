@@ -84,7 +84,7 @@ class Cloud(Seller, Protocol):
 class RealCloud(Protocol):
     """A cloud that costs money and needs credentials for each provider behind it."""
 
-    def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
+    def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
         """Test credentials, of all clouds if none is named: cloud -> empty, or what to fix."""
 
     def check_task(self, task: Mapping[str, Any]) -> None:

@@ -90,6 +90,7 @@ class SkyCloud:
     def __post_init__(self) -> None:
         self._providers = by_name = {provider.cloud: provider for provider in self.providers}
         sky, clock, submit = self.sky, self.clock, self.submit
+        self.check = sky.check
         self.journal = journal = Journal(self.folder / "launches")
         self._locks = wheel.LockFolder(self.folder / "locks", self.make_lock)
         self._census = Census(by_name, clock, submit)
@@ -200,10 +201,6 @@ class SkyCloud:
         return str(path) if path.exists() else None
 
     # -- beyond the port --------------------------------------------------------------------
-
-    def check(self, clouds: Sequence[str] = ()) -> Mapping[str, str]:
-        """See `RealCloud`."""
-        return self.sky.check(clouds)
 
     def credentials_end_at(self) -> float | None:
         """See `RealCloud`. What is known is looked at again after a minute."""
