@@ -231,7 +231,7 @@ class Content:
     rendezvous: tuple[Endpoint, ...] = ()
 
 
-def read_content(content: dict[str, Any]) -> Content:
+def read_content(content: Any) -> Content:
     """Return the content of a bundle."""
     try:
         made = from_plain(Content, content)
