@@ -17,7 +17,7 @@ from typing import Annotated
 
 from fogft import disk
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
-from fogft.model.credentials import Holder, Role
+from fogft.model.credentials import Role, manager_of
 from fogft.model.plain import Count, stored, to_plain
 from fogft.pool.commands import joining, startup
 from fogft.pool.commands.composition import make_store
@@ -69,9 +69,8 @@ def export(
                 store.identity()  # the manager may have stepped back just then
                 proxy_supervisor.forbid_restart(paths)
                 ended.enter_context(shutdown.without_orders(paths, store.spec(), told))
-                holder = Holder(Role.MANAGER, "manager", 1, identity.uid)
-                until = now + open_for_s
-                label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, until)
+                name, until = manager_of(identity.uid).common_name, now + open_for_s
+                label = Label(secrets.token_hex(16), identity.name, name, now, until)
                 files = dict(_files(paths, identity, root))
                 moved = _Moved(identity, files, lease.read_epoch(paths))
                 disk.write_whole(unfinished, bundle.seal(label, to_plain(moved), passphrase))
