@@ -55,17 +55,14 @@ def _named_in(spec: PoolSpec) -> Iterator[tuple[str, str]]:
         yield from _named(spec.task.get("resources") or {}, "resources")
 
 
-def _named(resources: Any, key: str) -> Iterator[tuple[str, str]]:
-    if not isinstance(resources, Mapping):
-        return
+def _named(resources: Mapping[str, Any], key: str) -> Iterator[tuple[str, str]]:
     for name in ("infra", "cloud"):
         if isinstance(resources.get(name), str):
             cloud = resources[name].split("/")[0].strip().lower()
             if cloud not in ("", "*"):
                 yield cloud, f"{key}.{name}"
     for name in ("any_of", "ordered"):
-        choices = resources.get(name)
-        for index, choice in enumerate(choices if isinstance(choices, list) else ()):
+        for index, choice in enumerate(resources.get(name) or ()):
             yield from _named(choice, f"{key}.{name}[{index}]")
 
 
