@@ -169,10 +169,9 @@ service = group("Let systemd start a pool's processes at boot, and restart them.
 def _units(
     pool: str | None, gateway: Path | None, rendezvous: Path | None, *, system: bool
 ) -> list[units.Unit]:
-    if gateway is not None:
-        return units.of_part("gateway", gateway, system=system)
-    if rendezvous is not None:
-        return units.of_part("rendezvous", rendezvous, system=system)
+    for part, config in (("gateway", gateway), ("rendezvous", rendezvous)):
+        if config is not None:
+            return units.of_part(part, config, system=system)
     return units.of_pool(composition.paths_of(pool), system=system)
 
 
