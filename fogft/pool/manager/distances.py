@@ -23,7 +23,7 @@ from typing import Annotated
 from fogft import disk, template_files
 from fogft.errors import StateError
 from fogft.model.choices import PlacementSpec
-from fogft.model.plain import Moment, stored, within
+from fogft.model.plain import Moment, stored, to_plain, within
 from fogft.model.replica import LinkReport, LinkState, Machine, Offer
 from fogft.model.spec import PoolSpec
 
@@ -139,8 +139,7 @@ class Latencies:
             disk.make_folder(self.file.parent)
             with disk.locked(self.file.with_suffix(".lock")):  # other managers measure, too
                 kept = {**self.measured(), **found}
-                plain = {r: {"rtt_s": d.rtt_s, "as_of": d.as_of} for r, d in kept.items()}
-                disk.write_json(self.file, plain, durable=False)
+                disk.write_json(self.file, to_plain(kept), durable=False)
         return failed
 
     def known(
