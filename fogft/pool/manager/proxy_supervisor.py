@@ -55,7 +55,6 @@ class ProxySupervisor:
     ended: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
-        self._alone = self.command is not None
         self._command = self.command or (
             *(sys.executable, "-m", "fogft"),
             *("proxy", "--spare", "--config", str(self.paths.proxy_config)),
@@ -65,7 +64,7 @@ class ProxySupervisor:
         self._ending: set[int] = set()
         locks = self.paths.proxy_lock, self.paths.standby_lock, self.paths.spare_lock
         self._hanging = {lock: Hanging(HANGS_AFTER_S, self.clock) for lock in locks}
-        self._places = locks[:1] if self._alone else locks
+        self._places = locks if self.command is None else locks[:1]
         self._sessions: set[int] = set()  # of what was started, and its copies
         self._complete_at = float("-inf")
         self._next_at = 0.0
