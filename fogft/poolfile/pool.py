@@ -77,7 +77,6 @@ def _judge_here(
     for section, service in zip(sections, spec.services, strict=False):
         with mistakes.step():
             _check_quorum(section, service, spec)
-    for section, service in zip(sections, spec.services, strict=False):
         with mistakes.step():
             _judge_types(section, service, spec, checks)
     for key, end in (("topics", ""), ("actions", "_SendGoal")):
