@@ -189,8 +189,7 @@ class TopicsOnReplica:
             for name, topic in self._topics.items()
         }
         # Publishing may block for a moment, and answers are copied: the wire's threads must not.
-        messages = _Inbox(self._publish, self._turn_away)
-        self.inboxes = messages, _Inbox(self._answer, self._overloaded)
+        self.inboxes = [_Inbox(take, self._turn_away) for take in (self._publish, self._answer)]
         self._running = False
         # Until when a robot sends nothing on a topic but what was on its way before.
         self._rests: dict[tuple[str, str], float] = {}
@@ -262,9 +261,6 @@ class TopicsOnReplica:
         except FrameError:
             incoming.refuse(Refusal.MALFORMED)
 
-    def _overloaded(self, incoming: Incoming) -> None:
-        incoming.refuse(Refusal.OVERLOADED)
-
     def tick(self) -> None:
         """Answer pulls at their time limit. Call at about 10 Hz."""
         now = self._clock()
@@ -300,7 +296,7 @@ class TopicsOnReplica:
             incoming.refuse(Refusal.NOT_READY)
 
     def _turn_away(self, incoming: Incoming, reason: Refusal = Refusal.OVERLOADED) -> None:
-        """Refuse a message, and those on their way behind it: they must not overtake it."""
+        """Refuse a pull, or a message and those on their way behind it, which would overtake it."""
         self._rests[incoming.service, incoming.robot] = self._clock() + _AGAIN_S
         incoming.refuse(reason)
 
