@@ -1,7 +1,6 @@
 """Creates links over Zenoh, and holds what all links of a robot share."""
 
 import contextlib
-import threading
 import time
 from collections.abc import Mapping, Sequence
 
@@ -42,8 +41,7 @@ class ZenohDialer:
             tell_losers,
         )
         self._pool_uid = pool_uid
-        self._lock = threading.Lock()
-        self._links: list[ZenohLink] = []
+        self._links: set[ZenohLink] = set()  # each of its methods is atomic
 
     def adopt(self, options: SendOptions) -> None:
         """Set the options of services, from the next connection on."""
@@ -53,16 +51,13 @@ class ZenohDialer:
         """Start a link; return at once. Raises WireError: the peer belongs to another pool."""
         if peer.id.pool_uid != self._pool_uid:
             raise WireError(f"replica `{peer.id}` belongs to another pool than this robot")
-        link = ZenohLink(self._shared, peer, services, events, self._closed)
-        with self._lock:
-            self._links.append(link)
+        link = ZenohLink(self._shared, peer, services, events, self._links.discard)
+        self._links.add(link)
         return link
 
     def renew(self) -> None:
         """Reload the credentials from their files, link by link."""
-        with self._lock:
-            links = list(self._links)
-        for link in links:
+        for link in list(self._links):
             link.renew()
 
     def tell(self, records: Sequence[SignedRecord]) -> None:
@@ -79,23 +74,16 @@ class ZenohDialer:
 
     def certificate(self) -> str:
         """Return the common name of the certificate that every open link uses, or nothing."""
-        with self._lock:
-            used = {link.certificate for link in self._links} - {b""}
+        used = {link.certificate for link in list(self._links)} - {b""}
         try:
             signer = self._shared.signer
         except CredentialError:
             return ""
         return signer.common_name if used <= {signer.certificate} else ""
 
-    def _closed(self, link: ZenohLink) -> None:
-        with self._lock:
-            if link in self._links:
-                self._links.remove(link)
-
     def close(self) -> None:
         """Close every link, and wait a little for their threads."""
-        with self._lock:
-            links, self._links = self._links, []
+        links = list(self._links)
         for link in links:
             link.close()
         end = time.monotonic() + _CLOSE_WAIT_S
