@@ -176,6 +176,8 @@ class ZenohListener:
             threads.note()
             try:
                 heard(one)
+            except FrameError as error:
+                self._malformed(error)
             except Exception:
                 self._counters.add("failed")
                 log.exception("not_taken what=%r", what)
@@ -187,14 +189,10 @@ class ZenohListener:
     def _request(self, on_request: Callable[[Incoming], None], sample: zenoh.Sample) -> None:
         attachment = sample.attachment
         head = attachment.to_bytes() if attachment else b""
-        try:
-            if head[:1] == batch_frames.BATCH:
-                requests = batch_frames.decode_requests(head, sample.payload.to_bytes())
-            else:
-                requests = [(frame.decode_request(head), sample.payload.to_bytes())]
-        except FrameError as error:
-            self._malformed(error)
-            return
+        if head[:1] == batch_frames.BATCH:
+            requests = batch_frames.decode_requests(head, sample.payload.to_bytes())
+        else:
+            requests = [(frame.decode_request(head), sample.payload.to_bytes())]
         self._take_requests(on_request, str(sample.key_expr), requests)
         self._counters.add("requests", len(requests))
 
@@ -262,11 +260,7 @@ class ZenohListener:
 
     def _cancel(self, on_cancel: Callable[[Sequence[bytes]], None], sample: zenoh.Sample) -> None:
         self._counters.add("cancellations")
-        try:
-            ids = frame.decode_cancel(sample.payload.to_bytes())
-        except FrameError as error:
-            self._malformed(error)
-            return
+        ids = frame.decode_cancel(sample.payload.to_bytes())
         self._work_queue.offer(partial(on_cancel, ids))
 
     # -- the owner ------------------------------------------------------------------------
