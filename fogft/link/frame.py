@@ -8,7 +8,7 @@ be of another version. Each frame begins with its version. Other frames: `probe_
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 from fogft.errors import FrameError
@@ -79,16 +79,24 @@ def origin(robot: str, token: bytes) -> bytes:
 @lru_cache(maxsize=256)  # a robot says the same in each request of a connection
 def read_origin(origin: bytes) -> tuple[bytes, str]:
     """Return the token and the robot's name of what `origin` wrote."""
-    token, name = origin[:TOKEN_BYTES], origin[TOKEN_BYTES:]
-    if not 0 < len(name) <= ROBOT_BYTES_LIMIT:
-        raise FrameError(f"a robot's name of {len(name)} bytes")
+    name = origin[TOKEN_BYTES:]
+    return origin[:TOKEN_BYTES], _read_text(name, "a robot's name", ROBOT_BYTES_LIMIT, "UTF-8")
+
+
+def _read_text(said: bytes, what: str, limit: int, encoding: str) -> str:
+    if not 0 < len(said) <= limit:
+        raise FrameError(f"{what} of {len(said)} bytes")
     try:
-        robot = name.decode()
+        text = said.decode(encoding)
     except UnicodeDecodeError as error:
-        raise FrameError("a robot's name that is not UTF-8") from error
-    if not robot.isprintable():
-        raise FrameError("a robot's name that is not printable")
-    return token, robot
+        raise FrameError(f"{what} that is not {encoding}") from error
+    if not text.isprintable():
+        raise FrameError(f"{what} that is not printable")
+    return text
+
+
+# Returns the reason of a refusal.
+read_reason = partial(_read_text, what="a reason", limit=REASON_LIMIT, encoding="ASCII")
 
 
 def encode_request(
@@ -183,19 +191,6 @@ def decode_refusal(frame: bytes) -> tuple[bytes, bytes, str, Load | None]:
     version, stamp, request_id, load = _ANSWER.unpack_from(frame)
     check_version(version)
     return stamp, request_id, read_reason(frame[_ANSWER.size :]), decode_load(load)
-
-
-def read_reason(said: bytes) -> str:
-    """Return the reason of a refusal."""
-    if not 0 < len(said) <= REASON_LIMIT:
-        raise FrameError(f"a reason of {len(said)} bytes")
-    try:
-        reason = said.decode("ascii")
-    except UnicodeDecodeError as error:
-        raise FrameError("a reason that is not ASCII") from error
-    if not reason.isprintable():
-        raise FrameError("a reason that is not printable")
-    return reason
 
 
 def greeted_bytes(token: bytes, replica: str) -> bytes:
