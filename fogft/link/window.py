@@ -177,7 +177,7 @@ class BatchBuffer:
     """Small attempts of one service that wait to leave in one message. Any thread."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self.attempts: list[OpenAttempt] = []
         self._bytes = 0
 
@@ -189,7 +189,7 @@ class BatchBuffer:
                 or self._bytes + attempt.size > batch_frames.BYTES_LIMIT
                 or (self.attempts and self.attempts[0].service != attempt.service)
             )
-            leaving = self._take() if full else []
+            leaving = self.take() if full else []
             self.attempts.append(attempt)
             self._bytes += attempt.size
             return leaving
@@ -197,11 +197,8 @@ class BatchBuffer:
     def take(self) -> list[OpenAttempt]:
         """Return all that is held, in order."""
         with self._lock:
-            return self._take()
-
-    def _take(self) -> list[OpenAttempt]:
-        taken, self.attempts, self._bytes = self.attempts, [], 0
-        return taken
+            taken, self.attempts, self._bytes = self.attempts, [], 0
+            return taken
 
 
 WORTH_S = 0.005
