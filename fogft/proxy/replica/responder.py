@@ -41,7 +41,7 @@ class Responder:
     """Passes requests to the local services, and answers each copy.
 
     Args:
-        limits: How many may be at work, by service, where it is not to be learned.
+        limits: How many may be at work, by service; 0 where it is to be learned.
         latest: Services of which the newest request goes first.
         results: Services that answer when a goal ends. That it is unknown holds for the moment
             only: a copy is run anew.
@@ -169,7 +169,7 @@ class Responder:
     def _queue(self, service: str) -> ServiceQueue:
         queue = self._queues.get(service)
         if queue is None:
-            limit, latest = self._limits.get(service), service in self._latest
+            limit, latest = self._limits.get(service) or None, service in self._latest
             queue = self._queues[service] = ServiceQueue(
                 self.outstanding, limit, latest=latest, results=service in self._results
             )

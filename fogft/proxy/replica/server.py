@@ -30,7 +30,7 @@ from fogft.proxy.replica.goals_once import GoalsOnce
 from fogft.proxy.replica.offering import Offering
 from fogft.proxy.replica.ordered_responder import Clients, OrderedResponder
 from fogft.proxy.replica.responder import CANCEL_TYPE, Responder
-from fogft.proxy.replica.service_queue import Job, limits_of
+from fogft.proxy.replica.service_queue import Job
 from fogft.proxy.replica.serving_lease import HeldLease
 from fogft.proxy.replica.supervisor import Supervisor
 from fogft.proxy.replica.topics import TopicsOnReplica
@@ -100,7 +100,8 @@ class ServerProxy:
         self.draining = self._at_risk = False  # as the machine was told by its cloud
         self.responder = Responder(
             lambda name: name in self.ready,
-            limits=limits_of(services),
+            # A cancel service names no request, so it must be clear which one is meant.
+            limits={s.name: 1 if s.cancel else s.concurrency for s in services},
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
             results=[s.name for s in services if s.part is Part.RESULT],
             answered=answered,

@@ -8,7 +8,6 @@ from collections import deque
 
 from fogft.link.port import Incoming
 from fogft.model.keys import LONGEST_S
-from fogft.model.spec import ServiceSpec
 from fogft.requests.concurrency import ConcurrencyLimit
 from fogft.requests.fair_queue import FairQueue
 from fogft.requests.load import NEARLY, NEVER, Handling, Load
@@ -273,10 +272,3 @@ class ServiceQueue:
                 self._unanswered += 1  # as it still is
                 self.free(job)
         return found
-
-
-def limits_of(services: tuple[ServiceSpec, ...]) -> dict[str, int]:
-    """Return how many requests a service may have concurrently, if that is fixed."""
-    # A cancel service names no request, so it must be clear which one is meant.
-    limits = {s.name: 1 if s.cancel else s.concurrency for s in services}
-    return {name: limit for name, limit in limits.items() if limit}
