@@ -12,6 +12,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 from fogft import __version__
@@ -77,6 +78,7 @@ class ServerProxy:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._id = id
+        self._keys = partial(names.service_keys, id.pool_uid, id.slot)
         self._offering = Offering(services, define, clock)
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
         self._listener, self._make_node = listener, make_node
@@ -115,8 +117,8 @@ class ServerProxy:
 
     def start(self) -> None:
         """Start listening, and start the user's command."""
-        keys = self._keys(self._offering.services)
-        keys |= names.service_keys(self._id.pool_uid, self._id.slot, self._topics.types)
+        types = {service.name: service.type for service in self._offering.services}
+        keys = self._keys(types | self._topics.types)
         self._join_ros()
         # Where no service is stateful there is nothing to choose, and nothing to pay.
         chosen = self._ordered or self._topics or self._goals
@@ -124,10 +126,6 @@ class ServerProxy:
         self._listener.serve(keys, request, self._probe, self.responder.cancel)
         self._poll()
         log.info("replica_listening replica=%s endpoint=%s", self._id, self._listener.endpoint)
-
-    def _keys(self, services: tuple[ServiceSpec, ...]) -> dict[str, str]:
-        types = {service.name: service.type for service in services}
-        return names.service_keys(self._id.pool_uid, self._id.slot, types)
 
     def run_once(self) -> None:
         """Supervise the command, readiness and deadlines. Call at about 10 Hz."""
@@ -179,7 +177,7 @@ class ServerProxy:
             name, type_name = service.name, service.type
             log.info("service_found replica=%s service=%s type=%s", self._id, name, type_name)
             self._make_client(self._node, service)
-            self._listener.add(self._keys((service,)))
+            self._listener.add(self._keys({name: type_name}))
 
     def _crashed(self) -> None:
         self.responder.crashed()
