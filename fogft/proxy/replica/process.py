@@ -34,7 +34,6 @@ from fogft.records.record import RecordKind
 from fogft.ros import environment, memory_tuning
 from fogft.ros.port import RosNode
 from fogft.ros.reservations import Reservation, own_domain, reserve_domain
-from fogft.ros.state_bytes import StateBytes
 
 log = logging.getLogger(__name__)
 
@@ -166,7 +165,6 @@ def _make(
         make_node,
         command(config.domain_id),
         spare=command(second.number) if second is not None else None,
-        make_state=StateBytes,
         define=define,
         topics=config.topics,
         answered=answered,

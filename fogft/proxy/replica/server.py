@@ -24,7 +24,6 @@ from fogft.model.choices import Freshness
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import Part, ServiceSpec
-from fogft.model.state import StateSpec
 from fogft.model.topic import TopicSpec
 from fogft.model.type_definition import Definition
 from fogft.proxy.replica.goals_once import GoalsOnce
@@ -71,7 +70,6 @@ class ServerProxy:
         command: Supervisor,
         *,
         spare: Supervisor | None = None,
-        make_state: Callable[[StateSpec], StateBytes] | None = None,
         define: Callable[[str], Definition] | None = None,
         topics: tuple[TopicSpec, ...] = (),
         answered: Callable[[Job, float], None] | None = None,
@@ -96,8 +94,8 @@ class ServerProxy:
         self._servers: dict[str, int] = {}
         self._ordered: dict[str, OrderedResponder] = {}
         for service in services:
-            if service.state is not None and make_state is not None:
-                state = make_state(service.state)
+            if service.state is not None:
+                state = StateBytes(service.state)
                 self._ordered[service.name] = OrderedResponder(service.name, state, clock)
         self.draining = self._at_risk = False  # as the machine was told by its cloud
         self.responder = Responder(
