@@ -23,7 +23,7 @@ class Offering:
     """The services of one replica: those of the configuration, or what is found out."""
 
     services: tuple[ServiceSpec, ...]
-    define: Callable[[str], Definition] | None
+    define: Callable[[str], Definition]
     clock: Callable[[], float]
 
     def __post_init__(self) -> None:
@@ -74,11 +74,10 @@ class Offering:
 
     def types(self) -> dict[str, Definition]:
         """Return the definitions of all types here; nothing until each is known."""
-        if self.define is not None:
-            for service in self.services:
-                found = self._definitions.get(service.type)
-                if found is None or not found.known:
-                    self._definitions[service.type] = self.define(service.type)
+        for service in self.services:
+            found = self._definitions.get(service.type)
+            if found is None or not found.known:
+                self._definitions[service.type] = self.define(service.type)
         told = dict(self._definitions)
         return told if all(definition.known for definition in told.values()) else {}
 

@@ -70,7 +70,7 @@ class ServerProxy:
         command: Supervisor,
         *,
         spare: Supervisor | None = None,
-        define: Callable[[str], Definition] | None = None,
+        define: Callable[[str], Definition] = lambda name: Definition(),
         topics: tuple[TopicSpec, ...] = (),
         answered: Callable[[Job, float], None] | None = None,
         clock: Callable[[], float] = time.monotonic,

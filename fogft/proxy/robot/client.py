@@ -19,6 +19,7 @@ from fogft.model import names
 from fogft.model.replica import Membership, ReplicaId
 from fogft.model.spec import HedgingMode, ServiceSpec
 from fogft.model.topic import TopicSpec
+from fogft.model.type_definition import Definition
 from fogft.process import Wakeup
 from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.proxy.robot.links import Define, Links, TypeCheck, best_of, link_report, seen_through
@@ -46,7 +47,7 @@ class ClientProxy:
 
     Args:
         node: The robot's side of ROS; none in a gateway, where requests come from the wire.
-        define: Returns the definition of a service type here; None to compare none.
+        define: Returns the definition of a service type here; unknown ones are not compared.
         merge: Makes one status of an action of what its replicas say.
     """
 
@@ -56,7 +57,7 @@ class ClientProxy:
     make_dispatcher: MakeDispatcher
     _: KW_ONLY
     clock: Callable[[], float] = time.monotonic
-    define: Define | None = None
+    define: Define = lambda name: Definition()
     merge: Merge = lambda said: None
 
     def __post_init__(self) -> None:

@@ -128,7 +128,7 @@ Define = Callable[[str], Definition]
 class TypeCheck:
     """Compares replicas' type definitions with those on this machine, if these are known."""
 
-    def __init__(self, define: Define | None) -> None:
+    def __init__(self, define: Define) -> None:
         self._define = define
         self._ours: dict[str, Definition] = {}
         self._found: dict[tuple[ReplicaId, str], tuple[Definition, str]] = {}
@@ -151,8 +151,6 @@ class TypeCheck:
         return found
 
     def _compare(self, id: ReplicaId, type_name: str, theirs: Definition) -> str:
-        if self._define is None:
-            return ""
         known = self._found.get((id, type_name))
         if known is not None and known[0] is theirs:
             return known[1]
