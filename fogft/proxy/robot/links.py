@@ -114,12 +114,9 @@ def best_of(reports: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
         state = _ORDER.index(LinkState(report["state"]))
         return (state, not report["ready"], report["silent_for_s"])
 
-    found: dict[tuple[int, int], dict[str, Any]] = {}
-    for report in reports:
-        key = (report["slot"], report["generation"])
-        if key not in found or rank(report) < rank(found[key]):
-            found[key] = report
-    return [found[key] for key in sorted(found)]
+    worst_first = sorted(reports, key=rank, reverse=True)
+    best = {(report["slot"], report["generation"]): report for report in worst_first}
+    return [best[key] for key in sorted(best)]
 
 
 Define = Callable[[str], Definition]
