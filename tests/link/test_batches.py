@@ -21,7 +21,7 @@ from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.window import BatchBuffer, OpenAttempt
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.replica.listener import ZenohListener
-from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns
+from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_queue import BYTES_LIMIT as REPLY_BYTES_LIMIT
 from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueue, ReplyQueues
 from fogft.link.zenoh.robot.link import ZenohLink
@@ -186,7 +186,7 @@ def test_replies_leave_in_order_and_only_those_of_one_query_together(
     queue = ReplyQueue()
     query: Any = object()
     put = [
-        QueryEnd(query, QueryTurns())
+        QueryEnd(query, lambda: 0)
         if one is None
         else Reply(STREAMS[one[0]], request_id(n), bytes(one[1]), "", may_pack=one[2])
         for n, one in enumerate(plan)

@@ -57,7 +57,7 @@ class ControlQueries:
             self._turn_away(asked, Refusal.NOT_ADMITTED, "it did not greet")
             return
         for gone, query in self.streams.opened(token, asked.query, holder):
-            self.queues.end(gone, "gone", QueryEnd(query, asked.turns))
+            self.queues.end(gone, "gone", QueryEnd(query, asked.turn))
 
     def probe(self, on_probe: Callable[[Probe], ProbeAnswer], asked: QueryEnd) -> None:
         """Handle a probe, which may carry a greeting."""

@@ -23,7 +23,7 @@ from fogft.link.zenoh import sockets, threads
 from fogft.link.zenoh.handshakes import HandshakeLog
 from fogft.link.zenoh.replica.connection_reaper import ConnectionReaper
 from fogft.link.zenoh.replica.control_queries import ControlQueries
-from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns
+from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_queue import Reply, ReplyQueues, ZenohIncoming
 from fogft.link.zenoh.replica.reply_streams import Stream, Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
@@ -76,7 +76,7 @@ class ZenohListener:
         )
         self._counters = Counters()
         self.counters = self._counters.snapshot  # since the start, by event
-        self._turns = QueryTurns()
+        self._turn = 0  # counted first by Zenoh's thread
         self.revoke = self._sessions.revoke  # let these holders in no more
         self._work_queue = WorkQueue("fogft-probes", self._counters)
         self._queues = ReplyQueues(self._counters, later=self._work_queue.add)
@@ -157,7 +157,7 @@ class ZenohListener:
 
     def _declare(self, session: zenoh.Session, key: str, asked: Callable[[QueryEnd], None]) -> None:
         def heard(query: zenoh.Query) -> None:
-            asked(QueryEnd(query, self._turns))
+            asked(QueryEnd(query, lambda: self._turn))
 
         callback = self._callback(f"query at {key}", heard)
         self._declared.append(session.declare_queryable(key, callback, complete=True))
@@ -172,7 +172,7 @@ class ZenohListener:
         """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
 
         def guarded(one: Any) -> None:
-            self._turns.last += 1
+            self._turn += 1
             threads.note()
             try:
                 heard(one)

@@ -2,11 +2,12 @@
 
 Ending one may block, and none of Zenoh's threads may do it; nor must it be done while Zenoh's own
 thread still holds that query: then that thread would be the last to let go, and would wait for room
-that only it can make. So a query is ended when that thread has come to the next one (`QueryTurns`),
+that only it can make. So a query is ended when that thread has come to the next one (`turn`),
 by the threads of `reply_queue`.
 """
 
 import time
+from collections.abc import Callable
 
 import zenoh
 
@@ -17,21 +18,17 @@ _NO_REQUEST = bytes(names.REQUEST_ID_BYTES)
 _ANYWAY_S = 1.0  # Zenoh's thread has long let go, though nothing came after
 
 
-class QueryTurns:
-    """The query that Zenoh's thread is working on: the last one received."""
-
-    def __init__(self) -> None:
-        self.last = 0  # counted first by Zenoh's thread
-
-
 class QueryEnd:
-    """A query to end, after sending a refusal if there is one. Made by Zenoh's thread."""
+    """A query to end, after sending a refusal if there is one. Made by Zenoh's thread.
 
-    def __init__(self, query: zenoh.Query, turns: QueryTurns) -> None:
+    `turn` returns which query that thread is working on: the last one received.
+    """
+
+    def __init__(self, query: zenoh.Query, turn: Callable[[], int]) -> None:
         self.query = query
         self.refusal = ""
-        self.turns = turns
-        self._turn = turns.last
+        self.turn = turn
+        self._turn = turn()
         self._came_at = time.monotonic()
 
     def say(self) -> None:
@@ -41,7 +38,7 @@ class QueryEnd:
 
     def ended(self) -> bool:
         """End the query if that may be done by now; return whether. May block like `say`."""
-        held = self.turns.last == self._turn and time.monotonic() - self._came_at <= _ANYWAY_S
+        held = self.turn() == self._turn and time.monotonic() - self._came_at <= _ANYWAY_S
         if not held:
             self.query.drop()  # type: ignore[no-untyped-call]
         return not held

@@ -6,11 +6,13 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from functools import partial
+from itertools import count
 
 from fogft.counters import Counters
 from fogft.link.frame import Greeting
 from fogft.link.zenoh.replica.control_queries import ControlQueries
-from fogft.link.zenoh.replica.query_ends import QueryEnd, QueryTurns
+from fogft.link.zenoh.replica.query_ends import QueryEnd
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
 from fogft.link.zenoh.replica.reply_streams import Streams
 from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
@@ -89,7 +91,7 @@ class Query:
 
 def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authority) -> None:
     """A robot that probes without end has its probes dropped and counted, and each query ended."""
-    counters, turns = Counters(), QueryTurns()
+    counters, turns = Counters(), count()
     verifier = Verifier(authority.replica().ca, lazy=True)
     work = WorkQueue("test", counters)  # not begun: nothing leaves it
     control = ControlQueries(
@@ -101,8 +103,7 @@ def test_what_waits_at_a_replica_besides_requests_is_bounded(authority: Authorit
         counters=counters,
     )
     for _ in range(3000):
-        asked = QueryEnd(Query(), turns)
-        turns.last += 1
+        asked = QueryEnd(Query(), partial(next, turns))
         control.later(Greeting(bytes(8)), lambda: None, asked)
     dropped = counters.snapshot()["control_queries_dropped"]
     assert 0 < len(work) == 3000 - dropped <= LIMIT
