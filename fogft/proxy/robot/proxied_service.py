@@ -103,10 +103,6 @@ class ProxiedService:
     def end(self) -> None:
         """Answer open requests as at their deadlines, and close it: another takes its place."""
         self.dispatcher.expire(every=True)
-        self.close()
-
-    def close(self) -> None:
-        """Withdraw it from ROS, and close its dispatcher."""
         for end in (self.server, self._fallback):
             if end is not None:
                 end.close()
