@@ -99,10 +99,7 @@ class Attempts:
         self._gate = gate
         self._tell_losers = tell_losers
         self._cancellations = Cancellations()
-        self._answered = tell.answered
-        self._late = tell.late
-        self._room = tell.room
-        self._wake = tell.wake
+        self._link = tell
         self._ended = ended
         self.window = LinkWindow(standing=len(self._services))
         self.watched = False  # something large was sent lately: the link's thread looks often
@@ -233,7 +230,7 @@ class Attempts:
         attempt.payload = None
         attempt.elsewhere = sent and now < attempt.deadline
         if self.window.declined and self.window.regained_room():
-            self._room()
+            self._link.room()
 
     def flush(self) -> None:
         """Send cancellations for forgotten, unanswered requests."""
@@ -250,9 +247,9 @@ class Attempts:
             return False
         attempt.payload = None
         answer.service = attempt.service
-        self._answered(answer)
+        self._link.answered(answer)
         if self.window.declined and self.window.regained_room():
-            self._room()
+            self._link.room()
         return True
 
     # -- the sender thread ----------------------------------------------------------------
@@ -288,7 +285,7 @@ class Attempts:
     def _skipped(self, attempt: OpenAttempt) -> None:
         """Tell the end of an attempt that was forgotten while it waited: no answer will."""
         if attempt.forgotten:
-            self._late(
+            self._link.late(
                 Answer(attempt.request_id, refusal=Refusal.CANCELLED, service=attempt.service)
             )
 
@@ -311,7 +308,7 @@ class Attempts:
             self._large_since = self._sending_since = began
             if not self.watched:  # have the link's thread look whether it flows, for a while
                 self.watched = True
-                self._wake()
+                self._link.wake()
         try:
             if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
                 attempt.payload = None
@@ -386,7 +383,7 @@ class Attempts:
         """Take the answer to an attempt that was forgotten, or has ended."""
         self._cancellations.answered(answer.request_id)
         answer.service = attempt.service
-        self._late(answer)
+        self._link.late(answer)
 
     # -- the link's thread ----------------------------------------------------------------
 
@@ -421,7 +418,7 @@ class Attempts:
         join_at_exit(self._thread)
         for attempt in ended:
             attempt.payload = None
-            self._answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
+            self._link.answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
 
     def end(self) -> None:
         """End the sender thread once its current send is done: within 11 s."""
