@@ -273,6 +273,9 @@ class FakeListener:
     def add(self, services) -> None:
         self.services |= services
 
+    def revoke(self, names) -> None:
+        pass
+
     def counters(self):
         return {}
 

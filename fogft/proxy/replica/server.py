@@ -81,6 +81,7 @@ class ServerProxy:
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
         self._listener, self._make_node = listener, make_node
         self.endpoint = listener.endpoint  # ``host:port`` at which it listens
+        self.revoke = listener.revoke  # the access of these certificate holders
         self.command, self._spare = command, spare  # the process at work, and the one that waits
         self._clock, self._look_at = clock, 0.0
         self._pauses = Pauses()
@@ -90,7 +91,6 @@ class ServerProxy:
         self.ready: frozenset[str] = frozenset()  # services that can answer now
         self._node: RosNode | None = None
         self._clients: dict[str, RosClient] = {}
-        self._revoked: frozenset[str] = frozenset()
         self._servers: dict[str, int] = {}
         self._ordered: dict[str, OrderedResponder] = {}
         for service in services:
@@ -247,12 +247,6 @@ class ServerProxy:
         """Take signed manager leases; only a newer one has an effect."""
         for record in records:
             self._lease.renew(record)
-
-    def revoke(self, names: frozenset[str]) -> None:
-        """Revoke the access of these certificate holders."""
-        if names - self._revoked:
-            self._revoked |= names
-            self._listener.revoke(self._revoked)
 
     @property
     def lease_is_over(self) -> bool:
