@@ -78,7 +78,7 @@ class ServerProxy:
         self._id = id
         self._keys = partial(names.service_keys, id.pool_uid, id.slot)
         self._offering = Offering(services, define, clock)
-        self._not_usable: dict[str, str] = {}  # service -> why it cannot be called here
+        self._not_usable: dict[str, str] = {}  # service -> why it cannot be called; maybe empty
         self._listener, self._make_node = listener, make_node
         self.endpoint = listener.endpoint  # ``host:port`` at which it listens
         self.revoke = listener.revoke  # the access of these certificate holders
@@ -205,16 +205,13 @@ class ServerProxy:
         if not client.available():
             return False
         self._note(name, client.mismatch())
-        return known and name not in self._not_usable
+        return known and not self._not_usable.get(name)
 
     def _note(self, name: str, trouble: str) -> None:
         """Keep, and log once, why a service cannot be called here; empty for nothing."""
-        if trouble and self._not_usable.get(name) != trouble:
+        if trouble not in ("", self._not_usable.get(name)):
             log.error("service_not_usable replica=%s service=%s reason=%r", self._id, name, trouble)
-        if trouble:
-            self._not_usable[name] = trouble
-        else:
-            self._not_usable.pop(name, None)
+        self._not_usable[name] = trouble
 
     def _end_stuck(self) -> None:
         """Start the command anew where a service of it answers nothing any more."""
@@ -365,7 +362,7 @@ class ServerProxy:
     def _detail(self) -> str:
         if self.complete:
             return self._detail_of_complete()
-        for why in self._not_usable.values():
+        for why in filter(None, self._not_usable.values()):
             return why
         if self._topics.trouble:
             return self._topics.trouble
