@@ -174,7 +174,9 @@ def _judge_greeting(data: bytes) -> None:
     sessions = _sessions()
     sessions.greet(greeting)
     said = "somebody was let in who holds no certificate"
-    assert sessions.holder(greeting.token) == ROBOT, said
+    holder = sessions.of(greeting.token)
+    assert holder is not None, said
+    assert holder.common_name == ROBOT, said
 
 
 def _greeting() -> bytes:

@@ -52,11 +52,11 @@ class ControlQueries:
         except FrameError as error:
             self._malformed(error, asked)
             return
-        holder = self.sessions.holder(token)
-        if not holder:
+        holder = self.sessions.of(token)
+        if holder is None:
             self._turn_away(asked, Refusal.NOT_ADMITTED, "it did not greet")
             return
-        for gone, query in self.streams.opened(token, asked.query, holder):
+        for gone, query in self.streams.opened(token, asked.query, holder.common_name):
             self.queues.end(gone, "gone", QueryEnd(query, asked.turn))
 
     def probe(self, on_probe: Callable[[Probe], ProbeAnswer], asked: QueryEnd) -> None:
@@ -93,9 +93,10 @@ class ControlQueries:
 
     def later(self, greeting: frame.Greeting, job: Callable[[], None], asked: QueryEnd) -> None:
         """Run a job on the other thread; if its sender's queue is full, just end the query."""
-        known = self.sessions.holder(greeting.token).encode()
-        lane = known or b"\0" + greeting.certificate  # which may say that it is anybody
-        if not self.work.offer(job, lane, always=bool(known)):
+        known = self.sessions.of(greeting.token)
+        # A certificate may say that it is anybody.
+        lane = known.common_name.encode() if known else b"\0" + greeting.certificate
+        if not self.work.offer(job, lane, always=known is not None):
             self._end_of_stranger(asked, "")
 
     def _turn_away(self, asked: QueryEnd, refusal: str, why: str) -> None:

@@ -93,11 +93,6 @@ class AuthenticatedSessions:
         for token in self._holders.pop(name, ()):
             del self._tokens[token]
 
-    def holder(self, token: bytes) -> str:
-        """Return the holder of the connection with a token; empty if unknown."""
-        found = self._tokens.get(token)
-        return "" if found is None else found.common_name
-
     def revoke(self, names: Collection[str]) -> None:
         """Admit these holders no more. Earlier revocations stay in force."""
         with self._lock:
