@@ -107,11 +107,9 @@ class DialIn:
             finally:
                 with self._lock:
                     self._greeting.pop(link, None)
-        except RecordError as error:
-            self._count(f"greeting_{error.reason}", f"{host}: {error}")
-            hang_up(link)
-        except (OSError, EOFError) as error:
-            self._count("greeting_failed", f"{host}: {error}")
+        except (RecordError, OSError, EOFError) as error:
+            reason = error.reason if isinstance(error, RecordError) else "failed"
+            self._count(f"greeting_{reason}", f"{host}: {error}")
             hang_up(link)
         else:
             self._wait(_Waiting(id, link))
