@@ -100,6 +100,7 @@ class ZenohListener:
         # What the pool has signed: taken before `serve`, none of the revoked is ever let in.
         self.take_records = self._control.take
         self._services: dict[str, str] = {}  # key -> service
+        self._on_request: Callable[[Incoming], None]
 
     def serve(
         self,
@@ -132,8 +133,9 @@ class ZenohListener:
             stuck_after_s=self._settings.stuck_after_s,
         )
         self.add(services)
+        self._on_request = on_request
         key = partial(names.slot_key, self._id.pool_uid, self._id.slot)
-        self._hear(session, key(names.SERVICES), partial(self._request, on_request))
+        self._hear(session, key(names.SERVICES), self._request)
         self._hear(session, key(names.CANCEL), partial(self._cancel, on_cancel))
         self._declare(session, key(names.ANSWERS), self._control.open_answers)
         self._declare(session, key(names.RECORDS), self._control.exchange)
@@ -186,21 +188,18 @@ class ZenohListener:
 
     # -- Zenoh's threads ------------------------------------------------------------------
 
-    def _request(self, on_request: Callable[[Incoming], None], sample: zenoh.Sample) -> None:
+    def _request(self, sample: zenoh.Sample) -> None:
         attachment = sample.attachment
         head = attachment.to_bytes() if attachment else b""
         if head[:1] == batch_frames.BATCH:
             requests = batch_frames.decode_requests(head, sample.payload.to_bytes())
         else:
             requests = [(frame.decode_request(head), sample.payload.to_bytes())]
-        self._take_requests(on_request, str(sample.key_expr), requests)
+        self._take_requests(str(sample.key_expr), requests)
         self._counters.add("requests", len(requests))
 
     def _take_requests(
-        self,
-        on_request: Callable[[Incoming], None],
-        key: str,
-        requests: Sequence[tuple[frame.RequestHeader, bytes]],
+        self, key: str, requests: Sequence[tuple[frame.RequestHeader, bytes]]
     ) -> None:
         token = requests[0][0].token
         stream = self.streams.of(token)
@@ -221,20 +220,15 @@ class ZenohListener:
             requests = [(one._replace(robot=holder.name), content) for one, content in requests]
         for header, payload in requests:
             if not header.packed:
-                self._hand_over(on_request, service, header, stream, payload)
+                self._hand_over(service, header, stream, payload)
                 continue
-            hand_over = partial(self._hand_over, on_request, service, header, stream)
+            hand_over = partial(self._hand_over, service, header, stream)
             if not self._unpacker.put(holder.common_name, payload, hand_over):
                 self._refuse(stream, Refusal.OVERLOADED, (header, payload))
         stream.seen(requests[0][0].seen)
 
     def _hand_over(
-        self,
-        on_request: Callable[[Incoming], None],
-        service: str,
-        header: frame.RequestHeader,
-        stream: Stream,
-        request: bytes | None,
+        self, service: str, header: frame.RequestHeader, stream: Stream, request: bytes | None
     ) -> None:
         if request is None:
             self._malformed("a payload that cannot be decompressed")
@@ -242,7 +236,7 @@ class ZenohListener:
             return
         incoming = ZenohIncoming(service, header, request, stream, self._queues)
         try:
-            on_request(incoming)
+            self._on_request(incoming)
         except Exception:  # the others that came with it go on
             self._counters.add("failed")
             log.exception("request_not_taken service=%s", service)
