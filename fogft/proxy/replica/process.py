@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from fogft.cloud import notice
 from fogft.cloud.notice_formats import Notice, NoticeKind
@@ -46,29 +47,23 @@ _LEAVE_S = 4.0
 def run(
     config_path: Path,
     *,
-    listen: str | None = None,
-    domain_id: int | None = None,
     workdir: Path | None = None,
     notice_file: Path | None = None,
-    advertise: str | None = None,
-    metrics: str | None = None,
+    **override: Any,
 ) -> None:
     """Run until a signal ends it, or until the manager's lease is over.
 
-    Each option replaces a key of the file; `notice_file` appears when the machine is about to be
-    preempted.
+    Each option replaces a key of the file, if it is not None; `notice_file` appears when the
+    machine is about to be preempted.
 
     Raises FogftError: The configuration, the credentials or ROS cannot be used.
     """
     begin_start()
     config = read_server(
         config_path,
-        listen=listen,
-        domain_id=domain_id,
         workdir=str(workdir.resolve()) if workdir else None,
         notice=f"file:{notice_file.resolve()}" if notice_file else None,
-        advertise=advertise,
-        metrics=metrics,
+        **override,
     )
     start_log()
     stop = stop_on_signal()
