@@ -7,7 +7,7 @@ Owns: levels, sentences, and the values below them; when they are told. Not here
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -40,7 +40,7 @@ class Diagnosis:
     def __init__(self, pool: str, robot: str) -> None:
         self._pool = pool
         self._robot = robot
-        self._before: deque[tuple[float, dict[str, dict[str, int]]]] = deque()
+        self._before: deque[tuple[float, dict[str, Counter[str]]]] = deque()
 
     def of(self, report: Mapping[str, Any], now: float) -> list[Status]:
         """Return the statuses of a report."""
@@ -54,17 +54,14 @@ class Diagnosis:
 
     def _lately(
         self, services: Mapping[str, Mapping[str, Any]], now: float
-    ) -> dict[str, dict[str, int]]:
+    ) -> dict[str, Counter[str]]:
         """Return how often each trouble befell each service in the last `WINDOW_S`."""
-        counts = {n: {k: int(s.get(k, 0)) for k in _TROUBLES} for n, s in services.items()}
+        counts = {n: Counter({k: s.get(k, 0) for k in _TROUBLES}) for n, s in services.items()}
         self._before.append((now, counts))
         while len(self._before) > 1 and self._before[1][0] <= now - WINDOW_S:
             self._before.popleft()
         then = self._before[0][1]
-        return {
-            name: {k: max(0, n - then.get(name, {}).get(k, 0)) for k, n in found.items()}
-            for name, found in counts.items()
-        }
+        return {name: found - then.get(name, Counter()) for name, found in counts.items()}
 
     def _overall(self, report: Mapping[str, Any], services: list[Status]) -> Status:
         links = report["links"]
@@ -109,7 +106,7 @@ class Diagnosis:
         lately: Mapping[str, int],
     ) -> Status:
         ready = sum(name in link["ready"] for link in links)
-        troubles = [f"{n} {_TROUBLES[key]}" for key, n in lately.items() if n]
+        troubles = [f"{n} {_TROUBLES[key]}" for key, n in lately.items()]
         if not ready:
             level, message = Level.ERROR, "no replica can answer"
         elif report.get("trouble"):
