@@ -73,9 +73,10 @@ class Responder:
         self._cancel_clients: Mapping[str, RosClient] = {}
         self.known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
         self._queues: dict[str, ServiceQueue] = {}
-        self.ran, self.ran_s = 0, 0.0  # requests passed on, and the time they took together
-        self.saved = self.interrupted = 0  # dropped unbegun, or told to stop: nobody wanted them
-        self.wasted, self.wasted_s = 0, 0.0  # run for nobody: too late, or unwanted
+        # Requests passed on, and the time they took together; dropped unbegun, or told to stop:
+        # nobody wanted them; run for nobody: too late, or unwanted.
+        counts = ("ran", "ran_s", "saved", "interrupted", "wasted", "wasted_s")
+        self.work: dict[str, float] = dict.fromkeys(counts, 0)
 
     @property
     def at_work(self) -> int:
@@ -89,15 +90,8 @@ class Responder:
 
     def report(self) -> dict[str, float]:
         """Return the counters of requests, in the form of a probe's answer."""
-        return {
-            "held": self.known.held,
-            "ran": self.ran,
-            "ran_s": round(self.ran_s, 3),
-            "saved": self.saved,
-            "interrupted": self.interrupted,
-            "wasted": self.wasted,
-            "wasted_s": round(self.wasted_s, 3),
-        }
+        work = {name: round(count, 3) for name, count in self.work.items()}
+        return {"held": self.known.held, **work}
 
     def hanging(self, *, stuck: bool = False) -> dict[str, float]:
         """Return for how many seconds services have finished nothing, where that is unusual.
@@ -207,7 +201,7 @@ class Responder:
                     continue
                 job.unwanted = True
                 if self._queue(job.service).remove(job):
-                    self.saved += 1
+                    self.work["saved"] += 1
                     dropped.append(id)
                 elif job.passed_on:
                     at_work.append(job)
@@ -219,7 +213,9 @@ class Responder:
                 with self._lock:
                     held = queue.hold(self._clock()) if job.passed_on else None
                 if held is not None:
-                    self.interrupted += self._await(job.service, client, EMPTY_REQUEST, held)
+                    self.work["interrupted"] += self._await(
+                        job.service, client, EMPTY_REQUEST, held
+                    )
 
     def _await(self, service: str, client: RosClient, request: bytes, held: float) -> bool:
         """End a hold once this is answered; return whether it was sent."""
@@ -263,7 +259,7 @@ class Responder:
         except KeyError:
             self._end(job.id, Refusal.NOT_READY)
         else:
-            self.ran += 1
+            self.work["ran"] += 1
             if job.service in self._results:
                 with self._lock:
                     held = self._queues[job.service].hold_batch(self._clock())
@@ -294,10 +290,10 @@ class Responder:
         finally:
             with self._lock:  # after the replies: these cannot wait
                 queue.finished(job, now)
-                self.ran_s += now - job.begun
+                self.work["ran_s"] += now - job.begun
                 if not waiting or job.unwanted:
-                    self.wasted += 1
-                    self.wasted_s += now - job.begun
+                    self.work["wasted"] += 1
+                    self.work["wasted_s"] += now - job.begun
             if queue.waiting():
                 self._pass_on(job.service)
             if self._answered is not None:

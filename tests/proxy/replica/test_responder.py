@@ -74,10 +74,10 @@ def test_an_answer_leaves_before_it_is_counted_and_makes_room_after():
     scene = Scene(limits={"/s": 1})
     first, second = scene.ask(A), scene.ask(B)
     ran_s: list[float] = []
-    first.reply = lambda payload, **_: ran_s.append(scene.responder.ran_s)
+    first.reply = lambda payload, **_: ran_s.append(scene.responder.work["ran_s"])
     scene.clock.now += 1.0
     scene.answer(0)
-    assert (ran_s, scene.responder.ran_s) == ([0.0], 1.0)
+    assert (ran_s, scene.responder.work["ran_s"]) == ([0.0], 1.0)
     scene.answer(1)
     assert second.outcome == [b"r"]
     assert scene.responder.in_flight == 0
@@ -184,7 +184,7 @@ def test_a_copy_joins_the_work_in_progress():
     first, copy = scene.ask(A), scene.ask(A)
     scene.answer(0, b"r")
     assert (first.outcome, copy.outcome) == ([b"r"], [b"r"])
-    assert scene.responder.ran == 1
+    assert scene.responder.work["ran"] == 1
 
 
 def test_few_copies_of_one_request_are_held():
@@ -562,7 +562,7 @@ def test_what_waits_and_is_no_longer_wanted_is_dropped_and_counted():
     assert unwanted.outcome == ["refused cancelled"]
     scene.answer(0)
     assert len(scene.client.calls) == 1
-    assert (scene.responder.saved, scene.responder.in_flight) == (1, 0)
+    assert (scene.responder.work["saved"], scene.responder.in_flight) == (1, 0)
 
 
 def test_what_is_at_work_and_no_longer_wanted_is_counted_as_wasted_and_its_bytes_stay_here():
@@ -572,7 +572,7 @@ def test_what_is_at_work_and_no_longer_wanted_is_counted_as_wasted_and_its_bytes
     scene.clock.now += 2.0
     scene.answer(0, b"a large answer")
     assert unwanted.outcome == ["refused late"]
-    assert (scene.responder.wasted, scene.responder.wasted_s) == (1, 2.0)
+    assert (scene.responder.work["wasted"], scene.responder.work["wasted_s"]) == (1, 2.0)
 
 
 def test_an_answer_after_the_deadline_is_counted_as_wasted():
@@ -581,7 +581,7 @@ def test_an_answer_after_the_deadline_is_counted_as_wasted():
     scene.clock.now += 1.5
     scene.responder.tick()
     scene.answer(0)
-    assert scene.responder.wasted == 1
+    assert scene.responder.work["wasted"] == 1
 
 
 def test_what_is_answered_cannot_be_cancelled():
@@ -590,7 +590,7 @@ def test_what_is_answered_cannot_be_cancelled():
     scene.answer(0, b"r")
     scene.responder.cancel([A])
     assert scene.ask(A).outcome == [b"r"]
-    assert scene.responder.saved == 0
+    assert scene.responder.work["saved"] == 0
 
 
 def interruptible() -> tuple[Scene, FakeClient]:
@@ -605,7 +605,7 @@ def test_a_cancel_service_is_called_for_what_is_at_work():
     scene.ask(A)
     scene.responder.cancel([A])
     assert [payload for payload, _ in stop.calls] == [EMPTY_REQUEST]
-    assert scene.responder.interrupted == 1
+    assert scene.responder.work["interrupted"] == 1
 
 
 def test_nothing_is_begun_before_the_cancel_service_has_answered():
@@ -643,7 +643,7 @@ def test_a_service_without_a_cancel_service_works_on():
     scene = Scene()
     scene.ask(A)
     scene.responder.cancel([A])
-    assert scene.responder.interrupted == 0
+    assert scene.responder.work["interrupted"] == 0
 
 
 def test_the_earliest_deadline_is_begun_first():
@@ -726,10 +726,10 @@ def test_a_short_service_has_its_next_request_in_hand_and_a_long_one_does_not():
     """So it never stands still between two; the next one's time counts from its turn."""
     scene = saturated(0.02)
     assert len(scene.client.calls) == 152
-    before = scene.responder.ran_s
+    before = scene.responder.work["ran_s"]
     scene.clock.now += 0.02
     scene.answer(150)
-    assert scene.responder.ran_s - before == pytest.approx(0.02)
+    assert scene.responder.work["ran_s"] - before == pytest.approx(0.02)
     assert len(saturated(0.2).client.calls) == 151
 
 
