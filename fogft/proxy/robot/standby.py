@@ -232,13 +232,9 @@ def _run(proxy: ClientProxy, limit_s: float, done: Callable[[], bool]) -> bool:
 
 def _takes(report: Path, callers: Mapping[str, int]) -> bool:
     """Whether another proxy offers all of these services, to as many callers at least."""
-    try:
+    with contextlib.suppress(StateError, AttributeError, KeyError, TypeError):
         told = disk.read_json(report)
-    except StateError:
-        return False
-    if not isinstance(told, dict) or told.get("pid") == os.getpid():
-        return False
-    theirs = told.get("callers")
-    if not isinstance(theirs, dict):
-        return False
-    return all(theirs.get(name, -1) >= count for name, count in callers.items())
+        theirs = told["callers"]
+        if told["pid"] != os.getpid():
+            return all(theirs.get(name, -1) >= count for name, count in callers.items())
+    return False
