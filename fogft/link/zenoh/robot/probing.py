@@ -7,9 +7,9 @@ present connection, by which it is given up. When to probe is `link`'s to say.
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING
 
 from fogft.errors import FrameError, WireError
@@ -66,7 +66,7 @@ class Probing:
         self._peer = peer
         self._came = came
         self._key = names.slot_key(peer.id.pool_uid, peer.id.slot, names.PROBE)
-        self._queue: SimpleQueue[Heard] = SimpleQueue()
+        self._queue: deque[Heard] = deque()  # filled by Zenoh's thread
         self._of_replica = Silence()
         self.silent_s = self._of_replica.for_s  # for how long the replica has been
         self.nobody_to_ask = self._of_replica.began  # it is not reached: silent from now on
@@ -85,18 +85,15 @@ class Probing:
         self._of_replica.began(now)
 
         def heard(content: bytes) -> None:
-            self._queue.put((connection, content, now, time.monotonic()))
+            self._queue.append((connection, content, now, time.monotonic()))
             self._came()
 
         connection.probe(self._key, probe_frames.encode_probe(probe), heard)
 
     def heard(self, connection: Connection) -> Iterator[Heard]:
         """Return the answers of this connection since the last call; others are dropped."""
-        while True:
-            try:
-                heard = self._queue.get_nowait()
-            except Empty:
-                return
+        while self._queue:
+            heard = self._queue.popleft()
             if heard[0] is connection:
                 yield heard
 
