@@ -100,13 +100,14 @@ def _clock_words(error: ssl.SSLError, peer: Peer, credentials: CredentialPaths) 
 
 
 def _certificate_of(peer: Peer, credentials: CredentialPaths) -> bytes:
-    """Return the certificate (DER) that stands at an endpoint, whoever's it is; to look at only."""
+    """Return the certificate (PEM) that stands at an endpoint, whoever's it is; to look at only."""
     context = _context(credentials)
     context.verify_mode = ssl.CERT_NONE
     with contextlib.suppress(OSError, ValueError):
         with socket.create_connection(host_and_port(peer.endpoint), _TIMEOUT_S) as raw:
             with context.wrap_socket(raw) as link:
-                return link.getpeercert(binary_form=True) or b""
+                der = link.getpeercert(binary_form=True) or b""
+                return ssl.DER_cert_to_PEM_cert(der).encode()
     return b""
 
 
@@ -125,16 +126,11 @@ Validity = tuple[datetime.datetime, datetime.datetime]  # from when to when a ce
 
 
 def validity_of(certificate: bytes) -> Validity | None:
-    """Return when a certificate (PEM or DER) is good; None where it cannot be read."""
+    """Return when a certificate (PEM) is good; None where it cannot be read."""
     from cryptography import x509
 
     try:
-        load = (
-            x509.load_pem_x509_certificate
-            if certificate.lstrip().startswith(b"-----")
-            else x509.load_der_x509_certificate
-        )
-        read = load(certificate)
+        read = x509.load_pem_x509_certificate(certificate)
     except Exception:  # the parser may raise anything on hostile bytes
         return None
     return read.not_valid_before_utc, read.not_valid_after_utc

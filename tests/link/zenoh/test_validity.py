@@ -35,14 +35,15 @@ def test_our_own_certificates_end_is_our_own_fault(begins: int, lasts: int) -> N
     assert blamed == (judged_here(validity, NOW) == "")
 
 
-def test_both_forms_of_a_certificate_are_read(tmp_path: Path) -> None:
+def test_a_certificate_is_read_also_as_it_comes_from_elsewhere(tmp_path: Path) -> None:
     import ssl
 
     authority.create_authority(tmp_path, "0123456789abcdef")
     pem = (tmp_path / "ca.crt").read_bytes()
     read = validity_of(pem)
     assert read is not None
-    assert read == validity_of(ssl.PEM_cert_to_DER_cert(pem.decode()))
+    der = ssl.PEM_cert_to_DER_cert(pem.decode())
+    assert read == validity_of(ssl.DER_cert_to_PEM_cert(der).encode())
     assert read[1] - read[0] > 3000 * DAY
 
 
