@@ -71,21 +71,18 @@ class Supervisor:
             if status is None:
                 return False
             died = True
-            self._note_death(status, at_work=at_work)
+            self._kill_group(self._child.pid)  # what it left behind in its group
+            ran_s = self.clock() - self._started_at
+            if ran_s > self.backoff_s[1] or at_work:
+                self._wait_s = 0.0
+            self.last_exit = how_it_ended(status)
+            wait_s = self._wait_s
+            log.warning("run_ended status=%d ran_s=%.1f again_in_s=%.1f", status, ran_s, wait_s)
+            self._child = None
+            self._delay_next_start()
         if self.clock() >= self.start_at:
             self._start()
         return died
-
-    def _note_death(self, status: int, *, at_work: bool) -> None:
-        assert self._child is not None
-        self._kill_group(self._child.pid)  # what it left behind in its group
-        ran_s = self.clock() - self._started_at
-        if ran_s > self.backoff_s[1] or at_work:
-            self._wait_s = 0.0
-        self.last_exit = how_it_ended(status)
-        log.warning("run_ended status=%d ran_s=%.1f again_in_s=%.1f", status, ran_s, self._wait_s)
-        self._child = None
-        self._delay_next_start()
 
     def _delay_next_start(self) -> None:
         first_s, longest_s = self.backoff_s
