@@ -183,11 +183,8 @@ class Forwarder:
     def tick(self, ready: frozenset[str]) -> None:
         """Drop requests past their deadline or without a `ready` replica. Call at 50 Hz."""
         now = self._clock()
-        for name in ready:
-            self._unready_since.pop(name, None)
-        for name in self._dispatchers.keys() - ready:
-            self._unready_since.setdefault(name, now)
-        self._ready = ready
+        unready, before = self._dispatchers.keys() - ready, self._unready_since
+        self._ready, self._unready_since = ready, {n: before.get(n, now) for n in unready}
         hopeless = {n for n, since in self._unready_since.items() if now - since >= UNREADY_S}
         with self._lock:
             late = self._known.expired(now)
