@@ -30,10 +30,6 @@ class WorkQueue:
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
         self.start = self._thread.start  # jobs queued earlier wait until then
 
-    def __len__(self) -> int:
-        with self._lock:
-            return sum(map(len, self._lanes.values()))
-
     def offer(self, job: Callable[[], None], lane: bytes = b"", *, always: bool = False) -> bool:
         """Queue a job; if its lane is full, or there are too many, count it and return False."""
         with self._lock:
