@@ -226,14 +226,10 @@ class DialIn:
                         return None
                 one = found[-1]  # the latest is the likeliest to live
                 self._waiting.remove(one)
-            with one.lock:
+            with one.lock, contextlib.suppress(OSError):
                 one.taken = True
-                try:
-                    one.link.settimeout(0.5)
-                    one.link.sendall(GO)
-                except OSError:
-                    hang_up(one.link)
-                    continue
+                one.link.settimeout(0.5)
+                one.link.sendall(GO)
                 if _drained(one.link):
                     return one
             hang_up(one.link)
@@ -262,12 +258,6 @@ class DialIn:
 def _drained(link: socket.socket) -> bool:
     """Read signs of life away up to the replica's `GO`: behind it the TLS client speaks first."""
     link.settimeout(SILENCE_S)
-    try:
-        while True:
-            data = link.recv(1)
-            if data == GO:
-                return True
-            if data != SIGN:
-                return False
-    except OSError:
-        return False
+    while (data := link.recv(1)) == SIGN:
+        pass
+    return data == GO
