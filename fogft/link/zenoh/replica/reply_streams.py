@@ -150,9 +150,7 @@ class Streams:
         with self._lock:
             if token in self._streams:
                 ended.append((token, self._streams.pop(token).query))
-            credit = self._credit.get(holder)
-            if credit is None:
-                credit = self._credit[holder] = ReplyCredit()
+            credit = self._credit.setdefault(holder, ReplyCredit())
             self._streams[token] = Stream(query, credit, holder, self._slow)
             own = [other for other, one in self._streams.items() if one.holder == holder]
             if len(own) > OF_ONE_LIMIT or len(self._streams) > self.limit:
