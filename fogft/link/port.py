@@ -8,7 +8,7 @@ Implementations: `fogft.link.zenoh.robot.link` and `uplinks`, `tests.fakes.link`
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
@@ -33,13 +33,12 @@ class SendOptions:
     timed: frozenset[str] = frozenset()
 
     @classmethod
-    def of(cls, services: Iterable[ServiceSpec]) -> SendOptions:
+    def of(cls, services: Collection[ServiceSpec]) -> SendOptions:
         """Return the options of these services."""
-        known = tuple(services)
         return cls(
-            frozenset(s.name for s in known if s.freshness is Freshness.LATEST),
-            frozenset(s.name for s in known if s.compression is Compression.OFF),
-            frozenset(s.name for s in known if s.state is None),
+            frozenset(s.name for s in services if s.freshness is Freshness.LATEST),
+            frozenset(s.name for s in services if s.compression is Compression.OFF),
+            frozenset(s.name for s in services if s.state is None),
         )
 
 
