@@ -88,7 +88,7 @@ class ReplyQueue:
         self.replies: SimpleQueue[Reply | QueryEnd | None] = SimpleQueue()
         self.waiting = 0
         self.large = ByteLimit(BYTES_LIMIT)  # of the waiting ones
-        self.thread: threading.Thread | None = None
+        self.thread: threading.Thread  # which begins before the queue is used
         self._taken: list[Reply | QueryEnd | None] = []  # it did not fit to what was taken before
 
     def next(self, timeout_s: float) -> list[Reply] | QueryEnd:
@@ -240,8 +240,7 @@ class ReplyQueues:
         for queue in queues:
             queue.replies.put(None)
         for queue in queues:
-            if queue.thread is not None:
-                queue.thread.join(timeout_s / max(len(queues), 1))
+            queue.thread.join(timeout_s / max(len(queues), 1))
 
 
 class ZenohIncoming:
