@@ -126,7 +126,6 @@ class _Gateway:
         log.info("gateway_listening gateway=%s endpoint=%s", self._holder.short, listener.endpoint)
 
     def _probed(self, probe: Probe) -> ProbeAnswer:
-        behind = self._proxy.behind()
         ready = self._proxy.links.ready
         return ProbeAnswer(
             slot=names.gateway_slot(self._holder.name),
@@ -136,7 +135,7 @@ class _Gateway:
             in_flight=self._forwarder.in_flight,
             work=self._forwarder.work(),
             detail="" if ready else "no replica behind it answers",
-            behind=behind,
+            behind=self._proxy.behind(),
             types=self._proxy.links.types() if probe.describe else {},
         )
 
