@@ -7,6 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -69,7 +70,7 @@ def test_the_profile_goes_to_the_variable_that_the_sourced_fast_dds_reads(
 @needs("fastdds")
 @pytest.mark.parametrize("prepared", [True, False])
 def test_a_node_maps_a_segment_as_large_as_its_profile_says(
-    prepared: bool, ros_domain: int
+    prepared: bool, ros_domains: Callable[[], int]
 ) -> None:
     """What is in force is seen in the memory of a process, whatever its variables say."""
     program = (
@@ -78,13 +79,18 @@ def test_a_node_maps_a_segment_as_large_as_its_profile_says(
         "print(json.dumps(self_test.segment()))\n"
     )
     clean = {k: v for k, v in os.environ.items() if not k.endswith("_DEFAULT_PROFILES_FILE")}
-    clean["ROS_DOMAIN_ID"] = str(ros_domain)  # it also maps those of whom it hears
-    out = subprocess.run(
-        [sys.executable, "-c", program], env=clean, capture_output=True, check=True, timeout=100
-    )
-    mapped = json.loads(out.stdout.splitlines()[-1])["segment_bytes"]
-    assert mapped > 0
-    assert (mapped >= environment.PROFILE_SEGMENT_BYTES) == prepared
+
+    def mapped() -> int:
+        clean["ROS_DOMAIN_ID"] = str(ros_domains())
+        out = subprocess.run(
+            [sys.executable, "-c", program], env=clean, capture_output=True, check=True, timeout=100
+        )
+        return int(json.loads(out.stdout.splitlines()[-1])["segment_bytes"])
+
+    if prepared:
+        assert mapped() >= environment.PROFILE_SEGMENT_BYTES
+    else:  # it also maps those of whom it hears, and a process may just be leaving its domain
+        assert any(0 < mapped() < environment.PROFILE_SEGMENT_BYTES for _ in range(3))
 
 
 def test_a_profile_in_the_working_folder_stands(
