@@ -118,21 +118,21 @@ class UplinksLink:
         """Take one attempt, or return False when no uplink takes it. Never blocks."""
         attempt = _Attempt(service, payload, time.monotonic() + remaining_s, handling)
         with self._lock:
-            # Of a topic, what follows by another uplink would overtake what is under way.
-            its = service.startswith(topic.PREFIX)
-            if self._closed or (its and self._again) or request_id in self._attempts:
+            if self._closed or request_id in self._attempts:
                 return False
-            others = (one.on for one in self._attempts.values() if its and one.service == service)
-            by = frozenset(next(others, ()))
+            by: Collection[int] = ()
+            if service.startswith(topic.PREFIX):  # by another uplink it would overtake the others
+                if self._again:
+                    return False
+                others = (one.on for one in self._attempts.values() if one.service == service)
+                by = frozenset(next(others, ()))
             self._attempts[request_id] = attempt
         if self._send(request_id, attempt, by):
             return True
         with self._lock:  # unless it has ended meanwhile, which was told
             return self._attempts.pop(request_id, None) is None
 
-    def _send(
-        self, request_id: bytes, attempt: _Attempt, by: Collection[int] = frozenset()
-    ) -> bool:
+    def _send(self, request_id: bytes, attempt: _Attempt, by: Collection[int] = ()) -> bool:
         policy = self._dialer.policies.get(attempt.service, UplinkPolicy.PREFER)
         taken = False
         usable = [i for i, link in enumerate(self._links) if link.usable and (not by or i in by)]

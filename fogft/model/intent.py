@@ -61,13 +61,13 @@ def scale(intent: Intent, spec: PoolSpec, change: int, now: float) -> Intent:
         )
     wanted = intent.wanted(spec, now) + change
     least = max((1, *(service.quorum for service in spec.services)))
-    if not least <= wanted <= MAX_REPLICAS:
-        limit = f"minimum is {least}" if wanted < least else f"maximum is {MAX_REPLICAS}"
+    cannot = f"cannot scale `{spec.name}` to {wanted} replicas"
+    if wanted > MAX_REPLICAS:
+        raise FogftError(f"{cannot}: the maximum is {MAX_REPLICAS}")
+    if wanted < least:
         raise FogftError(
-            f"cannot scale `{spec.name}` to {wanted} replicas: the {limit}",
-            ""
-            if wanted > least
-            else "`fogft down` ends a pool"
+            f"{cannot}: the minimum is {least}",
+            "`fogft down` ends a pool"
             if least == 1
             else "a service needs that `quorum`: change it in the pool file and run `fogft up`",
         )

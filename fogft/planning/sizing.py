@@ -57,9 +57,11 @@ def size(inputs: Inputs, running: int = 0) -> Size:
     groups = groups_of(spec)
     now = wish(spec, observed.wall_clock)
     notes = [Reason(Cause.SCHEDULED_AHEAD)] if now.ahead else []
-    cap = cap_usd(spec, observed)
-    total = intent.wanted(spec, observed.wall_clock)
-    if spec.availability and total == now.replicas == spec.replicas and not intent.is_scaled(spec):
+    cap = observed.below(now.max_usd_per_hour)
+    total = now.replicas
+    if intent.stopping or intent.is_scaled(spec):
+        total = intent.wanted(spec, observed.wall_clock)
+    elif spec.availability and total == spec.replicas:
         total, unmet = _for_target(inputs, spec.availability, cap, running)
         notes += because(unmet)
     return Size(groups, shares(groups, total), cap, tuple(notes))

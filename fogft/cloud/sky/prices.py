@@ -76,7 +76,8 @@ class Prices:
     def instead(self, placement: Placement, limit: float | None) -> Sequence[Offer]:
         """Return what else would do for at most `limit` US dollars per hour, the cheapest first."""
         lately = self.clock() - USABLE_S
-        used = [kept.answer for key, kept in self._kept.items() if self._asked[key] >= lately]
+        keys = [key for key, at in list(self._asked.items()) if at >= lately]  # another may ask
+        used = [self._kept[key].answer for key in keys]
         asked = [sold.instead[placement] for sold in used if sold and placement in sold.instead]
         allowed = [{offer.placement for offer in others} for others in asked]  # by each who asked
         found = [o for o in asked[0] if all(o.placement in a for a in allowed)] if asked else []

@@ -104,9 +104,9 @@ def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
 def _pools() -> dict[str, tuple[str, bool]]:
     """Return uid -> name and whether it has a manager, of the pools here and those exported."""
     found = {}
-    for path in (home() / "pools").glob("*/exported.json"):
+    for folder in (home() / "pools").glob("*"):
         with contextlib.suppress(StateError):
-            if (moved := disk.read_as(Identity, path)) is not None:
+            if (moved := disk.read_as(Identity, PoolPaths(folder).exported)) is not None:
                 found[moved.uid] = (moved.name, True)
     for name in pools():
         paths = PoolPaths.of(name)

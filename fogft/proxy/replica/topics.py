@@ -21,6 +21,7 @@ from fogft.errors import FrameError, RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
 from fogft.model.topic import Origin, TopicSpec
+from fogft.process import on_thread
 from fogft.requests.fair_queue import FairQueue
 from fogft.topics import frames
 from fogft.topics.queues import Judgement, Ring, Seen
@@ -189,7 +190,8 @@ class TopicsOnReplica:
             for name, topic in self._topics.items()
         }
         # Publishing may block for a moment, and answers are copied: the wire's threads must not.
-        self.inboxes = [_Inbox(take, self._turn_away) for take in (self._publish, self._answer)]
+        messages, pulls = (_Inbox(take, self._turn_away) for take in (self._publish, self._answer))
+        self._messages, self._pulls, self.inboxes = messages, pulls, (messages, pulls)
         self._running = False
         # Until when a robot sends nothing on a topic but what was on its way before.
         self._rests: dict[tuple[str, str], float] = {}
@@ -213,7 +215,7 @@ class TopicsOnReplica:
         if not self._running:
             self._running = True
             for inbox in self.inboxes:
-                threading.Thread(target=inbox.run, name="fogft-topics", daemon=True).start()
+                on_thread(inbox.run, name="fogft-topics")
         for name, topic in self._topics.items():
             try:
                 if topic.origin is Origin.ROBOT:
@@ -247,11 +249,11 @@ class TopicsOnReplica:
         """Take a message or a pull from the link. Never blocks."""
         name = incoming.service
         if name in self._outgoing:
-            self.inboxes[1].put(incoming)
+            self._pulls.put(incoming)
         elif self._clock() < self._rests.get((name, incoming.robot), 0.0):
             incoming.refuse(Refusal.OVERLOADED)
         elif name in self._publishers:
-            self.inboxes[0].put(incoming)
+            self._messages.put(incoming)
         else:
             self._turn_away(incoming, Refusal.NOT_READY)
 

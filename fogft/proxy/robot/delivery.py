@@ -44,11 +44,11 @@ class Delivery:
     def adopt(self, spec: ServiceSpec, client: RosClient | None) -> None:
         """Apply a spec's fallback, with its client; without one, ask no more. Under the lock."""
         was, self._client, requests = self._client, client, self.ledger.requests
-        if requests.fallback is not None and was is not client:
-            requests.fallback.not_asked()
         if requests.fallback is None and spec.fallback is not None:
             requests.fallback = FallbackTimer(spec.fallback)
         elif requests.fallback is not None:
+            if client is not was:
+                requests.fallback.not_asked()
             old = requests.fallback.spec
             unasked = replace(old, after_s=None, while_none_ready=False)
             requests.fallback.spec = spec.fallback or unasked
