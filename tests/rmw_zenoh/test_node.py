@@ -194,14 +194,17 @@ class PlainClient:
         self.lost += len(self._answers) == 10
         self._answers.append(reply.ok.payload.to_bytes())
 
-    def call(self, number: int) -> None:
-        self._session.get(
-            KEY,
-            handlers.Callback(self._answered, indirect=False),
-            payload=BODY,
-            attachment=request_attachment(number, time.time_ns(), GID),
-            timeout=LIMIT_S,
-        )
+    def burst(self, requests: int) -> None:
+        """Ask at once: all bear one time, however long it takes here to send them."""
+        sent_ns = time.time_ns()
+        for number in range(requests):
+            self._session.get(
+                KEY,
+                handlers.Callback(self._answered, indirect=False),
+                payload=BODY,
+                attachment=request_attachment(number, sent_ns, GID),
+                timeout=LIMIT_S,
+            )
 
     def close(self) -> None:
         self._open = False
@@ -217,8 +220,7 @@ def burst(node: RmwZenohNode, peer: zenoh.Session) -> PlainClient:
         wait_for(lambda: node.graph.servers("/robot/get_parameter_types"), "the client's node")
         echo(node)
         wait_for(lambda: any("/SS/" in t and "grasp" in t for t in tokens(peer)), "the service")
-        for number in range(64):
-            client.call(number)
+        client.burst(64)
         wait_for(lambda: client.taken + client.lost >= 64, "all answers")
     return client
 
