@@ -63,20 +63,20 @@ def plan_gateway(
     history: History,
     offers: Sequence[Offer],
     *,
-    up_at: float | None,
+    heard_at: float,
 ) -> GatewayPlan:
     """Return the next step; the cloud must have answered.
 
     Args:
         offers: On-demand machines that would do, the cheapest first.
-        up_at: When the robot's link to a gateway of the pool's own was last seen up.
+        heard_at: When the robot's link to it was last seen up, or nobody looked.
     """
     here = [m for m in observed.gateway if m.id not in observed.ending]
     newest = max((m.id for m in here), default=None)
     ends, failed, host = [], set(), ""
     for machine in here:
         wanted = spec.gateway.launch and not intent.stopping and machine.id == newest
-        fault = _fault(machine, spec, observed.now, history, up_at) if wanted else None
+        fault = _fault(machine, spec, observed.now, history, heard_at) if wanted else None
         if not wanted:
             ends.append((machine.id, Reason(Cause.DOWN if intent.stopping else Cause.NOT_WANTED)))
         elif machine.spec_hash != version(spec):
@@ -95,7 +95,7 @@ def plan_gateway(
 
 
 def _fault(
-    machine: Machine, spec: PoolSpec, now: float, history: History, up_at: float | None
+    machine: Machine, spec: PoolSpec, now: float, history: History, heard_at: float
 ) -> Reason | None:
     if machine.phase is MachinePhase.FAILED:
         return machine.failure or Reason(Cause.ERROR)
@@ -105,7 +105,7 @@ def _fault(
     if machine.phase is not MachinePhase.RUNNING or machine.setting_up or not runs_since:
         return None  # the cloud gives up a launch that hangs
     limit_s = LOST_S if was_up else spec.health.start_limit_s
-    silent_s = now - max(runs_since, up_at or 0.0)
+    silent_s = now - max(runs_since, heard_at)
     if silent_s <= limit_s:
         return None
     if was_up:

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from fogft.model.groups import is_current, replica_hash
-from fogft.model.reason import Cause, Reason, because
+from fogft.model.reason import NOTICES, Cause, Reason, because
 from fogft.model.replica import LinkState
 from fogft.model.spec import PoolSpec
 from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment, Health, Verdict
-from fogft.planning.observed.history import History
+from fogft.planning.observed.history import OWN_FAULTS, History, fault_of
 
 # A new replica has to serve for so long before the next one is replaced, or its version is good.
 SETTLE_S = 5.0
@@ -29,8 +29,7 @@ CLOUD_FAILURES = 3
 ERRORS_MIN = 5
 ERRORS_MARGIN = 0.02
 _SURE = 3.0  # standard deviations: chance alone stops about one update in a thousand
-_THE_VERSIONS = (Cause.SETUP, Cause.TIMEOUT)
-_THE_CLOUDS = (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS)
+_THE_CLOUDS = (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS, Cause.NOT_LISTED, *NOTICES)
 
 
 class UpdateState(str, Enum):
@@ -101,7 +100,7 @@ def fault(
 
 def _does_not_start(judged: Assessment) -> Reason | None:
     why = judged.why
-    if judged.verdict is Verdict.FAILED and why is not None and why.cause in _THE_VERSIONS:
+    if why is not None and judged.verdict is Verdict.FAILED and fault_of(why) in OWN_FAULTS:
         return replace(why, words=why.words.partition("\n")[0])
     link = judged.link
     if link is None or link.state is not LinkState.UP or judged.serving:

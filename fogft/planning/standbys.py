@@ -70,12 +70,12 @@ def stopped(
 
 
 def superfluous(
-    spec: PoolSpec, observed: Observed, starting: Iterable[PlannedLaunch]
+    spec: PoolSpec, observed: Observed, starting: Iterable[PlannedLaunch], *, stopping: bool = False
 ) -> list[tuple[ReplicaId, Reason]]:
     """Return the standbys to end: of another version, or more than the file asks for."""
     groups = groups_of(spec)
     used = {(planned.slot, planned.generation) for planned in starting}
-    room = {group.name: group.on_demand.standbys for group in groups}
+    room = {group.name: 0 if stopping else group.on_demand.standbys for group in groups}
     ends = []
     for machine in observed.standbys:
         if machine.id in observed.ending or (machine.id.slot, machine.id.generation) in used:

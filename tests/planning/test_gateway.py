@@ -52,11 +52,11 @@ def step(
     past: History | None = None,
     intent=NOTHING,
     pool=POOL,
-    up_at=None,
+    heard_at=0.0,
     replicas: tuple[Machine, ...] = (),
 ) -> GatewayPlan:
     observed = Observed(NOW, replicas, gateway=machines)
-    return plan_gateway(pool, intent, observed, past or History(), (CHEAP, DEAR), up_at=up_at)
+    return plan_gateway(pool, intent, observed, past or History(), (CHEAP, DEAR), heard_at=heard_at)
 
 
 def test_the_cheapest_is_bought_and_replicas_wait_for_its_address():
@@ -64,7 +64,7 @@ def test_the_cheapest_is_bought_and_replicas_wait_for_its_address():
     assert first.launch == CHEAP
     assert first.note is not None
     assert step(machine(phase=MachinePhase.PROVISIONING, endpoint=None)).host == ""
-    there = step(machine(), up_at=NOW)
+    there = step(machine(), heard_at=NOW)
     assert (there.host, there.launch, there.ends) == ("203.0.113.7", None, ())
 
 
@@ -91,16 +91,16 @@ LAUNCHED, UP, GONE = EventKind.LAUNCH, EventKind.READY, EventKind.GONE
 
 
 @pytest.mark.parametrize(
-    ("past", "up_at", "why"),
+    ("past", "heard_at", "why"),
     [
         (((RUNS_SINCE, LAUNCHED, 1), (RUNS_SINCE, UP, 1)), NOW - 50, None),
         (((RUNS_SINCE, LAUNCHED, 1), (RUNS_SINCE, UP, 1)), NOW - 70, Cause.SILENT),
-        (((RUNS_SINCE, LAUNCHED, 1),), None, Cause.TIMEOUT),
+        (((RUNS_SINCE, LAUNCHED, 1),), 0.0, Cause.TIMEOUT),
     ],
 )
-def test_it_is_replaced_when_the_robot_reaches_it_no_more(past, up_at, why):
+def test_it_is_replaced_when_the_robot_reaches_it_no_more(past, heard_at, why):
     """After a minute, or where it never did after `start_limit_s` (900 s)."""
-    ended = step(machine(), past=history(*past), up_at=up_at).ends
+    ended = step(machine(), past=history(*past), heard_at=heard_at).ends
     assert [reason.cause for _, reason in ended] == ([why] if why else [])
 
 

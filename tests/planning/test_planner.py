@@ -71,6 +71,12 @@ def test_the_price_of_today_counts_against_the_budget() -> None:
     assert (again.launches, again.terminations, again.draining) == ((), (), ())
 
 
+def test_as_many_may_be_launched_an_hour_as_go_with_what_is_wanted_now() -> None:
+    """Twelve for each replica: of those that `scale` asks for, not of the file's."""
+    scaled = World(spec(1), intent=Intent(target=20, scaled_from=1))
+    assert len(scaled.plan().launches) == 20
+
+
 def test_a_rebalance_is_an_early_hint() -> None:
     """Its replica serves on, is replaced elsewhere, new before old, and one at a time."""
     world = World(spec(2)).having(

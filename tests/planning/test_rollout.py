@@ -71,18 +71,19 @@ def test_what_is_wrong_with_the_old_version_does_not_speak_against_the_new_one()
 @pytest.mark.parametrize(
     ("failure", "is_fault"),
     [
-        (Cause.SETUP, True),
-        (Cause.TIMEOUT, True),
-        (Cause.CAPACITY, False),
-        (Cause.QUOTA, False),
-        (Cause.ERROR, False),
+        (Reason(Cause.SETUP), True),
+        (Reason(Cause.TIMEOUT, because=(Reason(Cause.NOT_READY),)), True),
+        (Reason(Cause.TIMEOUT, because=(Reason(Cause.NOT_RUNNING),)), False),
+        (Reason(Cause.CAPACITY), False),
+        (Reason(Cause.QUOTA), False),
+        (Reason(Cause.ERROR), False),
     ],
 )
 def test_a_failed_launch_is_the_versions_fault_or_the_clouds(
-    failure: Cause, is_fault: bool
+    failure: Reason, is_fault: bool
 ) -> None:
     failed = replica(1, 2, state="failed", of=NEW, age_s=20)
-    failed = replace(failed, machine=replace(failed.machine, failure=Reason(failure)))
+    failed = replace(failed, machine=replace(failed.machine, failure=failure))
     assert failed.machine.phase is MachinePhase.FAILED
     assert bool(found(pool(OLD, failed))) is is_fault
 
@@ -90,9 +91,11 @@ def test_a_failed_launch_is_the_versions_fault_or_the_clouds(
 def test_launches_that_keep_failing_are_the_versions_fault_in_the_end() -> None:
     """An image that does not exist looks like a broken cloud, until it does so again."""
 
-    def refused(times: int, at: float) -> tuple[Event, ...]:
+    why = Reason(Cause.ERROR, words="no such image")
+
+    def refused(times: int, at: float, why: Reason = why) -> tuple[Event, ...]:
         return tuple(
-            Event(at + i, kind, 1, i + 2, "east/one/a", Reason(Cause.ERROR, words="no such image"))
+            Event(at + i, kind, 1, i + 2, "east/one/a", why)
             for i in range(times)
             for kind in (EventKind.LAUNCH, EventKind.REFUSED)
         )
@@ -103,6 +106,8 @@ def test_launches_that_keep_failing_are_the_versions_fault_in_the_end() -> None:
     assert (fault.cause, fault.count) == (Cause.LAUNCHES_FAIL, 3)
     before = replace(pool(old), events=(*old.events, *refused(3, NOW - 250)))
     assert found(before) is None, "before the update began"
+    taken = refused(3, NOW - 50, Reason(Cause.NOT_LISTED))
+    assert found(replace(pool(old), events=(*old.events, *taken))) is None, "the market's doing"
 
 
 def test_more_errors_than_the_old_version_has_are_a_fault() -> None:

@@ -13,6 +13,7 @@ import pytest
 from fogft.cloud.sky import adapter, naming
 from fogft.cloud.sky.following import ASK_LIMIT_S, JOB_PAUSE_S, LAUNCH_LIMIT_S
 from fogft.cloud.sky.naming import cluster_name
+from fogft.cloud.sky.provider import Instance
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.cloud.sky.wheel import Locks
 from fogft.errors import (
@@ -26,7 +27,7 @@ from fogft.errors import (
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Placement
-from tests.fakes.sky import EAST, WEST, ScriptedProvider, ScriptedSky, replica
+from tests.fakes.sky import EAST, WEST, ScriptedProvider, ScriptedSky, labels, replica
 from tests.sky.scene import Scene
 
 ID = replica()
@@ -558,6 +559,37 @@ def test_a_lost_database_of_skypilot_loses_no_machine(scene: Scene):
     assert machine.endpoint == endpoint
     scene.cloud.terminate(ID)
     assert not scene.provider.found
+
+
+def test_one_that_skypilots_list_misses_once_is_listed_with_the_next(tmp_path: Path):
+    """Where the provider cannot be asked, nobody else knows of it."""
+    scene = Scene(tmp_path, with_provider=False)
+    scene.launched()
+    records = dict(scene.sky.records)
+    scene.pass_s(60)
+    scene.sky.records.clear()
+    assert not scene.machines()
+    scene.sky.records.update(records)
+    scene.pass_s(60)
+    scene.machines()  # begins to renew the list
+    scene.work()
+    assert [m.id for m in scene.machines()] == [ID]
+
+
+@pytest.mark.parametrize("reachable", [True, False])
+def test_the_first_census_that_is_answered_looks_everywhere(scene: Scene, reachable: bool):
+    far = Placement("aws", "eu-west-1", "eu-west-1a", "m6i.large")
+    instance = Instance(replica(7), "i-9", far, labels(replica(7)), "10.0.0.9", 1.0)
+    scene.provider.found["i-9"] = instance
+    scene.provider.reachable = reachable
+    scene.cloud.offers({"infra": "aws"})  # elsewhere
+    seen = set()
+    for _ in range(3):
+        seen |= {m.id for m in scene.machines()}
+        scene.work()
+        scene.provider.reachable = True
+        scene.pass_s(60)
+    assert seen == {replica(7)}
 
 
 def test_a_provider_that_does_not_answer_leaves_a_missing_machine_unknown(scene: Scene):

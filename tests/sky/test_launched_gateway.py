@@ -34,15 +34,22 @@ def pool(tmp_path: Path) -> PoolOnSky:
         made.store.the_spec = made.store.the_spec.behind(host)
 
     def is_up(now: float) -> bool:
-        return any(i.id.slot == GATEWAY_SLOT for i in made.scene.provider.found.values())
+        there = any(i.id.slot == GATEWAY_SLOT for i in made.scene.provider.found.values())
+        return made.connected and there
 
-    made.manager = Reconciler(
-        made.scene.cloud,
-        made.store,
-        clock=lambda: Reading(*[made.scene.now] * 3),
-        links=made.links,
-        gateway=LaunchedGateway(made.scene.cloud, is_up, order, place),
-    )
+    def new_manager(epoch: int = 2) -> Reconciler:
+        return Reconciler(
+            made.scene.cloud,
+            made.store,
+            clock=lambda: Reading(*[made.scene.now] * 3),
+            links=lambda uid, now: made.links(uid, now) if made.watched else None,
+            epoch=epoch,
+            gateway=LaunchedGateway(made.scene.cloud, is_up, order, place),
+        )
+
+    made.connected = made.watched = True
+    made.new_manager = new_manager
+    made.manager = new_manager(1)
     made.until(made.ready)
     return made
 
@@ -73,3 +80,24 @@ def test_one_that_is_lost_is_missed_at_once_and_no_replica_dials_its_address(poo
     pool.until(lambda: pool.ready() == ["0.2"])
     assert ordered(pool) == ["1999.1", "0.1", "1999.2", "0.2"]
     assert pool.store.the_spec.dial_in != before
+
+
+@pytest.mark.parametrize("what", ["reboot", "sleep", "no report"])
+def test_silence_that_nobody_listened_to_ends_no_gateway(pool: PoolOnSky, what: str):
+    """All replicas would be replaced after it, while nobody is served."""
+    pool.tick(100)
+    pool.connected = False
+    if what == "reboot":  # the robot's links come after its manager
+        pool.kill_the_manager()
+        pool.manager = pool.new_manager()
+    elif what == "sleep":
+        pool.scene.pass_s(600)
+    else:
+        pool.watched = False
+        pool.tick(70)
+    pool.tick(3)
+    pool.connected = pool.watched = True
+    pool.tick(60)
+    assert ordered(pool) == ["1999.1", "0.1"]
+    pool.connected = False
+    pool.until(lambda: "1999.2" in ordered(pool), limit=200)

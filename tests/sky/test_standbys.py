@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from fogft.cloud.sky.naming import cluster_name
-from fogft.errors import CloudError
+from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.choices import OnDemandSpec
 from fogft.model.replica import Offer
 from tests.fakes.sky import EAST, WEST, replica
@@ -56,6 +56,16 @@ def test_a_stand_in_is_stopped_when_spot_is_back_and_started_when_it_is_lost(poo
     assert not [name for name in pool.sky.records if "-100-2" in name or "-101-" in name]
 
 
+def test_one_whose_start_skypilot_does_not_answer_is_not_taken_for_a_failed_launch(pool: PoolOnSky):
+    """The request of its first launch has long ended; this one was heard."""
+    pool.sky.fail_next("launch", CloudUnreachable("no answer within 120 s"), 1)
+    lose_spot(pool)
+    pool.until(lambda: not stopped(pool))
+    pool.tick(60)
+    assert not [name for name in pool.sky.records if "-100-2" in name or "-101-" in name]
+    assert "100.1" in [m.id.short for m in pool.scene.machines()]
+
+
 def test_what_cannot_be_stopped_is_ended(tmp_path: Path):
     made = PoolOnSky(tmp_path, on_demand=OnDemandSpec(fallback=True, standbys=1))
     made.sky.sold = [Offer(EAST, 0.02, "catalogue"), Offer(ON_DEMAND, 0.1, "catalogue")]
@@ -79,6 +89,13 @@ def test_fewer_standbys_are_kept_when_the_file_says_so(pool: PoolOnSky):
     pool.change(on_demand=OnDemandSpec(fallback=True))
     pool.until(lambda: not stopped(pool))
     assert "100.1" not in pool.running()
+
+
+def test_a_new_manager_goes_on_to_shut_them_down(pool: PoolOnSky):
+    """`down` was cut short after it had written that the pool is to end."""
+    pool.store.the_intent = replace(pool.store.the_intent, stopping=True)
+    pool.kill_the_manager()
+    pool.until(lambda: not pool.scene.machines())
 
 
 def test_a_manager_that_died_finds_them(pool: PoolOnSky):

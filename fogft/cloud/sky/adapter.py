@@ -151,6 +151,7 @@ class SkyCloud:
         begun = Entry(
             *(order.id, order.placement, order.usd_per_hour, order.spec_hash, self.clock()),
             port=0 if order.dials_out else order.link_port,
+            starts=order.is_there,
             instead={offer.placement.instance: offer.usd_per_hour for offer in instead},
         )
         files = {**order.files, **self._locks.of(generation, packed)}

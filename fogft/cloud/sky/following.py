@@ -66,7 +66,8 @@ class Following:
         return False
 
     def _asking(self, entry: Entry) -> None:
-        requests = self.sky.launches(cluster_name(entry.id))
+        found = self.sky.launches(cluster_name(entry.id))
+        requests = [one for one in found if one.active or not entry.starts]
         if requests:
             self._move(entry, stage=Stage.LAUNCHING, request=requests[-1].id)
         elif self._lasts_s(entry) > ASK_LIMIT_S:

@@ -60,6 +60,7 @@ class Entry:
     instead: Mapping[str, float] = field(default_factory=dict)
     # `host:port`, on a cloud that maps ports or of a machine on demand; empty until it is known
     endpoint: str = ""
+    starts: bool = False  # a standby: requests that have ended are of earlier launches
 
 
 class Journal:
@@ -112,7 +113,8 @@ class Journal:
 
     def get(self, id: ReplicaId) -> Entry | None:
         """Return an entry, or None."""
-        return read_as(Entry, self._path(id))
+        hint = "remove it: fogft finds its machine by name and labels in the cloud"
+        return read_as(Entry, self._path(id), hint)
 
     def entries(self, pool_uid: str = "") -> list[Entry]:
         """Return the entries of one pool, or of all, ordered by id; a damaged one is an error."""

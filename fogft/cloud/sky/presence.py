@@ -176,6 +176,7 @@ class Presence:
         if entry is not None and alive is not None:
             gone_for_sure = self.clock() - entry.launched_at > PROVIDER_SURE_AFTER_S
             if not alive and gone_for_sure and entry.stage in ON_THE_MACHINE:
+                self._gone.add(id)  # SkyPilot still lists it
                 self._is_gone(entry)
                 self.submit(lambda: self._drop_record(id))
             if all(one.running for one in alive) and (alive or gone_for_sure):
@@ -194,7 +195,6 @@ class Presence:
 
     def _is_gone(self, entry: Entry) -> None:
         log.info("machine_gone replica=%s", entry.id.short)
-        self._gone.add(entry.id)
         self.journal.close(entry.id)
         self.census.forget(entry.id)
 

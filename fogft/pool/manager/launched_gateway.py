@@ -31,11 +31,16 @@ class LaunchedGateway:
     place: Callable[[str], object]
     up_at: float | None = field(default=None, init=False)  # when the robot reached it last
     _asked_at: float = field(default=-math.inf, init=False)
+    _looked_at: float = field(default=-math.inf, init=False)
+    _watched_since: float = field(default=0.0, init=False)  # nobody knows what was before
 
     def look(
         self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
     ) -> GatewayPlan:
         """Return the next step. The cloud must have answered."""
+        if observed.links is None or not 0 <= observed.now - self._looked_at < ASK_EVERY_S:
+            self._watched_since = observed.now
+        self._looked_at = observed.now
         if self.is_up(observed.now):
             self.up_at = observed.now
         wanted = spec.gateway.launch and not observed.gateway and not intent.stopping
@@ -43,7 +48,8 @@ class LaunchedGateway:
             sold = offered(self.cloud, spec) if wanted else ()
         except FogftError as error:
             return GatewayPlan(note=Reason(Cause.NO_PRICES, words=told(error)))
-        step = plan_gateway(spec, intent, observed, history, sold, up_at=self.up_at)
+        heard_at = max(self.up_at or 0.0, self._watched_since)
+        step = plan_gateway(spec, intent, observed, history, sold, heard_at=heard_at)
         if step.host and spec.dial_in != spec.gateway.endpoints(step.host)[2]:
             self.place(step.host)
         return step

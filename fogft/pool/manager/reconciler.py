@@ -294,7 +294,7 @@ class Reconciler:
         return None if there or not spec.gateway.launch else step.note
 
     def _apply(self, identity: Identity, inputs: Inputs, plan: Plan) -> None:
-        spec, _, observed, history = inputs
+        spec, intent, observed, history = inputs
         self._mark_draining(plan, observed, history)
         self._publish(identity, spec, observed, plan)
         slack = _slack(spec, observed, plan)
@@ -311,7 +311,9 @@ class Reconciler:
             stopped = stops.get(end.id)
             kept = None if stopped is None else bare_order(identity, spec, stopped)
             self._terminate(end.id, end.reason, history, stopped=kept)
-        for id, reason in standbys.superfluous(spec, observed, starts.values()):
+        for id, reason in standbys.superfluous(
+            spec, observed, starts.values(), stopping=intent.stopping
+        ):
             self._terminate(id, reason, history)
 
     def _mark_draining(self, plan: Plan, observed: Observed, history: History) -> None:
