@@ -68,6 +68,11 @@ class OrderedLog:
         """Return a request whose number is above `start`, and at most `last`."""
         return self._entries[index - self.start - 1]
 
+    def empty(self, index: int) -> None:
+        """Have it applied without effect from now on, as a request that cannot be read is."""
+        self.held_bytes -= len(self.get(index))
+        self._entries[index - self.start - 1] = b""
+
     def covers(self, index: int) -> bool:
         """Whether a replica at this index can be brought up to date from the log alone."""
         return self.start <= index <= self.last

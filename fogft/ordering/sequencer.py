@@ -55,6 +55,8 @@ class Sequencer:
         self._draining: frozenset[int] = frozenset()
         self._change_to: str | None = None  # no number is given meanwhile
         self._unanswered: dict[int, None] = {}
+        # Number -> replica -> how often its service died over it; 0 where it may have been applied.
+        self._deaths: dict[int, dict[int, int]] = {}
         self._replicas = CatchingUp(epoch, self._counts, handed_over=begin is not None)
         self._peers = self._replicas.peers
         self.log = self._replicas.log  # the numbered requests; empty until the term has begun
@@ -194,6 +196,7 @@ class Sequencer:
 
     def _applied(self, replica: int, index: int) -> bool:
         """A replica says that it has applied a number. Return whether that answers it."""
+        self._deaths.pop(index, None)
         first = index in self._unanswered and self._counts(replica)
         if first:
             del self._unanswered[index]
@@ -255,8 +258,11 @@ class Sequencer:
 
     def refused(
         self, replica: int, op: Op, index: int, reason: Refusal, now: float, *, detail: str = ""
-    ) -> None:
-        """Take a refusal or the loss of an order, which the replica may have carried out."""
+    ) -> bool:
+        """Take a refusal or the loss of an order, which the replica may have carried out.
+
+        Return whether every service has died over this number: from now on it is without effect.
+        """
         epoch = orders.read_epoch(detail) if reason is Refusal.FENCED else None
         if epoch is not None and epoch > self.epoch:
             self._fenced[replica] = epoch
@@ -266,23 +272,37 @@ class Sequencer:
         if op is Op.SNAPSHOT:
             self._gave_no_checkpoint(replica)
             self._replicas.bring_all(waited=True)
-            return
-        if peer is None:
-            return
+        if op is Op.APPLY and reason is Refusal.LOST and self.log.start < index:
+            self._deaths.setdefault(index, {})[replica] = 0
+        if peer is None or op is Op.SNAPSHOT:
+            return False
+        kills = op is Op.APPLY and reason is Refusal.CRASHED and self._kills(replica, peer, index)
         if op in (Op.APPLY, Op.RECALL):
             peer.open.discard(index)
             if reason in (Refusal.FORGOTTEN, Refusal.MALFORMED):
                 peer.acked = max(peer.acked, index)
-                return
+                return False
             expected = orders.read_index(detail) if reason is Refusal.GAP else None
             if expected is not None and not (peer.joined and peer.went_back >= _GOES_BACK):
                 peer.went_back += peer.joined and not peer.rewind
                 peer.go_back(expected)
-                return
+                return False
             if expected is not None:
                 peer.wait_s = RETRY_LIMIT_S  # it may say so of all that it is ever sent
         peer.pause(now)
         self._look_whom_most_obey()
+        return kills
+
+    def _kills(self, replica: int, peer: Peer, index: int) -> bool:
+        """Empty a request over which every service has died, and not by chance once."""
+        if index != peer.acked + 1 or index <= self.log.start:
+            return False
+        deaths = self._deaths.setdefault(index, {})
+        deaths[replica] = deaths.get(replica, 0) + 1
+        if not all(deaths.values()) or sum(deaths.values()) < 2 or self._peers.keys() - deaths:
+            return False
+        self.log.empty(index)
+        return True
 
     def _look_whom_most_obey(self) -> None:
         """End the term where more replicas obey a later one, or as many before the first number."""

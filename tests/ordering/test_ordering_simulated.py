@@ -8,6 +8,7 @@ import pytest
 
 from fogft.ordering import peer
 from fogft.ordering.catching_up import WINDOW
+from fogft.ordering.orders import Op
 from tests.nightly import by_day
 from tests.ordering.linearizability import Call, counter, key_value, linearizable
 from tests.ordering.ordering_world import World
@@ -196,6 +197,67 @@ def test_the_newest_replica_dies_during_its_restore():
     world.ask(0, ("add", 1))
     world.settle()
     assert world.hosts[again].state == world.history[-1].answer == 11
+
+
+class Poisoned(World):
+    """The question `kill` ends the services of some replicas; an empty one nobody can read."""
+
+    kills = frozenset({0, 1, 2})
+    deaths = 0
+
+    def work(self, replica: int) -> None:
+        host = self.hosts[replica]
+        begun = host.work
+        question = self.questions.get(begun.payload) if begun.op is Op.APPLY else None
+        if question == ("kill", 0) and replica in self.kills:
+            self.deaths += 1
+            self.crash_service(replica)
+        elif begun.op is Op.APPLY and question is None:
+            host.work = None
+            self.effects(host, host.machine.done(begun.serial, None))
+        else:
+            super().work(replica)
+
+    def step_of(self, replica: int):
+        return lambda state, asked: counter(state, ("add", 10) if asked[0] == "kill" else asked)
+
+
+@pytest.mark.parametrize("replicas", [1, 3])
+def test_a_request_over_which_every_service_dies_ends_without_effect(replicas):
+    """Else each would die again as it is brought up to date, for ever."""
+    world = Poisoned(counter, 0, replicas=replicas)
+    world.settle()
+    for question in (("add", 1), ("add", 1), ("kill", 0), ("add", 1), ("add", 1)):
+        world.ask(0, question)
+    world.settle(3000)
+    assert world.answers() == [1, 2, 3, 4]
+    assert world.deaths == max(2, replicas)
+    assert {host.state for host in world.hosts.values()} == {4}
+
+
+def test_one_that_a_replica_out_of_reach_may_have_applied_keeps_its_effect():
+    world = Poisoned(counter, 0, replicas=2)
+    world.kills = frozenset({1})
+    world.settle()
+    world.ask(0, ("kill", 0))
+    while world.working() != [0, 1]:
+        world.deliver(0)
+    world.work(0)
+    gone = world.hosts.pop(0)  # with its answer on the way
+    for letter in list(world.letters):
+        if letter.sent.order.replica == 0:
+            world.end(letter.sent, None, lost(letter.sent))
+    world.letters = []
+    world.reach()
+    world.settle(1000)
+    assert world.deaths > 10
+    assert world.sequencer.log.get(1)
+    world.hosts[0], world.kills = gone, frozenset()
+    world.reach()
+    world.ask(0, ("add", 1))
+    world.settle(3000)
+    assert world.answers() == [11]
+    assert {host.state for host in world.hosts.values()} == {11}
 
 
 def busy_world(requests: int) -> World:

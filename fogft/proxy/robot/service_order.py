@@ -156,7 +156,10 @@ class ServiceOrder(Decide):
         current = self._current(id)
         if current is not None:
             op, _, number = current
-            self._term.refused(replica, op, number, refusal, self._clock(), detail=detail)
+            kills = self._term.refused(replica, op, number, refusal, self._clock(), detail=detail)
+            if kills:
+                log.error("request_kills service=%s request=%s", self._name,
+                          self._requests.get(number, b"").hex())  # fmt: skip
         self._wake_if_due()
 
     def declined(self, id: bytes, replica: int, now: float) -> None:
