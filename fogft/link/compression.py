@@ -103,9 +103,9 @@ class Unpacker:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._waiting: dict[str, deque[tuple[bytes, Done]]] = {}
+        self._waiting: dict[str, deque[tuple[bytes, Done, bool]]] = {}
 
-    def put(self, peer: str, packed: bytes, done: Done) -> bool:
+    def put(self, peer: str, content: bytes, done: Done, *, packed: bool = True) -> bool:
         """Decompress a payload, then call `done`.
 
         False where too much of this peer waits, or there can be no more threads.
@@ -113,16 +113,16 @@ class Unpacker:
         with self._lock:
             waiting = self._waiting.get(peer)
             if waiting is not None:
-                held = sum(len(one) for one, _ in waiting)
-                if len(waiting) >= WAITING_LIMIT or held + len(packed) > WAITING_BYTES_LIMIT:
+                held = sum(len(one) for one, *_ in waiting)
+                if len(waiting) >= WAITING_LIMIT or held + len(content) > WAITING_BYTES_LIMIT:
                     return False
-                waiting.append((packed, done))
+                waiting.append((content, done, packed))
                 return True
             try:
                 on_thread(self._run, peer, name=f"fogft-unpack-{peer}")
             except RuntimeError:
                 return False
-            self._waiting[peer] = deque(((packed, done),))
+            self._waiting[peer] = deque(((content, done, packed),))
         return True
 
     def _run(self, peer: str) -> None:
@@ -131,12 +131,12 @@ class Unpacker:
                 if not self._waiting[peer]:
                     del self._waiting[peer]
                     return
-                packed, done = self._waiting[peer].popleft()
+                content, done, packed = self._waiting[peer].popleft()
             payload: bytes | None = None
             with contextlib.suppress(ValueError):  # whose payload it was counts it, and logs some
-                payload = unpack(packed)
+                payload = unpack(content) if packed else content
             try:
                 done(payload)
             except Exception:  # the next ones go on
                 log.exception("payload_not_taken peer=%s", peer)
-            del packed, payload, done  # while this thread waits for the lock, and after
+            del content, payload, done  # while this thread waits for the lock, and after

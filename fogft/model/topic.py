@@ -58,7 +58,8 @@ class TopicSpec:
     )
     depth: int = key(
         Whole(1, DEPTH_LIMIT, "messages"),
-        "Messages kept for slow subscribers and, if latched, for late ones.",
+        "Messages kept for slow subscribers and, if latched, for late ones: of all publishers "
+        "together, so `/tf_static` of many nodes needs more.",
         default=10,
     )
     reliable: bool = key(

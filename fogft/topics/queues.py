@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from enum import Enum, auto
 
 Numbered = tuple[int, bytes]
+_FEW_BYTES = 1 << 16  # no more is kept beyond `depth`, for robots far away
+_SMALL_BYTES = 1 << 12  # of a message of which many may be under way
 _KNOWN = 64  # numbers of which it is known whether they were published
 _MASK = (1 << _KNOWN) - 1
 
@@ -30,7 +32,8 @@ class Ring:
         self.last += 1
         self._kept.append((self.last, message))
         self._bytes += len(message)
-        while len(self._kept) > self._depth or (
+        few = self._bytes < _FEW_BYTES and self._depth > 1 and not self._latched
+        while (len(self._kept) > self._depth and not few) or (
             self._bytes > self.kept_bytes and len(self._kept) > 1
         ):
             self._bytes -= len(self._kept.popleft()[1])
@@ -57,7 +60,7 @@ class Ring:
 class Outbox:
     """The messages of a robot's topic to send to one replica, in order; at most `depth` wait."""
 
-    window = 16  # messages under way at once
+    window = 64  # messages under way at once; of large ones a quarter
     kept_bytes = 64 << 20  # of those that wait, at most; the newest is kept in any case
 
     def __init__(self, depth: int) -> None:
@@ -91,7 +94,10 @@ class Outbox:
         Nothing while later ones than that are under way: they may have been lost with it, and
         what overtakes a message makes it one that comes too late.
         """
-        if not self._waiting or len(self._open) >= self.window:
+        if not self._waiting:
+            return None
+        small = len(self._waiting[0][1]) <= _SMALL_BYTES
+        if len(self._open) >= (self.window if small else self.window // 4):
             return None
         if self._open and max(self._open) > self._waiting[0][0]:
             return None

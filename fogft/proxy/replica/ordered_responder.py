@@ -99,6 +99,7 @@ class OrderedResponder:
                 )
             except OrderError:
                 effects = [Refuse(incoming, Refusal.MALFORMED)]
+        incoming.payload = b""  # whoever repeats an order waits without it
         self._perform(effects)
 
     def _perform(self, effects: list[Any]) -> None:

@@ -38,6 +38,7 @@ _AGAIN_S = 0.2  # after a refusal
 _AT_ONCE_S = 0.1  # a pull that is answered sooner with nothing was not held
 _LOOK_EVERY_S = 2.0  # whether publishers are heard, and how often they publish
 _UNCONFIRMED_LIMIT = 4096
+_STATUS_BYTES = 32 << 10  # all replicas' are merged anew for each that comes: of 1000 goals
 
 
 # Makes one message of what several replicas said last; None where there is nothing to say.
@@ -222,6 +223,8 @@ class RobotTopic:
             return
         first = way.after if session == way.session else after
         now, begins = self._clock(), way.session == frames.NO_SESSION
+        if messages and session == way.session:
+            self.count["dropped"] += max(0, messages[0][0] - first - 1)
         way.session, way.after = session, after
         new = [message for number, message in messages if number > first]
         if not (new or begins) and now - way.pulled_at < _AT_ONCE_S:
@@ -242,6 +245,8 @@ class RobotTopic:
         if self._publisher is None:
             return
         try:
+            if self.topic.select is Select.STATUS and len(message) > _STATUS_BYTES:
+                raise Unreadable(f"a status of {len(message)} bytes")
             self._publisher.check(message)  # first: what is no message does not lead
         except Unreadable as error:
             self._misread(key, error.message)

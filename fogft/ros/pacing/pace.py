@@ -189,6 +189,7 @@ class Pace:
         if pace is None:
             if len(self.clients) >= _CLIENTS_KEPT:
                 idle = [c for c, p in self.clients.items() if not p.waiting]
+                idle = [c for c in idle if now > self.clients[c].asked_at + FIND_LIMIT_S]
                 idle.sort(key=lambda c: self.clients[c].asked_at)
                 for gone in idle[: _CLIENTS_KEPT // 2]:
                     del self.clients[gone]

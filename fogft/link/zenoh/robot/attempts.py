@@ -40,6 +40,8 @@ _STUCK_S = 0.1
 _ZENOH_HOLDS_BYTES = 2 * 65535
 # How long the link's thread looks often after the last large request began to leave.
 _WATCH_S = 5.0
+# Whoever takes a larger answer looks at all of it for long: not in the thread of all links.
+_ASIDE_BYTES = 1 << 20
 
 # In the queue, in place of an attempt: tell the replica of what was forgotten.
 _TELL = OpenAttempt("", b"", None, 0, 0.0, 0.0)
@@ -361,22 +363,25 @@ class Attempts:
                 continue
             if answer.payload is not None:
                 self._credit.heard(attempt.mark)  # requests of one connection arrive in order
-            if packed and self.window.holds(attempt):
-                self._unpack(attempt, answer)
+            aside = packed or len(answer.payload or b"") > _ASIDE_BYTES
+            if aside and self.window.holds(attempt):
+                self._unpack(attempt, answer, packed=packed)
             elif not self._close(attempt, answer):
                 self._came_late(attempt, answer)
 
-    def _unpack(self, attempt: OpenAttempt, answer: Answer) -> None:
-        """Decompress an answer that is still wanted, and was asked to be packed."""
+    def _unpack(self, attempt: OpenAttempt, answer: Answer, *, packed: bool) -> None:
+        """Take an answer that is still wanted aside; decompress it, if it was asked to be."""
+        bad = Refusal.MALFORMED if packed else Refusal.LOST
 
         def done(payload: bytes | None) -> None:
-            refusal = Refusal.MALFORMED if payload is None else None
+            refusal = bad if payload is None else None
             unpacked = replace(answer, payload=payload, refusal=refusal)
             if not self._close(attempt, unpacked):
                 self._came_late(attempt, unpacked)
 
-        packed = answer.payload or b""
-        if not attempt.reads_packed or not self._unpacker.put("answers", packed, done):
+        taken = attempt.reads_packed or not packed
+        content = answer.payload or b""
+        if not taken or not self._unpacker.put("answers", content, done, packed=packed):
             done(None)
 
     def _came_late(self, attempt: OpenAttempt, answer: Answer) -> None:

@@ -197,9 +197,13 @@ class Connection:
 
     def probe(self, key: str, payload: bytes, heard: Callable[[bytes], None]) -> None:
         """Send a probe ahead of all requests; `heard` gets the answer's bytes, if any."""
+        unanswered = {key}
 
         def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None:
+            if reply.ok is not None and not unanswered:
+                self.lose("it answers a probe twice")
+            elif reply.ok is not None:
+                unanswered.clear()
                 self._greeting = self._bare  # we are known from now on
                 heard(reply.ok.payload.to_bytes())
             elif reply.err is not None:
