@@ -13,7 +13,7 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import Demand, Load
+from fogft.requests.load import NEVER, Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
@@ -28,6 +28,7 @@ _TRIED_AFTER = 3000.0  # so long after a change there is one more again
 _WAIT = 0.6  # what it costs a request to wait for one
 _TRIED_SHARE = 0.02  # of requests, which try one more meanwhile
 _RETRY_S = 0.02
+_BUSY = 0.4  # of what the replicas can do: above that spare copies would make requests wait
 
 
 class Spares:
@@ -78,6 +79,8 @@ class Auto(Learning):
         self._tokens = BUDGET_CAPACITY  # for late hedges; each request brings a share of one
         self._spares = Spares()
         self._demand = Demand()
+        self._busy = False
+        self._slow_until = -NEVER  # one at least is
         self._beaten: dict[tuple[bytes, int], float] = {}  # copies, and when a spare was first
         self._wanting: dict[bytes, None] = {}  # requests that get a spare once a replica is free
         self.hedges = 0
@@ -94,8 +97,10 @@ class Auto(Learning):
             known = self._replicas[replica]
             if known.at_work:
                 self._doubts(replica, known.oldest_begun, now)
-        best = self._best(request, able, now)
+        quick = self._quick(able, now) if now < self._slow_until and not self._busy else able
+        best = self._best(request, quick, now)
         known = self._replicas[best]
+        self._busy = self._demand.rate * known.service_s > _BUSY * len(able)
         self._spares.request(known.service_s, len(able), now)
         if self._spares.open and not known.free(now):
             self._spares.made_wait(_WAIT * known.service_s)
@@ -103,7 +108,7 @@ class Auto(Learning):
         if len(able) == 1:
             return able  # there is nobody to hedge it at
         left_free = self._spares.left_free_by(request)
-        copied = left_free < len(able) - 1 and not self.dear
+        copied = left_free < len(able) - 1 and not self.dear and not self._busy
         others = able if copied else self._stale(able, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
         if copied and left_free:
@@ -123,6 +128,11 @@ class Auto(Learning):
     def _takes_spare(self, replica: int, now: float) -> bool:
         known = self._replicas[replica]
         return known.free(now) or (known.doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S)
+
+    def _quick(self, able: Sequence[int], now: float) -> Sequence[int]:
+        """Return those that are not slow just now, if one of them is free; else all."""
+        quick = [replica for replica in able if now >= self._replicas[replica].slow_until]
+        return quick if any(self._replicas[replica].free(now) for replica in quick) else able
 
     def _stale(self, able: Sequence[int], now: float) -> list[int]:
         """Return those of which nothing was heard for long: one spare copy shows how they do."""
@@ -241,7 +251,9 @@ class Auto(Learning):
 
     def _released(self, replica: int, now: float) -> None:
         """Have a replica that has become free work on what waits for one, if anything does."""
-        self.news |= bool(self._wanting) and self._replicas[replica].free(now)
+        known = self._replicas[replica]
+        self._slow_until = max(self._slow_until, known.slow_until)
+        self.news |= bool(self._wanting) and known.free(now)
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False

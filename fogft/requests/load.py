@@ -32,6 +32,9 @@ _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
 _MANY = 16.0  # requests ahead: behind more, a time tells little of what is unusual
 _FULL_OVER_S, _ASKED_OVER_S, _DEMAND_STEP_S = 10.0, 30.0, 0.1
+# How many times as long as usual an answer takes that shows a slow spell, and for how many times
+# that long other replicas are preferred while they are free.
+_SLOW, _SLOW_FOR = 2.5, 5.0
 _OFTEN = 0.5  # of the time something waits: there are too few replicas
 _UNANSWERED = 1.15  # times what full ones answer is asked: no chance
 _SILENT_S = 2.0  # without an answer nobody knows whether they are full
@@ -61,6 +64,7 @@ class Demand:
 
     def __init__(self) -> None:
         self.full = False  # something waited at the replica that answered last
+        self.rate = 0.0  # requests a second, lately; too few in the first seconds
         self._full_until = -NEVER  # unless another answer says so
         self._full_share = 0.0  # of the time, lately
         self._asked = 0.0  # lately
@@ -73,6 +77,7 @@ class Demand:
             kept = self._kept(now, _FULL_OVER_S)
             self._full_share, self._asked = self._share(now), self._asked * kept
             self.full = self.full and now < self._full_until
+            self.rate = self._asked / _FULL_OVER_S
             kept = self._kept(now, _ASKED_OVER_S)
             self._asked_full *= kept
             self._answered_full *= kept
@@ -119,6 +124,7 @@ class ReplicaLoad:
         self.doubted = False  # an attempt is overdue, and it has ended none since that one began
         self.ended_at = -NEVER  # when it last ended an attempt, with an answer or too late for one
         self.asked_at = -NEVER
+        self.slow_until = -NEVER  # its last answer took unusually long: another is preferred
         # Our attempts that it has not ended, oldest first: when each began, when it is overdue, and
         # for how much its time counts.
         self.at_work: dict[bytes, tuple[float, float, float]] = {}
@@ -243,13 +249,15 @@ class ReplicaLoad:
     def answered(self, request: bytes, load: Load | None, now: float) -> None:
         """Note that it has ended an attempt."""
         sent = self.at_work.pop(request, None)
-        self.ended_at = now
+        before, self.ended_at = self.ended_at, now
         self.doubted = False
         self._avoided_s = 0.0
         if sent is None:
             return
         begun, _, share = sent
-        took_s = now - begun
+        took_s, alone_s = now - begun, now - max(begun, before)
+        slow = self.told >= NEW and alone_s > _SLOW * ((self._rtt_s or 0.0) + self.usual_s)
+        self.slow_until = now + _SLOW_FOR * alone_s if slow else -NEVER
         if load is not None:
             rtt_s = max(0.0, took_s - load.spent_s)
             known = self._rtt_s
