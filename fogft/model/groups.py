@@ -106,8 +106,6 @@ def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:
 
 def shares(groups: tuple[Group, ...], total: int) -> tuple[int, ...]:
     """Distribute replicas over groups as in the file; differences affect the last groups first."""
-    if len(groups) == 1:
-        return (max(0, total),)
     counts = [group.replicas for group in groups]
     counts[-1] += max(0, total - sum(counts))
     for index in reversed(range(len(counts))):
