@@ -116,14 +116,12 @@ class Shape:
         return ""
 
     def _message(self, name: str, within: tuple[str, ...]) -> _Kind:
-        known = self._kinds.get(name)
-        if known is not None:
-            return known
-        if name not in self._fields or name in within:
-            raise _Uncheckable(name)
-        kinds = [self._kind(kind, (*within, name)) for _, kind in self._fields[name]]
-        # ROS 2 gives a message without fields one byte.
-        self._kinds[name] = _one_after_another(kinds or [_number("uint8")])
+        if name not in self._kinds:
+            if name not in self._fields or name in within:
+                raise _Uncheckable(name)
+            kinds = [self._kind(kind, (*within, name)) for _, kind in self._fields[name]]
+            # ROS 2 gives a message without fields one byte.
+            self._kinds[name] = _one_after_another(kinds or [_number("uint8")])
         return self._kinds[name]
 
     def _kind(self, kind: str, within: tuple[str, ...]) -> _Kind:
@@ -188,11 +186,8 @@ def _one_after_another(kinds: list[_Kind]) -> _Kind:
             at = step(data, at)
         return at
 
-    return _Kind(
-        walk,
-        max(kind.align for kind in kinds),
-        all(kind.has_fixed_size for kind in kinds),
-    )
+    align = max(kind.align for kind in kinds)
+    return _Kind(walk, align, all(kind.has_fixed_size for kind in kinds))
 
 
 def _several(of: _Kind, count: int, data: _Bytes, at: int) -> int:
