@@ -78,9 +78,8 @@ def scale(intent: Intent, spec: PoolSpec, change: int, now: float) -> Intent:
 
 def drain(intent: Intent, slot: int, generation: int) -> Intent:
     """Replace the replica in a slot, up to this generation. Repeating it changes nothing."""
-    drained = dict(intent.drained)
-    drained[slot] = max(generation, drained.get(slot, 0))
-    return replace(intent, drained=drained)
+    latest = max(generation, intent.drained.get(slot, 0))
+    return replace(intent, drained={**intent.drained, slot: latest})
 
 
 def exclude(intent: Intent, location: str) -> Intent:
@@ -104,10 +103,9 @@ def retry(intent: Intent, now: float) -> Intent:
 
 def file_changed(intent: Intent, before: PoolSpec, after: PoolSpec) -> Intent:
     """Apply a new pool file: a changed `replicas` overrides an earlier `scale`."""
-    stopping = replace(intent, stopping=False)
     if before.replicas != after.replicas:
-        return replace(stopping, target=None, scaled_from=None)
-    return stopping
+        intent = replace(intent, target=None, scaled_from=None)
+    return replace(intent, stopping=False)
 
 
 def checked_location(text: str) -> str:
