@@ -121,9 +121,12 @@ def _reader(hint: Any) -> Read:  # noqa: PLR0911
         reads = [_reader(kind) for kind in arguments]
         return lambda raw: tuple(read(one) for read, one in zip(reads, _list(raw), strict=True))
     if origin in (tuple, frozenset, Sequence, list):
-        return _listed(list if origin is Sequence else origin, _reader(arguments[0]))
+        make, read = list if origin is Sequence else origin, _reader(arguments[0])
+        return lambda raw: make(_at(n, read, one) for n, one in enumerate(_list(raw)))
     if origin in (Mapping, dict):
-        return _map(int if arguments[0] is int else _reader(arguments[0]), _reader(arguments[1]))
+        key = int if arguments[0] is int else _reader(arguments[0])
+        of = _reader(arguments[1])
+        return lambda raw: {key(name): _at(name, of, one) for name, one in _items(raw)}
     if issubclass(hint, Enum):
         return _by_value(hint)
     if dataclasses.is_dataclass(hint):
@@ -178,14 +181,6 @@ def _list(raw: Any) -> list[Any]:
     if not isinstance(raw, list):
         raise ValueError(f"{raw!r:.40} is not a list")  # noqa: TRY004
     return raw
-
-
-def _listed(make: Callable[[Iterable[Any]], Any], read: Read) -> Read:
-    return lambda raw: make(_at(n, read, one) for n, one in enumerate(_list(raw)))
-
-
-def _map(key: Read, read: Read) -> Read:
-    return lambda raw: {key(name): _at(name, read, one) for name, one in _items(raw)}
 
 
 def _at(place: str | int, read: Read, raw: Any) -> Any:
