@@ -37,8 +37,7 @@ def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str
     digest = hashlib.sha256()
     for part in (pool_uid, str(slot), service, type_name):
         encoded = part.encode()
-        digest.update(len(encoded).to_bytes(4, "big"))
-        digest.update(encoded)
+        digest.update(len(encoded).to_bytes(4, "big") + encoded)
     return digest.hexdigest()[:32]
 
 

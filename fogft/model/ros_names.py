@@ -14,7 +14,6 @@ from fogft.model.keys import Text, only
 MAX_SERVICE_NAME = 240  # DDS allows 255; ROS adds a prefix and a suffix
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _FIELD = re.compile(r"(?!.*__)(?!.*_$)[a-z][a-z0-9_]*")
-_PACKAGE = _FIELD
 _INTERFACE = re.compile(r"[A-Z][A-Za-z0-9]*")
 
 
@@ -44,7 +43,7 @@ def _is_type(name: str, kind: str) -> bool:
     parts = name.split("/")
     return (
         len(parts) == 3
-        and bool(_PACKAGE.fullmatch(parts[0]))
+        and is_field_name(parts[0])  # a package's name has the same form
         and parts[1] == kind
         and bool(_INTERFACE.fullmatch(parts[2]))
     )

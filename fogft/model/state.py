@@ -9,7 +9,6 @@ SNAPSHOT_TYPE = "nav_msgs/srv/GetMap"
 RESTORE_TYPE = "nav_msgs/srv/SetMap"
 FIELD = "map.data"
 _HINT = "write `state: {snapshot: /svc/get_state, restore: /svc/set_state}`"
-_END_HINT = "write `{name: ..., type: ..., field: ...}`"
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class StateService:
         "Name of the service.",
     )
     type: str = key(
-        service_type(_END_HINT),
+        service_type("write `{name: ..., type: ..., field: ...}`"),
         "Its type.",
         default="",
         usual=f"`{SNAPSHOT_TYPE}`, `{RESTORE_TYPE}`",
