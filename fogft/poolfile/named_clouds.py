@@ -16,8 +16,7 @@ def located(error: SpecError, source: str, file: Path) -> SpecError:
     """Return a cloud's error about a key, with its file and line."""
     path = re.findall(r"[^.\[\]]+", error.key)
     root = yaml_tree.tree(source, str(file))
-    node = below(root, [int(part) if part.isdecimal() else part for part in path])
-    line = node.key_line
+    line = below(root, [int(part) if part.isdecimal() else part for part in path]).key_line
     message = f"{file}:{line}: {error.message}"
     return SpecError(message, error.hint, key=error.key, what=error.what, line=line)
 

@@ -105,12 +105,11 @@ def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
     if ours.has("on_demand"):
         most = MAX_REPLICAS if made.availability else made.replicas
         rules.on_demand(ours.section("on_demand"), made.on_demand, most)
-    parts = [(action_services(a), action_topics(a)) for a in made.actions]
     spec = replace(
         made,
         groups=groups,
-        services=(*made.services, *(one for services, _ in parts for one in services)),
-        topics=(*made.topics, *(one for _, topics in parts for one in topics)),
+        services=(*made.services, *(one for a in made.actions for one in action_services(a))),
+        topics=(*made.topics, *(one for a in made.actions for one in action_topics(a))),
     )
     _check_topology(ours, made.services, spec)
     names = [*(one.name for one in spec.services), *(one.name for one in spec.topics)]

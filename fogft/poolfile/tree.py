@@ -116,14 +116,12 @@ class Section:
         """Yield an error for each key that is not known; `hints` are for past and future ones."""
         allowed = set(known)
         for key in [key for key in self.children if key not in allowed]:
+            what, hint = "unknown key", nearest(key, allowed)
             if hints and key in hints:
-                yield self.error(key, *hints[key], at_key=True)
-                continue
-            if elsewhere and key in elsewhere:
+                what, hint = hints[key]
+            elif elsewhere and key in elsewhere:
                 hint = f"`{key}` belongs {elsewhere[key]}"
-            else:
-                hint = nearest(key, allowed)
-            yield self.error(key, "unknown key", hint, at_key=True)
+            yield self.error(key, what, hint, at_key=True)
 
     def has(self, key: str) -> bool:
         """Whether the key is there with a value, here or under `advanced`."""
