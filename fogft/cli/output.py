@@ -29,8 +29,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # which a log may have, and which says 
 
 def data(text: str) -> None:
     """Write lines of data to stdout, flushed, with unprintable characters removed."""
-    sys.stdout.write(printable(text) + "\n")
-    sys.stdout.flush()
+    print(printable(text), flush=True)
 
 
 def json_data(value: Any) -> None:
@@ -44,8 +43,8 @@ def show(*parts: RenderableType, stream: IO[str] | None = None, folds: bool = Tr
     On a terminal a line is folded between words if it `folds`; elsewhere nothing is folded or cut.
     """
     stream = stream or sys.stdout
-    stream.write(_drawn(stream, *parts, limit=width(stream) if folds else None) + "\n")
-    stream.flush()
+    drawn = _drawn(stream, *parts, limit=width(stream) if folds else None)
+    print(drawn, file=stream, flush=True)
 
 
 def cell(text: str, style: str = "") -> Text:
@@ -65,8 +64,7 @@ def printable(text: str) -> str:
 
 def say(text: str) -> None:
     """Write a message to stderr, flushed."""
-    sys.stderr.write(printable(text) + "\n")
-    sys.stderr.flush()
+    print(printable(text), file=sys.stderr, flush=True)
 
 
 def done(text: str) -> None:
@@ -99,8 +97,7 @@ def confirm(question: str) -> None:
             "cannot ask for confirmation: there is no terminal",
             "add `--yes` to skip the confirmation",
         )
-    sys.stderr.write(f"{printable(question)} [y/N] ")
-    sys.stderr.flush()
+    print(f"{printable(question)} [y/N] ", end="", file=sys.stderr, flush=True)
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         say("aborted: nothing was changed")
         raise typer.Exit(1)
@@ -172,8 +169,7 @@ def _tagged(tag: str, style: str, text: str) -> None:
     from rich.text import Text
 
     told = Text.assemble((tag, style), " ", printable(text))  # whole: a command may be copied
-    sys.stderr.write(_drawn(sys.stderr, told, limit=None) + "\n")
-    sys.stderr.flush()
+    show(told, stream=sys.stderr, folds=False)
 
 
 def _console(stream: IO[str], **options: Any) -> Console:
