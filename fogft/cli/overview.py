@@ -28,6 +28,7 @@ _LISTED = (
     *("answers", "ready", "target", "cloud", "usd_per_hour", "age_s", "manager_alive"),
     *("proxy_alive", "file", "ended"),
 )
+EVENT_COLUMNS = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
 _ANSWERS = {True: ("yes", "green"), False: ("no", "bold red"), None: ("?", "yellow")}
 
 
@@ -89,8 +90,7 @@ def events(
     if as_json:
         output.json_data([to_plain(one) for one in _last_events(store, count)])
         return
-    names = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
-    show_table(names, event_rows(store, count), folds=("LOCATION", "WHY"))
+    show_table(EVENT_COLUMNS, event_rows(store, count), folds=("LOCATION", "WHY"))
 
 
 def event_rows(store: PoolStore, count: int) -> Sequence[Sequence[str]]:

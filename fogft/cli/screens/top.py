@@ -66,7 +66,7 @@ def _screen(
 ) -> RenderableType:
     from rich.console import Group
 
-    from fogft.cli.overview import event_rows
+    from fogft.cli.overview import EVENT_COLUMNS, event_rows
     from fogft.cli.table import table
 
     trends = [
@@ -78,8 +78,7 @@ def _screen(
         parts += ["", table(("LATENCY", "LAST MINUTE", "NOW"), trends, width=width, right=("NOW",))]
     events = event_rows(store, _EVENTS_SHOWN)[::-1]
     if events:
-        names = ("TIME", "EVENT", "REPLICA", "LOCATION", "WHY")
-        parts += ["", table(names, events, width=width, folds=("LOCATION", "WHY"))]
+        parts += ["", table(EVENT_COLUMNS, events, width=width, folds=("LOCATION", "WHY"))]
     return Group(*parts)
 
 
