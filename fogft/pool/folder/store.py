@@ -85,25 +85,22 @@ class PoolStore(HistoryFile):
             good = self.good()
             if good is not None:
                 return good
-        if self._spec is None or self._spec[0] != raw:
-            self._spec = (raw, self._read(raw))
-        self._spec = self._completed(self._spec)
+        self._spec = self._current(self._spec, raw)
         return self._spec[1]
 
-    def _completed(self, read: tuple[bytes, PoolSpec]) -> tuple[bytes, PoolSpec]:
-        """Add what was discovered to a spec that lists no services; the same object if known."""
-        raw, spec = read
+    def _current(self, known: tuple[bytes, PoolSpec] | None, raw: bytes) -> tuple[bytes, PoolSpec]:
+        """Return a file's spec, completed with what was discovered; the same object if known."""
+        spec = known[1] if known is not None and known[0] == raw else self._read(raw)
         if not spec.services:
             found = disk.read_or(self.paths.discovered, Discovered())
             services = found.specs(spec.namespace)
             if (services, found.spec_hash) != (spec.discovered, spec.discovered_by):
-                known = replace(spec, discovered=services, discovered_by=found.spec_hash)
-                return raw, known
+                return raw, replace(spec, discovered=services, discovered_by=found.spec_hash)
         if spec.gateway.launch:
             host = disk.read_or(self.paths.gateway, GatewayPlace()).host
             if host and spec.dial_in != spec.gateway.endpoints(host)[2]:
                 return raw, spec.behind(host)
-        return read
+        return raw, spec
 
     def _read(self, raw: bytes) -> PoolSpec:
         try:
@@ -130,12 +127,10 @@ class PoolStore(HistoryFile):
         raw = disk.read_bytes(self.paths.good_spec)
         if raw is None:
             return None
-        if self._good is None or self._good[0] != raw:
-            try:
-                self._good = (raw, self._read(raw))
-            except SpecError:  # it was good for a version of fogft that knew other keys
-                return None
-        self._good = self._completed(self._good)
+        try:
+            self._good = self._current(self._good, raw)
+        except SpecError:  # it was good for a version of fogft that knew other keys
+            return None
         return self._good[1]
 
     def keep_good(self, spec: PoolSpec) -> bool:
