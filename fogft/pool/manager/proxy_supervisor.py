@@ -16,7 +16,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from fogft import disk
 from fogft.child import detached, how_it_ended
@@ -33,11 +32,6 @@ STEADY_S = 5.0  # one that ran so long is no failure
 HANGS_AFTER_S = 10.0
 START_LIMIT_S = 20.0  # one that has no place by then will not get one
 MOVING_UP_S = 1.0  # while others run
-
-
-class _Child(NamedTuple):
-    process: subprocess.Popen[bytes]
-    started_at: float
 
 
 @dataclass(eq=False)
@@ -59,7 +53,7 @@ class ProxySupervisor:
             *(sys.executable, "-m", "fogft"),
             *("proxy", "--spare", "--config", str(self.paths.proxy_config)),
         )
-        self._children: list[_Child] = []
+        self._children: dict[subprocess.Popen[bytes], float] = {}  # and when each was started
         self._watched: set[int] = set()
         self._ending: set[int] = set()
         locks = self.paths.proxy_lock, self.paths.standby_lock, self.paths.spare_lock
@@ -76,9 +70,9 @@ class ProxySupervisor:
     def look(self, *, outdated: bool = False) -> bool:
         """Start missing proxies, and replace those of another version; return whether one works."""
         now = self.clock()
-        for child in [one for one in self._children if one.process.poll() is not None]:
-            self._children.remove(child)
-            self._ended(child.process.returncode, now - child.started_at)
+        for child in [one for one in self._children if one.poll() is not None]:
+            started_at = self._children.pop(child)
+            self._ended(child.returncode, now - started_at)
         for lock, hanging in self._hanging.items():
             pid = disk.holder(lock, said=False)
             if hanging.end(pid):
@@ -90,8 +84,8 @@ class ProxySupervisor:
             self._serving = serving
         if outdated:
             self._end_outdated(line)
-        for child in self._children:
-            if child.process.pid not in line and now - child.started_at < START_LIMIT_S:
+        for child, started_at in self._children.items():
+            if child.pid not in line and now - started_at < START_LIMIT_S:
                 return True
         running = any(pid is not None for pid in line)
         if line[-1] is not None:
@@ -100,7 +94,7 @@ class ProxySupervisor:
         if line[-1] is not None or moving_up or now < self._next_at:
             return running
         process = detached(self._command, self.paths.proxy_log)
-        self._children.append(_Child(process, now))
+        self._children[process] = now
         self._sessions.add(process.pid)
         self._watch(process.pid)
         log.info("proxy_started pid=%d others=%s", process.pid, running)
