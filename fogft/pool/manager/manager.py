@@ -170,10 +170,8 @@ class Manager:
     def _work(self) -> bool:
         """Do one round, each step again in the next if it fails; return whether the pool ended."""
         self._trouble = []
-        self._attempt(self._lease.beat)
-        self._attempt(self._step_back)
-        self._attempt(self._bound_logs)
-        self._attempt(self._keep_proxy)
+        for step in (self._lease.beat, self._step_back, self._bound_logs, self._keep_proxy):
+            self._attempt(step)
         tick = self._attempt(self._reconciler.tick)
         if tick is None:
             return False
