@@ -274,9 +274,7 @@ def _absolute(path: str, base: Path) -> str:
 
 def with_build(task: Mapping[str, Any]) -> dict[str, Any]:
     """Return a task that builds its workspace if it has one and no `setup`."""
-    workdir = task.get("workdir")
-    if task.get("setup") or not isinstance(workdir, str):
-        return dict(task)
-    if next(Path(workdir, "src").rglob("package.xml"), None) is None:
-        return dict(task)
-    return {**task, "setup": (template_files.folder() / "workspace.sh").read_text()}
+    workdir = None if task.get("setup") else task.get("workdir")
+    if isinstance(workdir, str) and any(Path(workdir, "src").rglob("package.xml")):
+        return {**task, "setup": (template_files.folder() / "workspace.sh").read_text()}
+    return dict(task)
