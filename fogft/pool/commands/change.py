@@ -51,8 +51,7 @@ def exclude(store: PoolStore, location: str, cloud: Cloud) -> bool:
     sold = [offer.placement for offer in offers.ask(cloud, store.spec())]
     known = {name for p in sold for name in (p.cloud, f"{p.cloud}/{p.region}", p.location)}
     if place not in known:
-        meant = [f"{cloud}/{place}" for cloud in sorted({p.cloud for p in sold})]
-        meant = [name for name in meant if name in known]
+        meant = sorted(known & {f"{p.cloud}/{place}" for p in sold})
         raise FogftError(
             f"the cloud `{identity.cloud}` of pool `{identity.name}` has no location `{place}`",
             f"did you mean `{meant[0]}`?" if meant else nearest(place, known),

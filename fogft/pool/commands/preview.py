@@ -29,7 +29,6 @@ from fogft.pool.folder.store import Identity, PoolStore, digest
 from fogft.pool.manager import launched_gateway, offers
 from fogft.poolfile import file as pool_file
 from fogft.poolfile.changes import changes, replaces_replicas
-from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import cloud_named_by, clouds_named, located
 from fogft.poolfile.pool import Checks
 from fogft.reason_words import words
@@ -83,8 +82,8 @@ def order(
     It runs on the cloud that its resources name, else `local`, unless told; `told` hears of what
     takes long.
     """
-    source = read_text(file)
-    spec = parse(source, str(file), checks_here(), file.parent)
+    source = pool_file.read_text(file)
+    spec = pool_file.parse(source, str(file), checks_here(), file.parent)
     cloud_name = cloud or cloud_named_by(spec, source, file)
     concrete = make_cloud(cloud_name)
     store = make_store(spec.name)

@@ -11,6 +11,7 @@ import binascii
 import hashlib
 import json
 import secrets
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -150,6 +151,4 @@ def _bytes(raw: Mapping[str, Any], key: str) -> bytes:
 
 
 def _utc(seconds: float) -> str:
-    import datetime
-
-    return f"{datetime.datetime.fromtimestamp(seconds, datetime.timezone.utc):%Y-%m-%d %H:%M} UTC"
+    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(seconds))
