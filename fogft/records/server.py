@@ -39,7 +39,6 @@ class RendezvousServer:
     def __init__(
         self, listen: str, credentials: CredentialPaths, verify: Verify, exchange: Exchange
     ) -> None:
-        self._listen = listen
         self._credentials = credentials
         self._verify = verify
         self._exchange = exchange
@@ -55,9 +54,9 @@ class RendezvousServer:
     def bind(self) -> None:
         """Bind the port."""
         self._renew_context()
-        self._socket = listening(self._listen)
+        self._socket = listening(self.endpoint)
         self._socket.setblocking(False)
-        self.endpoint = f"{self._listen.rpartition(':')[0]}:{self._socket.getsockname()[1]}"
+        self.endpoint = f"{self.endpoint.rpartition(':')[0]}:{self._socket.getsockname()[1]}"
 
     async def serve(self) -> None:
         """Accept callers until cancelled."""
