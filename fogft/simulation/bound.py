@@ -10,6 +10,7 @@ Owns: the flow. Not here: what policies reach (`comparison`).
 import heapq
 import itertools
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -59,10 +60,7 @@ def least_usd_per_hour(
 def _stays(
     line: Timeline, usd: float, most: int, boot_s: float, length_s: float
 ) -> Iterator[_Stay]:
-    layers: dict[tuple[tuple[float, float], ...], int] = {}
-    for level in range(1, most + 1):
-        spells = tuple(_spells(line, level, length_s))
-        layers[spells] = layers.get(spells, 0) + 1
+    layers = Counter(tuple(_spells(line, level, length_s)) for level in range(1, most + 1))
     for spells, machines in layers.items():
         for begin, end in spells:
             ready = begin + boot_s if begin > 0 else 0.0

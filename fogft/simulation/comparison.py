@@ -83,8 +83,7 @@ class Scenario:
     @cached_property
     def replicas(self) -> int:
         """How many replicas the planner wants outside the schedule's windows."""
-        bare = replace(self.spec, schedule=None)
-        return self._wanted(bare, EPOCH)
+        return self._wanted(replace(self.spec, schedule=None), EPOCH)
 
     @cached_property
     def _offers(self) -> tuple[Offer, ...]:

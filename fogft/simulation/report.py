@@ -18,13 +18,7 @@ from fogft.poolfile.file import parse, read_text
 from fogft.poolfile.named_clouds import cloud_named_by
 from fogft.poolfile.named_clouds import located as located_in_file
 from fogft.simulation import fitting
-from fogft.simulation.comparison import (
-    BOUND,
-    Row,
-    Scenario,
-    compare,
-    spot_locations,
-)
+from fogft.simulation.comparison import BOUND, Row, Scenario, compare, spot_locations
 from fogft.simulation.market import FindOffers, remembered
 from fogft.simulation.meter import DAY_S
 from fogft.simulation.model import MARKET_KEYS, SLOW, MarketModel, Timing, applied, read_values
