@@ -34,7 +34,6 @@ SERVICE_COLUMNS = (
 )
 TOPIC_COLUMNS = ("TOPIC", "FROM", "HEARD BY", "RATE", "MESSAGES", "PASSED", "DROPPED", "REFUSED")
 RARE = ("FALLBACK", "UNANSWERED", "LATE", "WAITING")
-DETAIL = "DETAIL"
 UNKNOWN = "?"
 _STRANGERS_SHOWN = 20  # fewer come of ports that are scanned, and of links that break off
 LOST = "unready"  # it has served, and does not now
@@ -183,7 +182,7 @@ def _replicas(
         beside = [[*row, one] for row, one in zip(cells, details, strict=True)]
         return [table([*names, ""], beside, right=NUMBERS)]
     below = [(row[0], one) for row, one in zip(cells, details, strict=True) if one]
-    return [own, "", table(("", DETAIL), below, width=width, folds=(DETAIL,), titled=False)]
+    return [own, "", table(("", "DETAIL"), below, width=width, folds=("DETAIL",), titled=False)]
 
 
 def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:

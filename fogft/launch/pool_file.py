@@ -9,7 +9,6 @@ from fogft import template_files
 from fogft.errors import FogftError
 
 FILE_LIMIT_BYTES = 256 << 10
-_END = "END_OF_PARAMETERS"
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def _file(name: str, path: str, content: str) -> str:
             f"the parameter file `{path}` is too large to travel with a launch file",
             "put it in the pool file's `workdir` or `file_mounts` and name it there",
         )
-    end = _END
+    end = "END_OF_PARAMETERS"
     while end in content:
         end += "_"
     newline = "" if content.endswith("\n") or not content else "\n"
