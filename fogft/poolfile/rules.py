@@ -117,9 +117,7 @@ def _topic(section: Section, made: TopicSpec) -> TopicSpec:
 def _metrics(section: Section, made: MetricsSpec) -> MetricsSpec:
     seen: set[str] = set()
     for key, endpoint in vars(made).items():
-        if not endpoint:
-            continue
-        if endpoint in seen:
+        if endpoint and endpoint in seen:
             raise section.error(key, f"`{endpoint}` is used twice", "give each its own port")
         seen.add(endpoint)
     if made.replica and int(made.replica.rpartition(":")[2]) > _LAST_REPLICA_PORT:
