@@ -101,11 +101,9 @@ def order(
             accounts, found = _tested(concrete, clouds_named(spec), may_fail=before is not None)
             notes += found
             usable = [name for name, problem in accounts.items() if not problem]
-            now, hours = time.time(), spec.max_hours
+            ends_at = None if spec.max_hours is None else time.time() + spec.max_hours * HOUR_S
             try:
-                notes += concrete.hindrances(
-                    usable, None if hours is None else now + hours * HOUR_S
-                )
+                notes += concrete.hindrances(usable, ends_at)
                 notes += concrete.exposures(
                     usable,
                     open_port=None if spec.dials_out else spec.link_port,
