@@ -194,9 +194,8 @@ class Row:
 
     def to_json(self) -> dict[str, Any]:
         """Return all figures."""
-        out: dict[str, Any] = {"policy": self.name}
-        for figure in FIGURES:
-            out[figure] = asdict(self.estimate(figure))
+        figures = {figure: asdict(self.estimate(figure)) for figure in FIGURES}
+        out: dict[str, Any] = {"policy": self.name, **figures}
         out["usd_per_month"] = out["usd_per_hour"]["mean"] * HOURS_A_MONTH
         out["longest_outage_s"] = self.longest_outage_s
         out["by_seed"] = [asdict(replace(o, days=())) for o in self.outcomes]
