@@ -200,9 +200,9 @@ def test_while_replicas_slow_down_in_turns_an_idle_pool_does_as_well_as_with_all
     Where they save nothing otherwise, the one that has become slow is asked no more meanwhile.
     """
     ratios = []
-    for seed in range(3, 3 + by_day(2, at_night=6)):
+    for seed in range(3, 3 + by_day(4, at_night=12)):
         p99s = [
-            p99(served(mode, service, 0.1, seconds=80.0, seed=seed, spells="one by one"))
+            p99(served(mode, service, 0.1, seconds=200.0, seed=seed, spells="one by one"))
             for mode in (AUTO, HedgingMode.ALL)
         ]
         ratios.append((p99s[0] - 2 * ONE_WAY_S) / (p99s[1] - 2 * ONE_WAY_S))
