@@ -149,9 +149,8 @@ class CatchingUp:
             return None
         index = log.append(payload)
         for replica, peer in self.peers.items():
-            if not peer.joined:
-                continue
-            if peer.next == index and peer.rewind is None and len(peer.open) < WINDOW:
+            keeps_up = peer.joined and peer.next == index and peer.rewind is None
+            if keeps_up and len(peer.open) < WINDOW:
                 peer.next = index + 1
                 peer.open.add(index)
                 self._out.append(Order(replica, Op.APPLY, index, payload))

@@ -305,14 +305,12 @@ class OrderedReplica(Generic[T]):
         return out
 
     def _give_up(self, reason: Refusal, detail: str = "") -> list[Effect[T]]:
-        out: list[Effect[T]] = [
-            Refuse(to, reason, detail) for _, waiting in self._queue.values() for to in waiting
-        ]
-        out += [Refuse(to, reason, detail) for to in self._snapshots]
+        ended = [to for _, waiting in self._queue.values() for to in waiting]
+        ended += self._snapshots
         if self._restore is not None:
-            out.append(Refuse(self._restore[2], reason, detail))
-        out += [Refuse(to, reason, detail) for to in self._claims]
+            ended.append(self._restore[2])
+        ended += self._claims
         self._queue.clear()
         self._queued_bytes = 0
         self._snapshots, self._restore, self._claims = [], None, []
-        return out
+        return [Refuse(to, reason, detail) for to in ended]

@@ -40,9 +40,7 @@ class Ring:
 
     def begin(self) -> int:
         """Return the number after which a new robot begins."""
-        if self._latched:
-            return self._kept[0][0] - 1 if self._kept else self.last
-        return self.last
+        return self._kept[0][0] - 1 if self._latched and self._kept else self.last
 
     def after(self, number: int, limit_bytes: int) -> list[Numbered]:
         """Return messages after a number, oldest first: one, or up to a number of bytes."""
