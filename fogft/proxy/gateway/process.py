@@ -101,7 +101,7 @@ class _Gateway:
             spec,
             self._forwarder.respond,
             fault_of=fault_of(spec.type, RESPONSE),
-            ok_of=_ok_of(spec.type),
+            ok_of=functools.partial(_ok_of, spec.type),
             wake=wake,
             poisoned=self._forwarder.poisoned,
         )
@@ -200,19 +200,15 @@ class _Gateway:
         self._proxy.close()
 
 
-def _ok_of(type_name: str) -> Callable[[str], Callable[[bytes], bool]]:
+def _ok_of(type_name: str, field: str) -> Callable[[bytes], bool]:
     """Return what finds whether a response is ok; all are where the type is not known here."""
+    try:
+        from fogft.ros import messages
 
-    def ok_of(field: str) -> Callable[[bytes], bool]:
-        try:
-            from fogft.ros import messages
-
-            return messages.bool_field(type_name, field)
-        except (FogftError, ImportError) as error:
-            log.warning(
-                "ok_field_not_judged type=%s reason=%r effect='the first response is returned'",
-                type_name, str(error),
-            )  # fmt: skip
-            return lambda payload: True
-
-    return ok_of
+        return messages.bool_field(type_name, field)
+    except (FogftError, ImportError) as error:
+        log.warning(
+            "ok_field_not_judged type=%s reason=%r effect='the first response is returned'",
+            type_name, str(error),
+        )  # fmt: skip
+        return lambda payload: True

@@ -41,6 +41,7 @@ from fogft.proxy.robot.following import Following
 from fogft.proxy.robot.manager_restart import ManagerRestart
 from fogft.proxy.robot.order_mark import OrderMark
 from fogft.proxy.robot.service_order import ServiceOrder
+from fogft.records import cache
 from fogft.requests.votes import Quorum
 from fogft.ros import memory_tuning, spdp
 from fogft.ros.joining import EarlyJoin, Pauses
@@ -293,7 +294,7 @@ class _Running:
                 proxy.renew()
                 self.following.renew()
             if announcements is not None and announcements.changed():
-                try_step(functools.partial(_tell, announcements.path, proxy), announcements.path)
+                try_step(lambda: proxy.tell(cache.read(announcements.path)), announcements.path)
             if now - reported > (_REPORT_AFTER_CHANGE_S if changed else _REPORT_EVERY_S):
                 reported, changed = now, False
                 if self.again:
@@ -391,12 +392,6 @@ def _bury(config: ClientProxyConfig) -> None:
         if isinstance(left, dict) and isinstance(said := left.get("participant"), str):
             domain = own_domain() if config.domain_id is None else config.domain_id
             spdp.declare_gone(bytes.fromhex(said), domain)
-
-
-def _tell(path: Path, proxy: ClientProxy) -> None:
-    from fogft.records import cache
-
-    proxy.tell(cache.read(path))
 
 
 def _trace(path: Path, proxy: ClientProxy, spans: Spans | None) -> None:
