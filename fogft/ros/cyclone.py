@@ -12,6 +12,8 @@ from ctypes import CDLL, c_int32, c_size_t, c_uint32, c_uint64, c_void_p, string
 from functools import lru_cache
 from typing import Any
 
+from fogft.ros.rcl import declared
+
 MIDDLEWARE = "rmw_cyclonedds_cpp"
 LIBRARY = "libddsc.so.0"  # of CycloneDDS 0.x, which every ROS distribution up to Kilted has
 _IDENTIFIER_BYTES = 16
@@ -29,13 +31,9 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 def loaded_library() -> Any:
     """Return the library that this process has loaded; None if it has none, or another one."""
     try:
-        library = CDLL(LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
-        for name, (result, arguments) in _SIGNATURES.items():
-            function = getattr(library, name)
-            function.restype, function.argtypes = result, arguments
+        return declared(CDLL(LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW), _SIGNATURES)
     except (OSError, AttributeError):
         return None
-    return library
 
 
 def identity(handle: bytes) -> bytes:

@@ -15,6 +15,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 from fogft.counters import Counters
@@ -30,32 +31,27 @@ BURST = 128  # messages taken from one entity before the others get their turn
 _ASK_EVERY_S, _ASK_LIMIT_S = 0.5, 5.0
 
 
+@dataclass(eq=False)
 class Server:
     """A service of a node (`fogft.ros.port.RosServer`)."""
 
-    def __init__(
-        self,
-        service: Any,
-        end: ServiceEnd,
-        on_request: Callable[[bytes, Any], None],
-        withdraw: Callable[[Server], None],
-        *,
-        on_burst: OnBurst | None = None,
-        probes: NodeProbes,
-        mismatch: Callable[[], str] = str,
-    ) -> None:
-        self.handle = service.handle
-        self._service = service
-        self._end: ServiceEnd | None = end
-        self.take = end.take
-        self._on_request = on_request
-        self._on_burst = on_burst
-        self._withdraw = withdraw
+    service: Any
+    end: ServiceEnd
+    on_request: Callable[[bytes, Any], None]
+    withdraw: Callable[[Server], None]
+    _: KW_ONLY
+    on_burst: OnBurst
+    probes: NodeProbes
+    mismatch: Callable[[], str] = str
+
+    def __post_init__(self) -> None:
+        self.handle = self.service.handle
+        self.take = self.end.take
+        self._end: ServiceEnd | None = self.end
         self._counters = Counters()
-        self.mismatch = mismatch
         self._in_bursts = False  # several came together the last time
         self._lock = threading.Lock()
-        self._pacer = Pacer(self._send, probes, service.service_name)
+        self._pacer = Pacer(self._send, self.probes, self.service.service_name)
         self.respond = self._pacer.respond  # in a burst, paced to the client
 
     def _send(self, handle: Any, payload: bytes) -> None:
@@ -65,7 +61,7 @@ class Server:
 
     def close(self) -> None:
         """Withdraw the service; repeatable. On return it is gone, unless the take loop called."""
-        self._withdraw(self)
+        self.withdraw(self)
 
     def drain(self) -> None:
         """Deliver received messages. Take loop only.
@@ -101,23 +97,21 @@ class Server:
         try:
             return self.take()
         except RosError as error:
-            self._counters.warn(log, "unreadable", "%s: %s", self._service.srv_name, error.message)
+            self._counters.warn(log, "unreadable", "%s: %s", self.service.srv_name, error.message)
             return None
 
     def _deliver(self, taken: tuple[bytes, Any], *, together: bool = False) -> None:
         self._pacer.requested(taken[1], together=together)
         try:
-            self._on_request(*taken)
+            self.on_request(*taken)
         except Exception:
-            log.exception("%s: a request was lost", self._service.srv_name)
+            log.exception("%s: a request was lost", self.service.srv_name)
 
     def _tell_burst(self, begins: bool) -> None:
-        if self._on_burst is None:
-            return
         try:
-            self._on_burst(begins)
+            self.on_burst(begins)
         except Exception:
-            log.exception("%s: the end of a burst was not taken", self._service.srv_name)
+            log.exception("%s: the end of a burst was not taken", self.service.srv_name)
 
     def destroy(self, node: Any) -> None:
         """Free everything. Take loop only, once, when no wait set holds the handle."""
@@ -126,9 +120,10 @@ class Server:
             end, self._end = self._end, None
         if end is not None:
             end.close()
-            node.destroy_service(self._service)
+            node.destroy_service(self.service)
 
 
+@dataclass(eq=False)
 class ReadinessProbe:
     """Whether the server of a service has discovered a client; if not, rmw drops its responses.
 
@@ -141,20 +136,18 @@ class ReadinessProbe:
         make: Creates a client of it.
     """
 
-    def __init__(
-        self,
-        find: Callable[[], str | None],
-        make: Callable[[str], RosClient],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._find, self._make, self._clock = find, make, clock
+    find: Callable[[], str | None]
+    make: Callable[[str], RosClient]
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
         self._servers, self._passed = 0, True
         self._ask_at = self._ends_at = 0.0
         self._client: RosClient | None = None
 
     def passed(self, servers: int) -> bool:
         """Return whether it has, or cannot be known; `servers` are listed. Call at about 10 Hz."""
-        now = self._clock()
+        now = self.clock()
         if servers > self._servers:  # one more than before is another one
             self._passed, self._ask_at, self._ends_at = False, now, now + _ASK_LIMIT_S
         self._servers = servers
@@ -170,9 +163,9 @@ class ReadinessProbe:
             self._passed = True
             return
         if self._client is None:
-            name = self._find()
+            name = self.find()
             self._passed = name == ""
-            self._client = self._make(name) if name else None
+            self._client = self.make(name) if name else None
         if self._client is not None:
             self._ask_at = now + _ASK_EVERY_S
             self._client.call(EMPTY_LIST, self._heard)

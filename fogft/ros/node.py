@@ -131,7 +131,7 @@ class SerialisedNode:
             )
             return Server(
                 *(service, ServiceEnd(service, service_type), on_request, self._withdraw),
-                on_burst=on_burst,
+                on_burst=on_burst or (lambda begins: None),
                 probes=self._probes,
                 mismatch=partial(self._server_trouble, service.service_name),
             )

@@ -9,6 +9,7 @@ Not here: when to call them (`serialised`).
 """
 
 import ctypes
+from collections.abc import Mapping
 from ctypes import (
     CDLL,
     POINTER,
@@ -82,8 +83,9 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 }
 
 
-def _declared(library: CDLL) -> CDLL:
-    for name, (result, arguments) in _SIGNATURES.items():
+def declared(library: CDLL, signatures: Mapping[str, Any] = _SIGNATURES) -> CDLL:
+    """Return a library whose functions are known to have these results and arguments."""
+    for name, (result, arguments) in signatures.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments
     return library
@@ -98,7 +100,7 @@ def load() -> tuple[CDLL, CDLL]:
     try:
         import rclpy.impl.implementation_singleton  # noqa: F401  loads librcl itself
 
-        return _declared(PyDLL("librcl.so")), _declared(CDLL("librcl.so"))
+        return declared(PyDLL("librcl.so")), declared(CDLL("librcl.so"))
     except (OSError, AttributeError, ImportError) as error:
         raise RosError(f"the C library of ROS 2 cannot be used: {error}") from error
 

@@ -36,6 +36,7 @@ KEPT = 64
 _Due = tuple[bytes, ClientPace, Any, bytes]  # a response to a client, by its id and handle
 
 
+@dataclass(eq=False)
 class NodeProbes:
     """Probes of the nodes in one ROS domain, for the clients of all services. Any thread.
 
@@ -48,19 +49,17 @@ class NodeProbes:
             client of a service belongs to: None while it is not discovered, empty without one.
     """
 
-    def __init__(
-        self,
-        make_client: Callable[[str, str], RosClient],
-        same_node_serves: Callable[[str, str, bytes], str | None],
-    ) -> None:
-        self._make_client, self._same_node_serves = make_client, same_node_serves
+    make_client: Callable[[str, str], RosClient]
+    same_node_serves: Callable[[str, str, bytes], str | None]
+
+    def __post_init__(self) -> None:
         self._by_name: dict[str, RosClient] = {}
         self._by_client: dict[bytes, RosClient] = {}
         self._lock = threading.Lock()
 
     def answers(self, service: str, client: bytes) -> bool | None:
         """Whether the node of a service's client answers probes; None while it is not known."""
-        asked = self._same_node_serves(PROBED, service, client)
+        asked = self.same_node_serves(PROBED, service, client)
         if not asked:
             return None if asked is None else False
         with self._lock:
@@ -69,7 +68,7 @@ class NodeProbes:
                 if len(self._by_name) >= KEPT:
                     self._by_name.pop(next(iter(self._by_name))).close()
                 try:
-                    end = self._by_name[asked] = self._make_client(asked, PROBED_TYPE)
+                    end = self._by_name[asked] = self.make_client(asked, PROBED_TYPE)
                 except RosError:
                     return False
             if not end.available():
