@@ -10,6 +10,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 import zenoh
@@ -25,6 +26,7 @@ from fogft.link.zenoh.robot.probing import Probing
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import names
 from fogft.model.replica import LinkState
+from fogft.process import on_thread
 from fogft.requests.load import NEVER
 
 log = logging.getLogger(__name__)
@@ -39,22 +41,18 @@ _LOOK_EVERY_S = 0.1  # while something large is sent
 _LOOK_AGAIN_S = 0.05  # at the earliest
 
 
+@dataclass(eq=False)
 class ZenohLink:
     """A link to one replica; see `port.Link`. Created by `ZenohDialer`."""
 
-    def __init__(
-        self,
-        shared: Shared,
-        peer: Peer,
-        services: Mapping[str, str],
-        events: LinkEvents,
-        on_close: Callable[[ZenohLink], None],
-    ) -> None:
-        self._shared = shared
-        self._on_close = on_close
-        self.peer = peer
-        self._services = dict(services)
-        self._events = events
+    shared: Shared
+    peer: Peer
+    services: Mapping[str, str]
+    events: LinkEvents
+    on_close: Callable[[ZenohLink], None]
+
+    def __post_init__(self) -> None:
+        shared, peer = self.shared, self.peer
         self._suspect_after_s = shared.suspect_after_s
         self._probe_every_s = min(_PROBE_EVERY_S, shared.suspect_after_s / 2)
         self._config = settings.robot_settings(peer, shared.credentials, shared.settings)
@@ -81,11 +79,8 @@ class ZenohLink:
         self._looked_at = 0.0
         self._renew_at = NEVER
         self._retiring: list[Connection] = []  # succeeded, with requests under way
-        self._thread = threading.Thread(
-            target=self._keep, name=f"fogft-keep-{peer.id.short}", daemon=True
-        )
+        self._thread = on_thread(self._keep, name=f"fogft-keep-{peer.id.short}")
         self.join = self._thread.join  # once closed
-        self._thread.start()
 
     # -- port.Link ------------------------------------------------------------------------
 
@@ -162,7 +157,7 @@ class ZenohLink:
         self._nothing_live()
         if live is not None:
             live.close()
-        self._on_close(self)
+        self.on_close(self)
 
     def renew(self) -> None:
         """Switch to new credentials over a new connection; returns at once, no request is lost."""
@@ -229,7 +224,7 @@ class ZenohLink:
         config = self._config | {"transport/unicast/open_timeout": open_timeout_ms}
         try:
             connection = Connection(
-                settings.to_zenoh(config), self.peer, self._services, self._shared, self._tell
+                settings.to_zenoh(config), self.peer, self.services, self.shared, self._tell
             )
         except (WireError, CredentialError) as error:
             self._say(error.message)
@@ -237,7 +232,7 @@ class ZenohLink:
         except zenoh.ZError as error:
             if not self._closed:
                 now = time.monotonic()
-                why = self._opening.failed(now - began, now, self._shared.credentials)
+                why = self._opening.failed(now - began, now, self.shared.credentials)
                 self._say(why or self._detail or str(error))
             return None
         self._opened += 1
@@ -285,7 +280,7 @@ class ZenohLink:
         self._looked_at = now
         moved_s = connection.flow.look(now, connection.attempts.look(now))
         self._probing.excuse(moved_s, now)
-        longest_s, shortest_s = self._suspect_after_s, self._shared.settings.stall_after_s
+        longest_s, shortest_s = self._suspect_after_s, self.shared.settings.stall_after_s
         if connection.flow.progress.stalled(now, shortest_s=shortest_s, longest_s=longest_s):
             connection.lost_because = "it no longer reads what is sent"
         return not connection.lost_because
@@ -302,16 +297,16 @@ class ZenohLink:
     def _next_probe_in_s(self, *, up: bool) -> float:
         if not up:
             return _FIRST_PROBES_EVERY_S
-        if self._services.keys() <= self.ready:
+        if self.services.keys() <= self.ready:
             return self._probe_every_s
         return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
 
     def _tell_records(self, connection: Connection) -> None:
         """Send what the replica has not taken, and all now and then: it may have newer."""
-        records, id = self._shared.records, self.peer.id
+        records, id = self.shared.records, self.peer.id
         again = bool(records) and time.monotonic() - connection.told_at > _TELL_AGAIN_S
         if again or records != connection.told:
-            newer = partial(self._shared.newer.__setitem__, id.slot)
+            newer = partial(self.shared.newer.__setitem__, id.slot)
             key = names.slot_key(id.pool_uid, id.slot, names.RECORDS)
             connection.tell_records(key, records, newer)
 
@@ -319,7 +314,7 @@ class ZenohLink:
         known = self._probing.answer
         # Its types are asked for once a connection: it may be another process at each.
         describe = self._live is not connection or known is None or not known.types
-        self._probing.ask(connection, Probe(self._shared.robot, describe, __version__), now)
+        self._probing.ask(connection, Probe(self.shared.robot, describe, __version__), now)
         if not connection.alive():
             connection.lost_because = "the connection was lost"
 
@@ -392,17 +387,17 @@ class ZenohLink:
 
     def _answered(self, answer: Answer) -> None:
         try:
-            self._events.answered(self, answer)
+            self.events.answered(self, answer)
         except Exception:  # in Zenoh's thread nobody else would tell of it
             log.exception("answer_not_taken request=%s", answer.request_id.hex())
 
     def _late(self, answer: Answer) -> None:
         if not self._closed:
-            self._events.late(self, answer)
+            self.events.late(self, answer)
 
     def _changed(self) -> None:
         try:
-            self._events.changed(self)
+            self.events.changed(self)
         except Exception:
             log.exception("change_not_taken replica=%s", self.peer.id.short)
 
