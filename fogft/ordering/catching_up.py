@@ -45,12 +45,6 @@ class OrderedLog:
         """The highest number given."""
         return self.start + len(self._entries)
 
-    @property
-    def half_full(self) -> bool:
-        """Whether the log is half full: time for a checkpoint."""
-        full = len(self._entries) / self.entries_limit, self.held_bytes / self.bytes_limit
-        return max(full) >= 0.5
-
     def has_room(self, size: int) -> bool:
         """Whether a request of this size can be appended."""
         if not self._entries:
@@ -109,7 +103,7 @@ class CatchingUp:
         self._epoch = epoch
         self._counts = counts
         self._handed_over = handed_over
-        self._out: list[Order] = []
+        self.out: list[Order] = []  # what `take` returns next
         self._serial = 0
         self._checkpoint_at = 0.0
 
@@ -118,14 +112,9 @@ class CatchingUp:
         """Whether a request numbered now is sent at once to a replica whose answer counts."""
         return any(peer.joined and self._counts(replica) for replica, peer in self.peers.items())
 
-    @property
-    def sends(self) -> bool:
-        """Whether `take` has orders to send."""
-        return bool(self._out)
-
     def take(self) -> list[Order]:
         """Remove and return the orders to send, in order."""
-        out, self._out = self._out, []
+        out, self.out = self.out, []
         return out
 
     # -- numbers --------------------------------------------------------------------------
@@ -133,7 +122,7 @@ class CatchingUp:
     def order(self, replica: int, op: Op) -> None:
         """Send an order without a number, identified by a serial."""
         self._serial += 1
-        self._out.append(Order(replica, op, self._serial))
+        self.out.append(Order(replica, op, self._serial))
 
     def begin_at(self, position: Position) -> None:
         """Begin the term from a state."""
@@ -153,7 +142,7 @@ class CatchingUp:
             if keeps_up and len(peer.open) < WINDOW:
                 peer.next = index + 1
                 peer.open.add(index)
-                self._out.append(Order(replica, Op.APPLY, index, payload))
+                self.out.append(Order(replica, Op.APPLY, index, payload))
         return index
 
     def feed(self, replica: int, peer: Peer) -> None:
@@ -173,14 +162,14 @@ class CatchingUp:
             peer.next += 1
             if index not in peer.open:
                 peer.open.add(index)
-                self._out.append(Order(replica, Op.APPLY, index, log.get(index)))
+                self.out.append(Order(replica, Op.APPLY, index, log.get(index)))
 
     def recall(self, replica: int, index: int) -> None:
         """Ask a replica for the answer to a number that it has applied."""
         peer = self.peers[replica]
         if index not in peer.open:
             peer.open.add(index)
-            self._out.append(Order(replica, Op.RECALL, index))
+            self.out.append(Order(replica, Op.RECALL, index))
 
     def _make_room(self, size: int) -> bool:
         """No checkpoint came in time: drop what every member has applied: each can go on alone."""
@@ -206,11 +195,11 @@ class CatchingUp:
             return
         if may_join and from_index == at.index:
             peer.phase = Phase.ASKED
-            self._out.append(Order(replica, Op.JOIN, at.index, orders.encode_join(at, log.last)))
+            self.out.append(Order(replica, Op.JOIN, at.index, orders.encode_join(at, log.last)))
         elif kept is not None:
             peer.phase = Phase.ASKED
             payload = orders.encode_snapshot(log.last, kept.state)
-            self._out.append(Order(replica, Op.RESTORE, kept.index, payload))
+            self.out.append(Order(replica, Op.RESTORE, kept.index, payload))
 
     def _knows(self, replica: int, at: Position) -> bool:
         """Whether a replica's state is one that this term knows, and not one it stood by with."""
@@ -246,7 +235,8 @@ class CatchingUp:
         # A log that begins with the service's first state needs none; nor does one just taken. A
         # later term's begins with a position that a fresh replica does not know, called or not.
         begins_later = log.checkpoint is None and (log.start > 0 or self.base != START)
-        if waits or begins_later or log.half_full:
+        full = max(len(log) / log.entries_limit, log.held_bytes / log.bytes_limit)
+        if waits or begins_later or full >= 0.5:
             # Of one that seldom answers first: it pauses for the snapshot.
             self.ask_for_checkpoint(
                 [

@@ -87,7 +87,7 @@ class Sequencer:
     def due(self) -> bool:
         """Whether the owner must act at once: send orders, or end the term."""
         ends = self.deposed_by is not None or self.handover is not None
-        return ends or self._replicas.sends or self._change_to is not None
+        return ends or bool(self._replicas.out) or self._change_to is not None
 
     def submit(self, payload: bytes) -> int | None:
         """Number a request and order it applied; None while the term has not begun or is full."""

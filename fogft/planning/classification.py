@@ -72,12 +72,11 @@ def classify(inputs: Inputs, health: Health, size: Size) -> Classification:
     """Classify every machine of the pool."""
     spec, intent, observed, _ = inputs
     machines = Classification()
-    failed = Verdict.FAILED
     blocks = {group.block for group in size.groups}
     for replica in health.replicas:
         if observed.ending and replica.id in observed.ending:
             machines.ending.append(replica)
-        elif replica.verdict is failed:
+        elif replica.verdict is Verdict.FAILED:
             machines.failed.append(replica)
         elif replica.verdict in _LOST:
             machines.lost.append(replica)

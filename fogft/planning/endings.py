@@ -60,7 +60,8 @@ def choose_endings(
     unwanted = [s for s in standing_in if s.unwanted]
     if surplus <= 0 and not machines.lost and first is None and not unwanted and extra <= 0:
         return
-    chooser = _Chooser(out, wanted, (*machines.good, *machines.replaced, *standing_in), now)
+    working = (*machines.good, *machines.replaced, *standing_in)
+    chooser = _Chooser(out, wanted, now, {s.id for s in working if s.serving})
     if health.uplink_suspected or not health.links_known:
         if surplus > 0 or machines.lost or unwanted or extra > 0:
             out.notes.append(Reason(Cause.NOBODY_HEARD))
@@ -112,19 +113,17 @@ def _by_expendability(replicas: list[Assessment], *, dear_first: bool) -> list[A
     return sorted(replicas, key=rank)
 
 
+@dataclass
 class _Chooser:
-    def __init__(
-        self, out: Endings, wanted: int, working: Iterable[Assessment], now: float
-    ) -> None:
-        self._out = out
-        self.counted_out = 0
-        self._wanted = wanted
-        self._now = now
-        self._pillars = {s.id for s in working if s.serving}
+    out: Endings
+    wanted: int
+    now: float
+    pillars: set[ReplicaId]  # those that serve and stay
+    counted_out: int = 0
 
     def end_lost(self, replica: Assessment, history: History) -> None:
         """A lost one ends once it is replaced, or at once when it cannot serve."""
-        enough = len(self._pillars) >= self._wanted
+        enough = len(self.pillars) >= self.wanted
         later_served = history.served[replica.slot] > replica.id.generation
         superseded = later_served and replica.verdict is Verdict.UNRESPONSIVE
         if enough or superseded or not replica.ever_ready:
@@ -140,20 +139,20 @@ class _Chooser:
         for replica in replicas:
             if count <= 0:
                 return
-            others = len(self._pillars - {replica.id})
+            others = len(self.pillars - {replica.id})
             is_missed = replica.may_serve or count <= coming
-            if is_missed and others < self._wanted:
+            if is_missed and others < self.wanted:
                 continue
             count -= 1
             self.counted_out += 1
             self.go(replica, Reason(cause, because=because(replica.why)))
 
     def go(self, replica: Assessment, why: Reason) -> None:
-        self._pillars.discard(replica.id)
+        self.pillars.discard(replica.id)
         if self._must_drain_first(replica):
-            self._out.draining.append(replica)
+            self.out.draining.append(replica)
         else:
-            self._out.now.append((replica, why))
+            self.out.now.append((replica, why))
 
     def _must_drain_first(self, replica: Assessment) -> bool:
         link = replica.link
@@ -161,7 +160,7 @@ class _Chooser:
             return False
         if replica.draining_since is None:
             return True
-        age_s = self._now - replica.draining_since
+        age_s = self.now - replica.draining_since
         if age_s >= DRAIN_LIMIT_S:
             return False
         return age_s < DRAIN_SETTLE_S or link.in_flight > 0
