@@ -42,9 +42,6 @@ class SendOptions:
         )
 
 
-DEFAULT_OPTIONS = SendOptions()
-
-
 @dataclass(frozen=True)
 class Probe:
     """The content of a robot's probe."""

@@ -14,7 +14,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from fogft.link.port import (
-    DEFAULT_OPTIONS,
     Answer,
     Dialer,
     Link,
@@ -282,7 +281,7 @@ class UplinkDialer:
         # The preferred one first; none for whatever the routes say.
         self.interfaces: tuple[str, ...] = ()
         self.policies: Mapping[str, UplinkPolicy] = {}
-        self._options = DEFAULT_OPTIONS
+        self._options = SendOptions()
 
     def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
         """Set the uplinks and the options of services; return whether links must be redialled."""

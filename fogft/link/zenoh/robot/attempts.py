@@ -5,10 +5,9 @@ connection's own, so a peer that takes nothing costs nobody else. Not here: the 
 (`connection`), what becomes of requests (`fogft.proxy.robot.dispatcher`).
 """
 
-import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Protocol
 
 from fogft.link import batch_frames, frame
@@ -29,6 +28,7 @@ from fogft.link.zenoh.flow_watch import FlowWatch
 from fogft.link.zenoh.threads import join_at_exit
 from fogft.model import topic
 from fogft.model.refusal import Refusal
+from fogft.process import on_thread
 from fogft.requests.load import Handling
 
 # Attempts that wait for the sender, forgotten ones included: those have freed their room in the
@@ -75,6 +75,7 @@ class Callbacks:
     wake: Callable[[], None]  # `Attempts.watched` was set, or the connection is lost; perhaps again
 
 
+@dataclass(eq=False)
 class Attempts:
     """The attempts of one connection.
 
@@ -82,28 +83,21 @@ class Attempts:
     which are no longer wanted.
     """
 
-    def __init__(
-        self,
-        outlet: Outlet,
-        services: Iterable[str],
-        origin: bytes,
-        *,
-        options: SendOptions,
-        gate: LargeSendGate,
-        tell_losers: bool,
-        tell: Callbacks,
-        ended: Callable[[], None],
-        name: str,
-    ) -> None:
-        self._outlet = outlet
-        self._services = frozenset(services)
-        self._origin = origin
-        self._gate = gate
-        self._tell_losers = tell_losers
+    outlet: Outlet
+    services: frozenset[str]
+    origin: bytes
+    _: KW_ONLY
+    options: SendOptions
+    gate: LargeSendGate
+    tell_losers: bool
+    tell: Callbacks
+    ended: Callable[[], None]
+    name: str
+
+    def __post_init__(self) -> None:
+        options, outlet = self.options, self.outlet
         self._cancellations = Cancellations()
-        self._link = tell
-        self._ended = ended
-        self.window = LinkWindow(standing=len(self._services))
+        self.window = LinkWindow(standing=len(self.services))
         self.watched = False  # something large was sent lately: the link's thread looks often
         self.round_trip_s = 0.0  # the shortest seen
         self._large_since = float("-inf")
@@ -116,7 +110,7 @@ class Attempts:
         self._batch = BatchBuffer()
         self._credit = Credit()
         self._queue = SendQueue(options.latest)
-        self._compressions = {name: Compression() for name in self._services - options.plain}
+        self._compressions = {name: Compression() for name in self.services - options.plain}
         self._flow, self._progress = outlet.flow, outlet.flow.progress
         self._deadline = DeadlineFilter(
             options.timed,
@@ -124,8 +118,7 @@ class Attempts:
             self._left_bytes,
             self._compressions.get,
         )
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        self._thread = on_thread(self._run, name=self.name)
 
     # -- requests (any thread) ------------------------------------------------------------
 
@@ -140,7 +133,7 @@ class Attempts:
         handling: Handling = Handling.NORMAL,
     ) -> bool:
         """Accept an attempt, or return False. Never blocks. With `more`, `send` must follow."""
-        if service not in self._services or self._queue.qsize() >= _QUEUE_LIMIT:
+        if service not in self.services or self._queue.qsize() >= _QUEUE_LIMIT:
             return False
         now = time.monotonic()
         attempt = OpenAttempt(
@@ -195,9 +188,9 @@ class Attempts:
                 self._skipped(attempt)
         if not parts:
             return
-        header, content = batch_frames.encode_requests(parts, self._origin, seen=self._seen)
+        header, content = batch_frames.encode_requests(parts, self.origin, seen=self._seen)
         try:
-            self._outlet.publish(attempts[0].service, content, header)
+            self.outlet.publish(attempts[0].service, content, header)
         except Exception as error:  # whatever it is, the attempts must end
             self._lose(error, *attempts)
 
@@ -226,13 +219,13 @@ class Attempts:
         if attempt is None:
             return
         sent, now = attempt.payload is None, time.monotonic()
-        tell = sent and self._tell_losers
+        tell = sent and self.tell_losers
         if tell and self._cancellations.add(request_id, attempt.offered, now):
             self.flush()
         attempt.payload = None
         attempt.elsewhere = sent and now < attempt.deadline
         if self.window.declined and self.window.regained_room():
-            self._link.room()
+            self.tell.room()
 
     def flush(self) -> None:
         """Send cancellations for forgotten, unanswered requests."""
@@ -249,9 +242,9 @@ class Attempts:
             return False
         attempt.payload = None
         answer.service = attempt.service
-        self._link.answered(answer)
+        self.tell.answered(answer)
         if self.window.declined and self.window.regained_room():
-            self._link.room()
+            self.tell.room()
         return True
 
     # -- the sender thread ----------------------------------------------------------------
@@ -263,13 +256,13 @@ class Attempts:
             else:
                 self._send_or_lose(attempt)
                 self._credit.dequeued()
-        self._ended()
+        self.ended()
 
     def _tell(self) -> None:
         self._telling = False
         try:
             if ids := self._cancellations.take():
-                self._outlet.cancel(ids)
+                self.outlet.cancel(ids)
         except Exception as error:
             self._lose(error)
 
@@ -280,14 +273,14 @@ class Attempts:
             self._lose(error, attempt)
 
     def _lose(self, error: Exception, *attempts: OpenAttempt) -> None:
-        self._outlet.lose(f"sending failed: {error}")
+        self.outlet.lose(f"sending failed: {error}")
         for attempt in attempts:
             self._end(attempt, Refusal.LOST)
 
     def _skipped(self, attempt: OpenAttempt) -> None:
         """Tell the end of an attempt that was forgotten while it waited: no answer will."""
         if attempt.forgotten:
-            self._link.late(
+            self.tell.late(
                 Answer(attempt.request_id, refusal=Refusal.CANCELLED, service=attempt.service)
             )
 
@@ -304,13 +297,13 @@ class Attempts:
             self._skipped(attempt)  # if it was forgotten just now
             return
         large = attempt.size >= LARGE_BYTES
-        turn = self._gate.take() if large else None
+        turn = self.gate.take() if large else None
         began = time.monotonic()
         if large:
             self._large_since = self._sending_since = began
             if not self.watched:  # have the link's thread look whether it flows, for a while
                 self.watched = True
-                self._link.wake()
+                self.tell.wake()
         try:
             if self.window.holds(attempt):  # else `close` has ended it, and may not see this send
                 attempt.payload = None
@@ -319,11 +312,11 @@ class Attempts:
                 self._skipped(attempt)
         finally:
             self._sending_since = None
-            self._gate.give(turn)
+            self.gate.give(turn)
         if large:
             self._held_by_zenoh = time.monotonic(), min(attempt.size, _ZENOH_HOLDS_BYTES)
-        if time.monotonic() - began > _STUCK_S and not self._outlet.alive():
-            self._outlet.lose("it stopped reading, and Zenoh closed the session")
+        if time.monotonic() - began > _STUCK_S and not self.outlet.alive():
+            self.outlet.lose("it stopped reading, and Zenoh closed the session")
 
     def _left_there_s(self, remaining_s: float) -> float:
         """Return how long the replica has: in an overload all that it ends it ends just in time."""
@@ -340,7 +333,7 @@ class Attempts:
         header = frame.encode_request(
             attempt.request_id,
             self._left_there_s(remaining_s),
-            self._origin,
+            self.origin,
             seen=self._seen,
             packed=packed is not None,
             may_pack=reads_packed and rate is not None and self._flow.thin,
@@ -348,7 +341,7 @@ class Attempts:
             handling=attempt.handling,
         )
         content = payload if packed is None else packed
-        self._outlet.publish(attempt.service, content, header)
+        self.outlet.publish(attempt.service, content, header)
 
     # -- what came (Zenoh's threads) ------------------------------------------------------
 
@@ -359,7 +352,7 @@ class Attempts:
             attempt = self._unanswered.answered(answer.request_id)
             if attempt is None:  # it was answered before
                 if self._unanswered.owed < 0:
-                    self._outlet.lose("it sends more answers than it received requests")
+                    self.outlet.lose("it sends more answers than it received requests")
                 continue
             if answer.payload is not None:
                 self._credit.heard(attempt.mark)  # requests of one connection arrive in order
@@ -388,7 +381,7 @@ class Attempts:
         """Take the answer to an attempt that was forgotten, or has ended."""
         self._cancellations.answered(answer.request_id)
         answer.service = attempt.service
-        self._link.late(answer)
+        self.tell.late(answer)
 
     # -- the link's thread ----------------------------------------------------------------
 
@@ -423,7 +416,7 @@ class Attempts:
         join_at_exit(self._thread)
         for attempt in ended:
             attempt.payload = None
-            self._link.answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
+            self.tell.answered(Answer(attempt.request_id, None, Refusal.LOST, attempt.service))
 
     def end(self) -> None:
         """End the sender thread once its current send is done: within 11 s."""

@@ -21,7 +21,7 @@ from zenoh import handlers
 from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
 from fogft.link.credit import LargeSendGate
-from fogft.link.port import DEFAULT_OPTIONS, Answer, Peer, SendOptions
+from fogft.link.port import Answer, Peer, SendOptions
 from fogft.link.zenoh import threads
 from fogft.link.zenoh.diagnosis import wrong_name
 from fogft.link.zenoh.flow_watch import FlowWatch
@@ -44,7 +44,7 @@ class Shared:
     suspect_after_s: float
     settings: LinkSettings
     tell_losers: bool
-    options: SendOptions = DEFAULT_OPTIONS
+    options: SendOptions = field(default_factory=SendOptions)
     gate: LargeSendGate = field(default_factory=LargeSendGate)
     records: bytes = b""  # signed, for every replica, packed; empty for none
     newer: dict[int, bytes] = field(default_factory=dict)  # slot -> what its replica said instead
@@ -117,7 +117,7 @@ class Connection:
             raise
         self.attempts = Attempts(
             self,
-            keys,
+            frozenset(keys),
             frame.origin(shared.robot, self._token),
             options=shared.options,
             gate=shared.gate,

@@ -26,30 +26,25 @@ class Silence:
     """For how long a replica has not answered probes. Times are monotonic seconds."""
 
     def __init__(self) -> None:
-        self._since: float | None = None
+        self.since: float | None = None  # None while probes are answered
 
     def began(self, now: float) -> None:
         """Note that a probe was sent or cannot be sent. Continuing silence is not restarted."""
-        if self._since is None:
-            self._since = now
+        if self.since is None:
+            self.since = now
 
     def ended(self) -> None:
         """Note an answer."""
-        self._since = None
+        self.since = None
 
     def excuse(self, held_up_s: float, now: float) -> None:
         """Exclude `held_up_s` before `now`, in which this process did not run."""
-        if self._since is not None and held_up_s > 0:
-            self._since = min(self._since + held_up_s, now)
-
-    @property
-    def lasts(self) -> bool:
-        """Whether a probe is unanswered."""
-        return self._since is not None
+        if self.since is not None and held_up_s > 0:
+            self.since = min(self.since + held_up_s, now)
 
     def for_s(self, now: float) -> float:
         """Return for how long it has lasted; 0 while probes are answered."""
-        return 0.0 if self._since is None else max(0.0, now - self._since)
+        return 0.0 if self.since is None else max(0.0, now - self.since)
 
 
 # Over which connection an answer came, its bytes, when its probe was sent, and when it came.
@@ -135,7 +130,7 @@ class Probing:
 
         Infinite once it is late, and while none is awaited.
         """
-        if not self._of_replica.lasts:
+        if self._of_replica.since is None:
             self._doubted = False
             return False, float("inf")
         left_s = doubted_after_s(self.rtt_s) - self.silent_s(now)

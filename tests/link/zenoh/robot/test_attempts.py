@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from fogft.link import batch_frames, compression, frame
 from fogft.link.credit import LARGE_BYTES, LargeSendGate
-from fogft.link.port import DEFAULT_OPTIONS, Answer, SendOptions
+from fogft.link.port import Answer, SendOptions
 from fogft.link.socket_progress import SocketProgress
 from fogft.link.zenoh.robot.attempts import Attempts, Callbacks
 from fogft.model.refusal import Refusal
@@ -63,16 +63,16 @@ class Outlet:
 
 
 class Scene:
-    def __init__(self, options: SendOptions = DEFAULT_OPTIONS) -> None:
+    def __init__(self, options: SendOptions | None = None) -> None:
         self.outlet, self.gate = Outlet(), LargeSendGate()
         self.answers: list[Answer] = []
         self.late: list[bytes] = []
         self.ended = 0
         self.attempts = Attempts(
             self.outlet,
-            [SERVICE],
+            frozenset({SERVICE}),
             frame.origin("ada", bytes(frame.TOKEN_BYTES)),
-            options=options,
+            options=options or SendOptions(),
             gate=self.gate,
             tell_losers=True,
             tell=Callbacks(
