@@ -9,13 +9,13 @@ Not here: what is said (`fogft.proxy.robot.diagnostics`).
 """
 
 import logging
-import threading
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from queue import SimpleQueue
 from typing import Any
 
 from fogft.errors import RosError
+from fogft.process import on_thread
 from fogft.ros.port import Status
 
 log = logging.getLogger(__name__)
@@ -55,8 +55,7 @@ class VisibleNode:
             self._log = RosLog(self._node.get_logger(), self._wake)
         except Exception as error:
             raise RosError(f"the ROS node `{name}` cannot be created: {error}") from error
-        self._thread = threading.Thread(target=self._run, name=f"ros-{name}", daemon=True)
-        self._thread.start()
+        self._thread = on_thread(self._run, name=f"ros-{name}")
 
     # -- any thread -----------------------------------------------------------------------
 

@@ -37,7 +37,7 @@ class Forwarder:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._lock = threading.Lock()
-        self._dispatchers: dict[str, Dispatcher] = {}
+        self.dispatchers: dict[str, Dispatcher] = {}  # by service
         self._ready: frozenset[str] = frozenset()
         self._unready_since: dict[str, float] = {}
         self._known = KnownRequests(self.kept_bytes, 4 * self.held_limit, self.held_bytes)
@@ -51,10 +51,6 @@ class Forwarder:
     def start(self) -> None:
         """Start forwarding on its own thread, since the link's threads must not send."""
         threading.Thread(target=self.pass_on, name="fogft-forward", daemon=True).start()
-
-    def use(self, service: str, dispatcher: Dispatcher) -> None:
-        """Set the dispatcher of a service."""
-        self._dispatchers[service] = dispatcher
 
     @property
     def in_flight(self) -> int:
@@ -127,7 +123,7 @@ class Forwarder:
                 return
             waiting = self._end(job)
             self._known.forget(job)
-        self._dispatchers[job.service].cancel(id)
+        self.dispatchers[job.service].cancel(id)
         for incoming in waiting:
             self._refuse(incoming, reason)
 
@@ -159,7 +155,7 @@ class Forwarder:
         if left_s <= 0:
             self._stop(job.id, Refusal.EXPIRED)
             return
-        dispatcher = self._dispatchers[job.service]
+        dispatcher = self.dispatchers[job.service]
         if not dispatcher.forward(job.id, payload, job, left_s):
             self._stop(job.id, Refusal.OVERLOADED)
             return
@@ -183,7 +179,7 @@ class Forwarder:
     def tick(self, ready: frozenset[str]) -> None:
         """Drop requests past their deadline or without a `ready` replica. Call at 50 Hz."""
         now = self._clock()
-        unready, before = self._dispatchers.keys() - ready, self._unready_since
+        unready, before = self.dispatchers.keys() - ready, self._unready_since
         self._ready, self._unready_since = ready, {n: before.get(n, now) for n in unready}
         hopeless = {n for n, since in self._unready_since.items() if now - since >= UNREADY_S}
         with self._lock:

@@ -105,7 +105,7 @@ class _Gateway:
             wake=wake,
             poisoned=self._forwarder.poisoned,
         )
-        self._forwarder.use(spec.name, dispatcher)
+        self._forwarder.dispatchers[spec.name] = dispatcher
         return dispatcher
 
     def _listen(self) -> None:

@@ -12,6 +12,7 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from functools import partial
 
 from fogft.byte_limit import SharedByteLimit
@@ -74,21 +75,19 @@ class _ActionServer:
         return sum(known.holds(now) for known in self.open.values())
 
 
+@dataclass(eq=False)
 class GoalsOnce:
     """Forwards new goals; remembers the last `accepted_kept` of each action."""
 
     outstanding = OUTSTANDING  # goals that an action server is given at once
     accepted_kept = 16_384  # of each action, 200 bytes each; the oldest go first
 
-    def __init__(
-        self,
-        services: Collection[str],
-        is_ready: Callable[[str], bool],
-        clock: Callable[[], float],
-    ) -> None:
-        self._servers = {service: _ActionServer() for service in services}
-        self._is_ready = is_ready
-        self._clock = clock
+    services: Collection[str]
+    is_ready: Callable[[str], bool]
+    clock: Callable[[], float]
+
+    def __post_init__(self) -> None:
+        self._servers = {service: _ActionServer() for service in self.services}
         self._lock = threading.Lock()
         self._clients: Mapping[str, RosClient] = {}
 
@@ -121,7 +120,7 @@ class GoalsOnce:
                 known = server.open.get(goal)
                 if known is None:
                     known = server.open[goal] = _Open(goal, incoming.robot, incoming.payload)
-                known.waiting.append((self._clock() + incoming.remaining_s, incoming))
+                known.waiting.append((self.clock() + incoming.remaining_s, incoming))
         if answer is not None:
             incoming.reply(answer)
         elif reason is not None:
@@ -134,7 +133,7 @@ class GoalsOnce:
     ) -> Refusal | None:
         if incoming.remaining_s <= 0:
             return Refusal.EXPIRED
-        if not self._is_ready(incoming.service) or incoming.service not in self._clients:
+        if not self.is_ready(incoming.service) or incoming.service not in self._clients:
             return Refusal.NOT_READY
         large = SharedByteLimit(_BYTES_LIMIT)
         for other in self._servers.values():
@@ -155,40 +154,39 @@ class GoalsOnce:
         server = self._servers[service]
         while True:
             with self._lock:
-                now, known = self._clock(), server.next()
+                now, known = self.clock(), server.next()
                 if known is None or server.at_work(now) >= self.outstanding:
                     return
-                goal, known.begun_at, server.served[known.robot] = known.goal, now, now
+                known.begun_at = server.served[known.robot] = now
                 payload, known.payload = known.payload, b""
                 client = self._clients.get(service)  # of this life: after a crash it is sent anew
             if client is None:
-                self._drop(service, goal, known, Refusal.NOT_READY)
+                self._drop(service, known, Refusal.NOT_READY)
                 continue
             try:
-                answered = partial(self._answered, service, goal, known)
-                known.ticket = client.call(payload, answered)
+                known.ticket = client.call(payload, partial(self._answered, service, known))
             except RosError as error:
                 log.warning("goal_not_passed_on service=%s reason=%r", service, str(error))
                 hopeless = isinstance(error, Unreadable)
                 reason = Refusal.MALFORMED if hopeless else Refusal.OVERLOADED
-                self._drop(service, goal, known, reason)
+                self._drop(service, known, reason)
 
-    def _drop(self, service: str, goal: bytes, known: _Open, reason: Refusal) -> None:
+    def _drop(self, service: str, known: _Open, reason: Refusal) -> None:
         """Forget a goal that the action server was not given after all."""
         with self._lock:
-            if self._servers[service].open.get(goal) is known:
-                del self._servers[service].open[goal]
+            if self._servers[service].open.get(known.goal) is known:
+                del self._servers[service].open[known.goal]
         self._refuse(service, (known,), reason)
 
-    def _answered(self, service: str, goal: bytes, known: _Open, answer: bytes) -> None:
+    def _answered(self, service: str, known: _Open, answer: bytes) -> None:
         server = self._servers[service]
         with self._lock:
-            if server.open.get(goal) is not known:  # the action server has died since
+            if server.open.get(known.goal) is not known:  # the action server has died since
                 return
-            del server.open[goal]
+            del server.open[known.goal]
             lost = self._overtaken(server, known)
             if goals.is_success(Part.GOAL, answer):
-                server.accepted[goal] = answer
+                server.accepted[known.goal] = answer
                 if len(server.accepted) > self.accepted_kept:
                     server.accepted.popitem(last=False)
         try:
@@ -204,7 +202,7 @@ class GoalsOnce:
         One that was silent for long was given more than its queue holds, which then loses the
         oldest. It answers in order: what it was given before that, it has lost.
         """
-        now, by_at = self._clock(), by.begun_at or 0.0
+        now, by_at = self.clock(), by.begun_at or 0.0
         lost = [
             goal
             for goal, known in server.open.items()
@@ -217,7 +215,7 @@ class GoalsOnce:
 
     def tick(self) -> None:
         """Refuse copies past their deadline. Call at about 10 Hz."""
-        now = self._clock()
+        now = self.clock()
         late: list[Incoming] = []
         with self._lock:
             for server in self._servers.values():
@@ -233,7 +231,7 @@ class GoalsOnce:
 
     def crashed(self, service: str = "") -> None:
         """Note that a service, or the whole command, died: its action has lost all goals."""
-        action, now = service.rpartition("/")[0], self._clock()
+        action, now = service.rpartition("/")[0], self.clock()
         for name, server in self._servers.items():
             if not service or name.rpartition("/")[0] == action:
                 with self._lock:

@@ -159,10 +159,9 @@ class Following:
 
     def _reached(self, membership: Membership) -> tuple[Member, ...]:
         door = self.door
-        dialling = [m for m in membership.members if not m.endpoint]
         if door is None:
             return tuple(m for m in membership.members if m.endpoint)
-        door.keep([m.id for m in dialling])
+        door.keep([m.id for m in membership.members if not m.endpoint])
         return tuple(
             m if m.endpoint else replace(m, endpoint=door.local(m.id)) for m in membership.members
         )

@@ -34,7 +34,7 @@ class Scene:
             clock=self.clock,
             poisoned=self.forwarder.poisoned,
         )
-        self.forwarder.use("/s", self.dispatcher)
+        self.forwarder.dispatchers["/s"] = self.dispatcher
         self.links = [FakeLink(0), FakeLink(1)]
         for link in self.links:
             link.ready = READY
@@ -228,7 +228,7 @@ def test_its_numbers_are_told_while_the_first_are_refused(scene):
     for number in range(30):
         forwarder = Forwarder()
         forwarder.tick(READY)
-        forwarder.use("/s", scene.dispatcher)
+        forwarder.dispatchers["/s"] = scene.dispatcher
         asked = [
             FakeIncoming(b"0" * 16, remaining_s=0.0),
             FakeIncoming(b"1" * 16, service="/unknown"),
