@@ -120,10 +120,8 @@ def revoke(
     if told:
         output.done(f"{role} {listed} {are} revoked")
     else:
-        output.warn(
-            f"{role} {listed} {are} revoked, but no manager is running to tell the other members"
-        )
-        output.hint("start one with `fogft up`")
+        output.warn(f"{role} {listed} {are} revoked, but no manager has told the other members yet")
+        output.hint("see `fogft status`: whether one runs, and how to start one")
 
 
 @credentials.command(cls=Command, epilog="fogft credentials rotate robot")
@@ -148,6 +146,8 @@ def rotate(
         if name and not name.isdecimal():
             raise FogftError(f"`{name}` is not a slot", "see `fogft status`")
         replaced = rotate_replicas(store, int(name) if name else None)
+        if not replaced:
+            raise FogftError(f"`{store.name}` has no replica to replace", "see `fogft status`")
         listed = ", ".join(f"`{one}`" for one in replaced)
         output.done(f"{listed} will be replaced, each with a new key; see `fogft status`")
         return
@@ -161,7 +161,7 @@ def rotate(
     if not in_use:
         new = f"robot `{holder.short}` has a new certificate"
         output.warn(f"{new}, but its client proxy does not use it yet")
-        listed = " ".join(h.short for h in old)
+        listed = f"` and `fogft credentials revoke {role} ".join(h.short for h in old)
         output.hint(
             "the old one stays valid; once the new one is in use, run `fogft "
             f"credentials revoke robot {listed}`"
@@ -289,7 +289,8 @@ def _read_passphrase(file: Path | None) -> str:
     if file is not None:
         try:
             text = sys.stdin.readline() if str(file) == "-" else file.read_text()
-        except (OSError, UnicodeDecodeError):
+            text.encode()  # stdin lets through what is no text in this locale
+        except (OSError, UnicodeError):
             raise FogftError(f"the passphrase file `{file}` cannot be read") from None
         found = text.splitlines()[0].strip() if text.strip() else ""
         if not found:

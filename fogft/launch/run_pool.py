@@ -5,13 +5,18 @@ signal it ends, and with `--down` it ends the pool first.
 """
 
 import argparse
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from fogft.child import tied
+from fogft.errors import FogftError
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import read_identity
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 READY = "fogft_pool_ready"  # a line of stdout, for the launch file
@@ -38,9 +43,16 @@ def main(arguments: Sequence[str]) -> int:
     finally:
         for number in _ENDING:
             signal.signal(number, signal.SIG_IGN)  # launch repeats itself; `down` takes its time
-        if asked.down:
+        if asked.down and _is_ours(asked):
             status = _fogft("down", asked.pool, "--yes").wait()
     return status
+
+
+def _is_ours(asked: argparse.Namespace) -> bool:
+    """Whether the pool was started from this file: else its `up` was refused, and it goes on."""
+    with contextlib.suppress(FogftError):
+        return read_identity(PoolPaths.of(asked.pool)).file == str(Path(asked.file).resolve())
+    return False
 
 
 def _run(asked: argparse.Namespace) -> int:

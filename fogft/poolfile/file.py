@@ -15,7 +15,7 @@ MAX_BYTES = 1 << 20
 
 def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
     """Return the spec in a pool file. Its `workdir`, relative to its own folder, must exist."""
-    return parse(read_text(path), str(path), checks, Path(path).parent)
+    return parse(read_text(path), str(path), checks, Path(path).resolve().parent)
 
 
 def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
@@ -23,7 +23,7 @@ def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
 
     What depends on something that is wrong is not judged: that may still be wrong then.
     """
-    checks = replace(checks, workdir=partial(_no_folder, path.parent))
+    checks = replace(checks, workdir=partial(_no_folder, path.resolve().parent))
     found = Mistakes(keep=True)
     with found.step():
         pool_spec(yaml_tree.tree(read_text(path), str(path)), str(path), checks, found)

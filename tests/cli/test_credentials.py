@@ -35,7 +35,7 @@ fogft: {services: [{name: /s, type: std_srvs/srv/SetBool}]}
 
 @pytest.fixture
 def paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PoolPaths:
-    """A pool no manager is running, in a home of its own."""
+    """A pool no manager has told, in a home of its own."""
     monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(bundle.SCRYPT, "n", 2)

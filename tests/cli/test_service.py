@@ -130,6 +130,12 @@ def test_units_of_a_gateway_and_of_the_machine(tmp_path, monkeypatch):
     assert f'gateway --config "{tmp_path}/edge 1%%.yaml"\n' in unit.text
     assert "User=root\n" in unit.text
     assert "WantedBy=multi-user.target\n" in unit.text
+    joined = [tmp_path / f"{pool}.gateway.edge" / "gateway.yaml" for pool in ("one", "two")]
+    for config in joined:
+        config.parent.mkdir()
+        config.write_text("")
+    names = [service.of_part("gateway", config, system=True)[0].name for config in joined]
+    assert names == [f"fogft-gateway-{pool}.gateway.edge.service" for pool in ("one", "two")]
 
 
 @needs("systemd")

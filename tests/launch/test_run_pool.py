@@ -12,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from fogft.launch.run_pool import READY
+from fogft.pool.folder.paths import PoolPaths
+from fogft.pool.folder.store import Identity, write_identity
 
 # Stands in for `python -m fogft`: notes its words, and behaves as FAKE_UP says.
 FAKE = """
@@ -33,15 +35,20 @@ def run_pool(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
     package = tmp_path / "site" / "fogft"
     package.mkdir(parents=True)
     root = Path(__file__).parents[2] / "fogft"
-    for name in ("launch", "child.py", "__init__.py"):
-        (package / name).symlink_to(root / name)
+    for path in root.iterdir():
+        if path.name != "__main__.py":
+            (package / path.name).symlink_to(path)
     (package / "__main__.py").write_text(FAKE)
     started: list[subprocess.Popen[str]] = []
 
-    def start(*options: str, up: str = "0") -> subprocess.Popen[str]:
+    def start(*options: str, up: str = "0", of: str = "f.yaml") -> subprocess.Popen[str]:
+        identity = Identity("p", "0123456789abcdef", "local", str(tmp_path / of), 1.0)
+        paths = PoolPaths.of("p", tmp_path / "home")
+        paths.folder.mkdir(parents=True)
+        write_identity(paths, identity)
         environ = {
             **os.environ, "PYTHONPATH": str(tmp_path / "site"), "FAKE_UP": up,
-            "TRACE": str(tmp_path / "trace"),
+            "TRACE": str(tmp_path / "trace"), "FOGFT_HOME": str(tmp_path / "home"),
         }  # fmt: skip
         words = [sys.executable, "-m", "fogft.launch.run_pool", "f.yaml", "--pool", "p", *options]
         child = subprocess.Popen(
@@ -70,6 +77,12 @@ def test_up_then_one_line_then_the_logs(run_pool, tmp_path: Path) -> None:
         "up f.yaml --yes --cloud local --timeout 9",
         "logs --follow --lines 0 --pool p",
     ]
+
+
+def test_a_pool_that_another_file_has_started_goes_on(run_pool, tmp_path: Path) -> None:
+    """Its `up` was refused: this launch file has started nothing."""
+    assert run_pool("--down", up="1", of="other.yaml").wait(20) == 1
+    assert trace(tmp_path) == ["up f.yaml --yes"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -28,7 +28,7 @@ def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
     cloud = make_cloud(cloud_named_by(spec, text, file))
     if not isinstance(cloud, RealCloud):
         raise SpecError(f"`{file}` names no real cloud", "the local cloud needs no image")
-    task = with_build(absolute(spec.task, file.parent.resolve()))
+    task = with_build(absolute(spec.task, file.resolve().parent))
     named = {str(one.get("image_id", "")) for _, one in alternatives(task.get("resources") or {})}
     images = sorted(one.removeprefix(_DOCKER) for one in named if one.startswith(_DOCKER))
     if base is None:

@@ -161,14 +161,17 @@ def join(
                 claim(holder, token, endpoints, credentials)
         pool = "".join(c for c in label.pool if c.isalnum() or c == "-")
         folder = root / "joined" / f"{pool}.{holder.role.value}.{holder.name}"
+        of_role = f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml"
+        there = disk.read_bytes(folder / of_role)
+        if there is not None and holder.pool_uid.encode() not in there:  # of another pool's
+            folder = folder.with_name(f"{folder.name}.{holder.pool_uid}")
         for name, text in files.items():
             place = folder / name
             disk.make_folder(place.parent)
             disk.write_whole(place, text)
     destroy(file)
-    config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
     alone = not endpoints and holder.role is not Role.RENDEZVOUS
-    return Joined(holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
+    return Joined(holder, folder / of_role, _COMMANDS.get(holder.role, "proxy"), alone)
 
 
 @contextlib.contextmanager

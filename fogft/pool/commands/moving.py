@@ -59,6 +59,8 @@ def export(
     bundle.check_passphrase(passphrase)
     if file.exists():
         raise FogftError(f"`{file}` exists", "choose another name")
+    if not os.access(file.parent, os.W_OK | os.X_OK):
+        raise FogftError(f"`{file.parent}` is no folder to write to", "choose another")
     unfinished = file.with_name(f"{file.name}.unfinished")
     paths = store.paths
     with disk.locked(paths.intent_lock):

@@ -47,7 +47,8 @@ class Awaited:
         if self.is_updating(seen) and not is_last:
             hopeless = seen.status.applied == self.digest and keeps_ending(seen)
             return Outcome.RUN_KEEPS_ENDING if hopeless else Outcome.PENDING
-        if seen.status.update is not None and seen.status.update.fault:
+        update, is_new = seen.status.update, seen.status.observed_at >= self.since
+        if is_new and update is not None and update.fault:
             return Outcome.WITHDRAWN
         if self.is_answering(seen):
             return Outcome.ANSWERING
@@ -55,8 +56,7 @@ class Awaited:
             return Outcome.TYPES_DIFFER
         if keeps_ending(seen) and seen.status.observed_at >= self.since + AGAIN_S:
             return Outcome.RUN_KEEPS_ENDING
-        given_up = is_given_up(seen) and seen.status.observed_at >= self.since
-        return Outcome.NEVER_READY if given_up else Outcome.PENDING
+        return Outcome.NEVER_READY if is_given_up(seen) and is_new else Outcome.PENDING
 
     def is_updating(self, seen: Seen) -> bool:
         """Whether the awaited update is still in progress."""
@@ -81,7 +81,7 @@ class Awaited:
 
 @dataclass(frozen=True)
 class Settled:
-    """What `scale` and `drain` wait for: all replicas ready, none draining, no `gone` there."""
+    """What `scale` and `drain` wait for: all ready, none draining, and none of or before `gone`."""
 
     since: float
     gone: tuple[int, int] | None = None
@@ -93,7 +93,8 @@ class Settled:
         draining = [
             one
             for one in status.replicas
-            if one.phase == Phase.DRAINING.value or (one.slot, one.generation) == self.gone
+            if one.phase == Phase.DRAINING.value
+            or (self.gone and one.slot == self.gone[0] and one.generation <= self.gone[1])
         ]
         if status.observed_at < self.since or draining or status.ready < status.target:
             return Outcome.PENDING

@@ -68,7 +68,7 @@ def plan_file(
     in place of a cloud. Offline no distance is measured; `told` hears of what takes long.
     """
     source = read_text(file)
-    spec = parse(source, file=str(file), folder=file.parent)
+    spec = parse(source, file=str(file), folder=file.resolve().parent)
     seller: Seller
     if prices is not None:
         name, seller = str(prices), PriceTable(prices)

@@ -83,7 +83,7 @@ def order(
     takes long.
     """
     source = pool_file.read_text(file)
-    spec = pool_file.parse(source, str(file), checks_here(), file.parent)
+    spec = pool_file.parse(source, str(file), checks_here(), file.resolve().parent)
     cloud_name = cloud or cloud_named_by(spec, source, file)
     concrete = make_cloud(cloud_name)
     store = make_store(spec.name)
@@ -217,7 +217,7 @@ def mistakes(file: Path) -> list[SpecError]:
         return found
     try:
         source = pool_file.read_text(file)
-        spec = pool_file.parse(source, str(file), checks, file.parent)
+        spec = pool_file.parse(source, str(file), checks, file.resolve().parent)
         if cloud_named_by(spec, source, file) == LOCAL:
             make_cloud(LOCAL).offers(spec.task.get("resources") or {})
     except SpecError as error:

@@ -104,7 +104,8 @@ def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
         raise StateError(f"there is no `{config}`", "`fogft join` writes it")
     words = (command, "--config", str(config))
     environment = config.with_suffix(".env")
-    name = f"fogft-{command}-{config.stem}.service"
+    of = config.parent.name if config.stem == command else config.stem  # as `join` names them
+    name = f"fogft-{command}-{of}.service"
     return [_unit(name, words, config, environment, system=system)]
 
 

@@ -77,7 +77,8 @@ class ManagerRestart:
         self._wait_s = LOOK_S if ran_s > STEADY_S else min(2 * self._wait_s, BACKOFF_LIMIT_S)
         self._look_at, self._started_at = now + self._wait_s, now
         try:
-            self.child = detached(command, log_path, folder=folder, environ=self._environ)
+            here = folder if folder.is_dir() else self._folder  # where `up` was, if still there
+            self.child = detached(command, log_path, folder=here, environ=self._environ)
         except OSError as error:
             raise StateError(f"the manager cannot be restarted: {error}") from error
         log.warning("manager_started_again pid=%d", self.child.pid)

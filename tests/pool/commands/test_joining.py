@@ -80,6 +80,19 @@ def test_a_robot_joins_from_one_file(file: Path, tmp_path: Path) -> None:
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
 
 
+def test_another_pool_of_the_same_name_joins_beside_it(
+    file: Path, store: PoolStore, tmp_path: Path
+) -> None:
+    """Its proxy may run from what is there."""
+    first = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    written = first.config.read_text()
+    first.config.write_text(written.replace(UID, "f" * 16))
+    file.write_bytes(issued(store, Role.ROBOT, "ada"))
+    second = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    assert second.config.parent.name == f"{first.config.parent.name}.{UID}"
+    assert first.config.read_text() == written.replace(UID, "f" * 16)
+
+
 def test_a_replica_by_hand_joins_too(tmp_path: Path) -> None:
     """In a slot that the manager leaves alone; it dials the robot."""
     store = store_of(replace(SPEC, dial_in="ada.example:7460"), tmp_path)

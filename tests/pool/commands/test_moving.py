@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import threading
 
 import pytest
@@ -111,14 +112,14 @@ def test_a_join_bundle_moves_no_pool(made, tmp_path):
         moving.import_(bundle, SECRET, tmp_path / "new", NOW)
 
 
-def test_a_pool_whose_file_cannot_be_written_stays(made, tmp_path, monkeypatch):
-    """It is managed here as before: its manager is started again."""
+def test_a_folder_that_cannot_be_written_to_ends_no_manager(made, tmp_path, monkeypatch):
     store, _ = made
-    started = []
+    started, told = [], []
     monkeypatch.setattr(moving.startup, "start_manager", started.append)
-    with pytest.raises(FogftError, match="cannot be written"):
-        export(store, tmp_path / "no folder" / "planner.pool")
-    assert started == [store]
+    place = tmp_path / "no folder" / "planner.pool"
+    with pytest.raises(FogftError, match="is no folder to write to"):
+        moving.export(store, tmp_path, place, SECRET, NOW, open_for_s=60, told=told.append)
+    assert started == told == []
     assert store.identity().name == "planner"
 
 
@@ -135,7 +136,7 @@ def test_a_pool_without_its_credentials_stays(made, monkeypatch):
     assert store.identity()
 
 
-@pytest.mark.parametrize("where", ["interrupted", "no folder", "exported"])
+@pytest.mark.parametrize("where", ["interrupted", "full disk", "exported"])
 def test_an_export_that_ends_early_starts_the_manager_again_or_keeps_the_file(
     made, tmp_path, monkeypatch, where
 ):
@@ -149,9 +150,8 @@ def test_an_export_that_ends_early_starts_the_manager_again_or_keeps_the_file(
 
     if where == "interrupted":
         monkeypatch.setattr(moving.bundle, "seal", interrupted)
-    elif where == "no folder":
-        file.write_text("a file")
-        file = file / "planner.pool"
+    elif where == "full disk":
+        monkeypatch.setattr(moving.disk, "write_whole", full_disk)
     else:
         monkeypatch.setattr(moving.shutdown, "without_orders", interrupting_at_its_end)
     with pytest.raises((KeyboardInterrupt, FogftError)):
@@ -165,6 +165,10 @@ def test_an_export_that_ends_early_starts_the_manager_again_or_keeps_the_file(
         assert store.identity().name == "planner"
         with contextlib.suppress(NotADirectoryError):
             assert not unfinished.exists()
+
+
+def full_disk(path, *_):
+    raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
 
 @contextlib.contextmanager

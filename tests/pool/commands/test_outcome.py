@@ -91,6 +91,7 @@ def test_services_that_are_discovered_are_answered_once_there_are_some():
         (updated(UpdateState.IN_PROGRESS), Outcome.PENDING),
         (updated(UpdateState.STOPPED, fault="why"), Outcome.PENDING),
         (updated(UpdateState.ROLLED_BACK, fault="why"), Outcome.WITHDRAWN),
+        (updated(UpdateState.ROLLED_BACK, fault="why", observed_at=9.0), Outcome.PENDING),
         (updated(None), Outcome.ANSWERING),
         (updated(None, applied="old", replicas=(HOPELESS,)), Outcome.PENDING),
         (updated(UpdateState.IN_PROGRESS, replicas=(HOPELESS,)), Outcome.RUN_KEEPS_ENDING),
@@ -131,3 +132,5 @@ def test_a_drain_is_done_once_the_replica_is_gone():
     assert drained.outcome(Seen(UP, 0.1, True)) is Outcome.PENDING
     assert drained.outcome(Seen(both, 0.1, True)) is Outcome.PENDING
     assert drained.outcome(Seen(new, 0.1, True)) is Outcome.ANSWERING
+    booting = Settled(APPLIED_AT, gone=(0, 2))  # the one that was to replace it
+    assert booting.outcome(Seen(UP, 0.1, True)) is Outcome.PENDING

@@ -58,6 +58,14 @@ def test_a_missing_manager_is_started_as_it_was_and_again_less_and_less_often(sc
     assert scene.paths.manager_log.read_text().splitlines()[0] == f"said {os.getcwd()}"
 
 
+def test_one_whose_folder_is_gone_is_started_in_the_pools(scene, tmp_path):
+    told = disk.read_json(scene.paths.manager_start)
+    disk.write_json(scene.paths.manager_start, told | {"folder": str(tmp_path / "gone")})
+    assert scene.looks(2)
+    assert scene.restart.child.wait(20) == 0
+    assert scene.paths.manager_log.read_text() == f"said {tmp_path}\n"
+
+
 @pytest.mark.parametrize("held", ["manager_lock", "intent_lock"])
 def test_one_that_lives_or_a_pool_that_is_being_ended_is_let_be(scene, held):
     with disk.locked(getattr(scene.paths, held)):
