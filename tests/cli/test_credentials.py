@@ -35,7 +35,7 @@ fogft: {services: [{name: /s, type: std_srvs/srv/SetBool}]}
 
 @pytest.fixture
 def paths(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> PoolPaths:
-    """A pool no manager has told, in a home of its own."""
+    """A pool no manager is running for, in a home of its own."""
     monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(bundle.SCRYPT, "n", 2)
@@ -143,7 +143,7 @@ def nothing_used(_root, _label):
 def test_the_list_shows_states_and_no_key(paths, capsys):
     passphrase = issue_ada(capsys)
     assert run("credentials", "revoke", "robot", "ada") == 0
-    assert "no manager is running" in capsys.readouterr().err
+    assert "no manager has told" in capsys.readouterr().err
     assert run("credentials", "issue", "robot", "ada", "--out", "again.join") == 0
     capsys.readouterr()
     assert run("credentials", "list") == 0

@@ -189,6 +189,19 @@ def test_the_rate_is_that_of_the_last_seconds_and_what_goes_nowhere_is_counted()
     assert world.robot.report()["/to"]["rate_hz"] == 0.0
 
 
+def test_what_a_replica_no_longer_has_is_counted_as_dropped():
+    world = World(replace(BACK, depth=1))
+    for said in ((b"1",), (b"2", b"3", b"4")):
+        world.carry()
+        world.carry()
+        for message in said:
+            world.nodes[0].heard["/back"](message)
+    world.carry()
+    world.carry()
+    assert world.robot_node.published["/back"] == [b"1", b"2", b"4"]
+    assert world.robot.report()["/back"]["dropped"] == 1
+
+
 @pytest.mark.parametrize("seed", range(by_day(6, at_night=200)))
 def test_every_message_of_a_replica_comes_back_once_and_in_order(seed):
     source = random.Random(seed)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from fogft.link.dial_out.replica import WAITING, DialOut
-from fogft.link.dial_out.robot import PURPOSE, DialIn
+from fogft.link.dial_out.robot import PURPOSE, SIGN, DialIn
 from fogft.model.credentials import CredentialPaths
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.records import frames
@@ -231,6 +231,16 @@ def test_a_replica_that_takes_no_part_after_greeting_is_dropped(authority, door)
         wait_for(lambda: door.waiting().get(ID) == 1)
         wait_for(lambda: not door.waiting())
         assert link.fileno() >= 0
+
+
+def test_one_that_sends_nothing_but_signs_of_life_is_dropped(authority, door):
+    """It would keep the robot busy for ever."""
+    with hostile.greet(door.endpoint, authority.replica()) as link:
+        wait_for(lambda: door.waiting().get(ID) == 1)
+        with contextlib.suppress(OSError):
+            while True:
+                link.sendall(SIGN * 1000)
+        wait_for(lambda: not door.waiting())
 
 
 def test_a_replica_survives_whatever_answers_at_a_door(authority, dial_out, caplog):

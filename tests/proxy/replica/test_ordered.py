@@ -146,6 +146,18 @@ def test_a_service_is_given_nothing_until_it_has_found_us(scene):
     assert scene.serve(1, b"a1") == b"q1"
 
 
+def test_whoever_repeats_an_order_is_held_without_its_bytes(scene):
+    scene.run()
+    scene.dispatcher.submit(b"q1", "h1")
+    [order] = [one for one in scene.links[0].offered if decode(one[1])[0] is Op.APPLY]
+    copies = [Incoming(scene, scene.links[0], order[1], bytes(1 << 20)) for _ in range(3)]
+    scene.run()
+    for copy in copies:
+        scene.responders[0].request(copy)
+    assert [copy.payload for copy in copies] == [b"", b"", b""]
+    assert scene.serve(0, b"a1") == b"q1"
+
+
 def test_a_service_is_given_one_request_at_a_time(scene):
     scene.run()
     for i in range(5):

@@ -431,6 +431,14 @@ def test_clients_that_are_gone_are_forgotten():
     assert len(pace.clients) <= 64
 
 
+def test_of_many_clients_none_is_forgotten_that_asked_just_now():
+    """Its account would begin anew, and it would get more than it keeps."""
+    pace = Pace()
+    for n in range(100):
+        pace.client(handle(n, 0), 0.01 * n).requested(0.01 * n)
+    assert len(pace.clients) == 100
+
+
 def test_a_response_to_a_client_that_is_not_found_yet_is_sent_again():
     """Once and no more, when discovery has told the way to it; others are not held up."""
     sent: list[bytes] = []

@@ -6,6 +6,7 @@ import threading
 import zlib
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -221,6 +222,26 @@ def test_a_packed_answer_is_unpacked_where_it_was_asked_for() -> None:
         request_id(1): (b"answer", None),
         request_id(2): (None, Refusal.MALFORMED),
     }
+    scene.close()
+
+
+def test_a_large_answer_keeps_the_thread_of_all_links_for_no_longer_than_a_small_one() -> None:
+    """Whoever takes it looks at all of it, which may take seconds."""
+    scene, taken = Scene(), threading.Event()
+
+    def slow(answer: Answer) -> None:
+        if len(answer.payload or b"") > 100:
+            taken.wait(60.0)
+        scene.answers.append(answer)
+
+    scene.attempts.tell = replace(scene.attempts.tell, answered=slow)
+    for number, size in ((1, 2 << 20), (2, 10)):
+        assert scene.attempts.offer(SERVICE, request_id(number), b"x", 60.0)
+        scene.attempts.heard(b"once", [Answer(request_id(number), bytes(size))])
+    assert [one.request_id for one in scene.answers] == [request_id(2)]
+    taken.set()
+    wait_for(lambda: len(scene.answers) == 2)
+    assert len(scene.answers[1].payload) == 2 << 20
     scene.close()
 
 
