@@ -162,7 +162,7 @@ class FogPool(Action):  # type: ignore[misc]
 def _tree(asked: Mapping[str, Any], nodes: Sequence[NodeCommand]) -> dict[str, Any]:
     base: Any = {}
     if asked["file"]:
-        file = Path(asked["file"]).absolute()
+        file = Path(asked["file"]).resolve()
         base = yaml.safe_load(_text_of(str(file)))
         if not isinstance(base, dict):
             raise FogftError(f"`{file}` is not a pool file", "see `fogft init`")

@@ -5,7 +5,6 @@ signal it ends, and with `--down` it ends the pool first.
 """
 
 import argparse
-import contextlib
 import os
 import signal
 import subprocess
@@ -14,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fogft.child import tied
-from fogft.errors import FogftError
+from fogft.errors import FogftError, StateError
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
 
@@ -50,9 +49,12 @@ def main(arguments: Sequence[str]) -> int:
 
 def _is_ours(asked: argparse.Namespace) -> bool:
     """Whether the pool was started from this file: else its `up` was refused, and it goes on."""
-    with contextlib.suppress(FogftError):
+    try:
         return read_identity(PoolPaths.of(asked.pool)).file == str(Path(asked.file).resolve())
-    return False
+    except StateError:
+        return True  # `down` says what is wrong
+    except FogftError:
+        return False
 
 
 def _run(asked: argparse.Namespace) -> int:

@@ -57,6 +57,7 @@ class Sequencer:
         self._unanswered: dict[int, None] = {}
         # Number -> replica -> how often its service died over it; 0 where it may have been applied.
         self._deaths: dict[int, dict[int, int]] = {}
+        self._applied_to = 0  # by somebody: no request up to it may become one without effect
         self._replicas = CatchingUp(epoch, self._counts, handed_over=begin is not None)
         self._peers = self._replicas.peers
         self.log = self._replicas.log  # the numbered requests; empty until the term has begun
@@ -196,7 +197,9 @@ class Sequencer:
 
     def _applied(self, replica: int, index: int) -> bool:
         """A replica says that it has applied a number. Return whether that answers it."""
-        self._deaths.pop(index, None)
+        self._applied_to = max(self._applied_to, index)
+        for known in [n for n in self._deaths if n <= self._applied_to]:
+            del self._deaths[known]
         first = index in self._unanswered and self._counts(replica)
         if first:
             del self._unanswered[index]
@@ -272,7 +275,7 @@ class Sequencer:
         if op is Op.SNAPSHOT:
             self._gave_no_checkpoint(replica)
             self._replicas.bring_all(waited=True)
-        if op is Op.APPLY and reason is Refusal.LOST and self.log.start < index:
+        if op is Op.APPLY and reason is Refusal.LOST and self._applied_to < index:
             self._deaths.setdefault(index, {})[replica] = 0
         if peer is None or op is Op.SNAPSHOT:
             return False
@@ -295,12 +298,14 @@ class Sequencer:
 
     def _kills(self, replica: int, peer: Peer, index: int) -> bool:
         """Empty a request over which every service has died, and not by chance once."""
-        if index != peer.acked + 1 or index <= self.log.start:
+        if index != peer.acked + 1 or index <= max(self.log.start, self._applied_to):
             return False
         deaths = self._deaths.setdefault(index, {})
         deaths[replica] = deaths.get(replica, 0) + 1
         if not all(deaths.values()) or sum(deaths.values()) < 2 or self._peers.keys() - deaths:
             return False
+        if any(index in other.open for other in self._peers.values() if other is not peer):
+            return False  # it is at work on it again
         self.log.empty(index)
         return True
 

@@ -113,7 +113,8 @@ class Buyer:
         """Whether one more machine of a market may be had within this hour; a note if not."""
         had = within_an_hour(self.history, self.observed.now, on_demand=on_demand)
         planned = sum(x.offer.placement.spot is not on_demand for x in self.launches)
-        most = LAUNCHES_AN_HOUR * max(1, self.sized.total)
+        usual = sum(group.replicas for group in self.groups)  # had before it was scaled down
+        most = LAUNCHES_AN_HOUR * max(1, usual, self.sized.total)
         if len(had) + planned < most:
             return True
         self.notes.append(Reason(Cause.LAUNCH_LIMIT, count=most))

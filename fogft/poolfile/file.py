@@ -23,10 +23,11 @@ def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
 
     What depends on something that is wrong is not judged: that may still be wrong then.
     """
-    checks = replace(checks, workdir=partial(_no_folder, path.resolve().parent))
     found = Mistakes(keep=True)
     with found.step():
-        pool_spec(yaml_tree.tree(read_text(path), str(path)), str(path), checks, found)
+        source = read_text(path)
+        checks = replace(checks, workdir=partial(_no_folder, path.resolve().parent))
+        pool_spec(yaml_tree.tree(source, str(path)), str(path), checks, found)
     return sorted(found.found, key=lambda error: error.line)
 
 

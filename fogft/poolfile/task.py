@@ -93,5 +93,5 @@ def _envs(envs: Section) -> None:
                 "use letters, digits and `_`, and begin with no digit",
                 at_key=True,
             )
-        if node.value is None or isinstance(node.value, (tuple, dict, bool)):
+        if node.value is None or isinstance(node.value, (tuple, dict)):
             raise envs.error(key, "must have a text as its value", f'write `{key}: "..."`')

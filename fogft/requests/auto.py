@@ -13,7 +13,7 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import NEVER, Demand, Load
+from fogft.requests.load import NEVER, SLOW, Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
@@ -100,7 +100,7 @@ class Auto(Learning):
         quick = self._quick(able, now) if now < self._slow_until and not self._busy else able
         best = self._best(request, quick, now)
         known = self._replicas[best]
-        self._busy = self._demand.rate * known.service_s > _BUSY * len(able)
+        self._busy = known.slots <= 1 and self._demand.rate * known.service_s > _BUSY * len(able)
         self._spares.request(known.service_s, len(able), now)
         if self._spares.open and not known.free(now):
             self._spares.made_wait(_WAIT * known.service_s)
@@ -130,9 +130,12 @@ class Auto(Learning):
         return known.free(now) or (known.doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S)
 
     def _quick(self, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return those that are not slow just now, if one of them is free; else all."""
-        quick = [replica for replica in able if now >= self._replicas[replica].slow_until]
-        return quick if any(self._replicas[replica].free(now) for replica in quick) else able
+        """Return those that are sound, and not slow just now, if one of them is free; else all."""
+        known = self._replicas
+        sound = [r for r in able if not known[r].avoided(now)]
+        most_s = SLOW * min((known[r].alone_s for r in sound if known[r].told), default=0.0)
+        quick = [r for r in sound if now >= known[r].slow_until and known[r].alone_s <= most_s]
+        return quick if any(known[r].free(now) for r in quick) else able
 
     def _stale(self, able: Sequence[int], now: float) -> list[int]:
         """Return those of which nothing was heard for long: one spare copy shows how they do."""

@@ -34,7 +34,7 @@ _MANY = 16.0  # requests ahead: behind more, a time tells little of what is unus
 _FULL_OVER_S, _ASKED_OVER_S, _DEMAND_STEP_S = 10.0, 30.0, 0.1
 # How many times as long as usual an answer takes that shows a slow spell, and for how many times
 # that long other replicas are preferred while they are free.
-_SLOW, _SLOW_FOR = 2.5, 5.0
+SLOW, _SLOW_FOR = 2.5, 5.0
 _OFTEN = 0.5  # of the time something waits: there are too few replicas
 _UNANSWERED = 1.15  # times what full ones answer is asked: no chance
 _SILENT_S = 2.0  # without an answer nobody knows whether they are full
@@ -128,7 +128,7 @@ class ReplicaLoad:
         # Our attempts that it has not ended, oldest first: when each began, when it is overdue, and
         # for how much its time counts.
         self.at_work: dict[bytes, tuple[float, float, float]] = {}
-        self._slots = 0
+        self.slots = 0
         self._rtt_s: float | None = None
         self._others = 0  # requests of other robots
         self._others_until = -NEVER
@@ -139,6 +139,11 @@ class ReplicaLoad:
 
     # -- what is believed -----------------------------------------------------------------
 
+    @property
+    def alone_s(self) -> float:
+        """What an answer usually takes where nothing is ahead."""
+        return (self._rtt_s or 0.0) + self.usual_s
+
     def ahead(self, now: float) -> int:
         """Return the estimated number of requests at the replica."""
         return len(self.at_work) + (self._others if now < self._others_until else 0)
@@ -148,7 +153,7 @@ class ReplicaLoad:
         if self.doubted:
             return False
         ahead = self.ahead(now)
-        if ahead < max(1, self._slots):
+        if ahead < max(1, self.slots):
             return True
         if not ahead == len(self.at_work) == 1:
             return False
@@ -161,7 +166,7 @@ class ReplicaLoad:
             return NEVER
         if self.free(now):
             return 0.0
-        return self.service_s * max(1, self.ahead(now) + 1 - max(1, self._slots))
+        return self.service_s * max(1, self.ahead(now) + 1 - max(1, self.slots))
 
     @property
     def oldest_begun(self) -> float:
@@ -237,7 +242,7 @@ class ReplicaLoad:
             seen -= id != request
         there = load.waiting + load.running
         self._others, self._others_until = max(0, there - seen), now + _WORD_HOLDS_S
-        self._slots = load.slots
+        self.slots = load.slots
         self.service_s = load.service_s
         self.told += 1
         gain = max(_USUAL_GAIN, 1.0 / max(1, self.told - NEW))
@@ -256,7 +261,7 @@ class ReplicaLoad:
             return
         begun, _, share = sent
         took_s, alone_s = now - begun, now - max(begun, before)
-        slow = self.told >= NEW and alone_s > _SLOW * ((self._rtt_s or 0.0) + self.usual_s)
+        slow = self.told >= NEW and alone_s > SLOW * self.alone_s
         self.slow_until = now + _SLOW_FOR * alone_s if slow else -NEVER
         if load is not None:
             rtt_s = max(0.0, took_s - load.spent_s)

@@ -159,7 +159,7 @@ def simulate(
         told: Called with how many runs are done, and of how many.
     """
     source = read_text(file)
-    spec = parse(source, file=str(file), folder=file.parent)
+    spec = parse(source, file=str(file), folder=file.resolve().parent)
     chosen = cloud or cloud_named_by(spec, source, file)
     find = remembered(_pricing(make_cloud(chosen).offers, source, file))
     values = read_values(model)

@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from enum import Enum, auto
 
 Numbered = tuple[int, bytes]
-_FEW_BYTES = 1 << 16  # no more is kept beyond `depth`, for robots far away
 _SMALL_BYTES = 1 << 12  # of a message of which many may be under way
 _KNOWN = 64  # numbers of which it is known whether they were published
 _MASK = (1 << _KNOWN) - 1
@@ -32,8 +31,7 @@ class Ring:
         self.last += 1
         self._kept.append((self.last, message))
         self._bytes += len(message)
-        few = self._bytes < _FEW_BYTES and self._depth > 1 and not self._latched
-        while (len(self._kept) > self._depth and not few) or (
+        while len(self._kept) > self._depth or (
             self._bytes > self.kept_bytes and len(self._kept) > 1
         ):
             self._bytes -= len(self._kept.popleft()[1])
@@ -94,8 +92,8 @@ class Outbox:
         """
         if not self._waiting:
             return None
-        small = len(self._waiting[0][1]) <= _SMALL_BYTES
-        if len(self._open) >= (self.window if small else self.window // 4):
+        small = self._depth > 1 and len(self._waiting[0][1]) <= _SMALL_BYTES
+        if len(self._open) >= (self.window if small else max(1, self.window // 4)):
             return None
         if self._open and max(self._open) > self._waiting[0][0]:
             return None

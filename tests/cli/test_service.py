@@ -122,6 +122,21 @@ def test_a_home_in_which_no_unit_can_be_written_is_one_clear_error(
     assert f"error: `{units}` cannot be created: Not a directory" in capsys.readouterr().err
 
 
+def test_a_unit_that_runs_something_else_stays(home, units, tmp_path, monkeypatch, capsys):
+    """`join` calls the configuration of each gateway `gateway.yaml`."""
+    Systemd(tmp_path / "bin", monkeypatch)
+    one, other = [tmp_path / pool / "gateway.yaml" for pool in ("one", "other")]
+    for config in (one, other):
+        config.parent.mkdir()
+        config.touch()
+    assert main.run(["service", "install", "--gateway", str(one)]) == 0
+    text = (units / "fogft-gateway-gateway.service").read_text()
+    assert main.run(["service", "install", "--gateway", str(other)]) == 1
+    assert "`fogft-gateway-gateway.service` runs something else" in capsys.readouterr().err
+    assert (units / "fogft-gateway-gateway.service").read_text() == text
+    assert main.run(["service", "install", "--gateway", str(one)]) == 0
+
+
 def test_units_of_a_gateway_and_of_the_machine(tmp_path, monkeypatch):
     """A part with its own file; units of the machine run as the file's owner."""
     config = tmp_path / "edge 1%.yaml"
@@ -130,12 +145,6 @@ def test_units_of_a_gateway_and_of_the_machine(tmp_path, monkeypatch):
     assert f'gateway --config "{tmp_path}/edge 1%%.yaml"\n' in unit.text
     assert "User=root\n" in unit.text
     assert "WantedBy=multi-user.target\n" in unit.text
-    joined = [tmp_path / f"{pool}.gateway.edge" / "gateway.yaml" for pool in ("one", "two")]
-    for config in joined:
-        config.parent.mkdir()
-        config.write_text("")
-    names = [service.of_part("gateway", config, system=True)[0].name for config in joined]
-    assert names == [f"fogft-gateway-{pool}.gateway.edge.service" for pool in ("one", "two")]
 
 
 @needs("systemd")

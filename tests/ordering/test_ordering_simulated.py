@@ -260,6 +260,29 @@ def test_one_that_a_replica_out_of_reach_may_have_applied_keeps_its_effect():
     assert {host.state for host in world.hosts.values()} == {11}
 
 
+def test_a_request_that_somebody_has_applied_keeps_its_effect_whatever_it_does_to_others():
+    """Its answer is out, then its replica is out of reach, and all others die over it."""
+    world = Poisoned(counter, 0)
+    world.kills = frozenset({1, 2})
+    world.settle()
+    world.ask(0, ("kill", 0))
+    while 0 not in world.working():
+        world.deliver(0)
+    world.work(0)
+    while not world.answers():
+        world.deliver(next(n for n, one in enumerate(world.letters) if not one.to_replica))
+    gone = world.hosts.pop(0)
+    world.reach()
+    world.settle(1000)
+    assert world.deaths > 10
+    world.hosts[0], world.kills = gone, frozenset()
+    world.reach()
+    world.ask(0, ("add", 1))
+    world.settle(3000)
+    assert world.answers() == [10, 11]
+    assert {host.state for host in world.hosts.values()} == {11}
+
+
 def busy_world(requests: int) -> World:
     world = World(counter, 0, replicas=1, log_entries=4000)
     world.settle()

@@ -75,6 +75,9 @@ def test_as_many_may_be_launched_an_hour_as_go_with_what_is_wanted_now() -> None
     """Twelve for each replica: of those that `scale` asks for, not of the file's."""
     scaled = World(spec(1), intent=Intent(target=20, scaled_from=1))
     assert len(scaled.plan().launches) == 20
+    events = tuple(Event(NOW - 1800 + n, EventKind.LAUNCH, n, 1, A.location) for n in range(20))
+    down = World(spec(20), intent=Intent(target=1, scaled_from=20), events=events)
+    assert len(down.plan().launches) == 1
 
 
 def test_a_rebalance_is_an_early_hint() -> None:

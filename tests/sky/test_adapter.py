@@ -13,7 +13,6 @@ import pytest
 from fogft.cloud.sky import adapter, naming
 from fogft.cloud.sky.following import ASK_LIMIT_S, JOB_PAUSE_S, LAUNCH_LIMIT_S
 from fogft.cloud.sky.naming import cluster_name
-from fogft.cloud.sky.provider import Instance
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
 from fogft.cloud.sky.wheel import Locks
 from fogft.errors import (
@@ -27,7 +26,7 @@ from fogft.errors import (
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase, Placement
-from tests.fakes.sky import EAST, WEST, ScriptedProvider, ScriptedSky, labels, replica
+from tests.fakes.sky import EAST, WEST, ScriptedProvider, ScriptedSky, replica
 from tests.sky.scene import Scene
 
 ID = replica()
@@ -574,22 +573,6 @@ def test_one_that_skypilots_list_misses_once_is_listed_with_the_next(tmp_path: P
     scene.machines()  # begins to renew the list
     scene.work()
     assert [m.id for m in scene.machines()] == [ID]
-
-
-@pytest.mark.parametrize("reachable", [True, False])
-def test_the_first_census_that_is_answered_looks_everywhere(scene: Scene, reachable: bool):
-    far = Placement("aws", "eu-west-1", "eu-west-1a", "m6i.large")
-    instance = Instance(replica(7), "i-9", far, labels(replica(7)), "10.0.0.9", 1.0)
-    scene.provider.found["i-9"] = instance
-    scene.provider.reachable = reachable
-    scene.cloud.offers({"infra": "aws"})  # elsewhere
-    seen = set()
-    for _ in range(3):
-        seen |= {m.id for m in scene.machines()}
-        scene.work()
-        scene.provider.reachable = True
-        scene.pass_s(60)
-    assert seen == {replica(7)}
 
 
 def test_a_provider_that_does_not_answer_leaves_a_missing_machine_unknown(scene: Scene):

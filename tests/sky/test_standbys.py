@@ -66,6 +66,17 @@ def test_one_whose_start_skypilot_does_not_answer_is_not_taken_for_a_failed_laun
     assert "100.1" in [m.id.short for m in pool.scene.machines()]
 
 
+def test_one_that_has_started_before_skypilot_is_asked_for_its_request_serves(pool: PoolOnSky):
+    """The answer to its order was lost."""
+    name = cluster_name(STANDBY)
+    before = pool.sky.asked("launch").count(name)
+    pool.sky.fail_next("launch-heard", CloudUnreachable("no answer within 120 s"))
+    lose_spot(pool)
+    pool.until(lambda: pool.sky.asked("launch").count(name) > before, seconds=0.1)
+    pool.sky.finish(name)
+    pool.until(lambda: pool.ready() == ["100.1"], limit=100)
+
+
 def test_what_cannot_be_stopped_is_ended(tmp_path: Path):
     made = PoolOnSky(tmp_path, on_demand=OnDemandSpec(fallback=True, standbys=1))
     made.sky.sold = [Offer(EAST, 0.02, "catalogue"), Offer(ON_DEMAND, 0.1, "catalogue")]

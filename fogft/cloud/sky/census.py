@@ -75,7 +75,7 @@ class Census:
                 self._begun_at[pool_uid] = now
             found = self._found.get(pool_uid, ())
         if due and self.providers:
-            where = regions if pool_uid in self._found else None
+            where = None if begun_at is None else regions
             self.submit(lambda: self._take(pool_uid, where))
         return found
 
@@ -87,8 +87,8 @@ class Census:
     def forget(self, id: ReplicaId) -> None:
         """Take a replica that is known to be gone out of the last census."""
         with self._lock:
-            if kept := self._found.get(id.pool_uid):
-                self._found[id.pool_uid] = [i for i in kept if i.id != id]
+            kept = self._found.get(id.pool_uid, ())
+            self._found[id.pool_uid] = [i for i in kept if i.id != id]
 
     def unverified(self, cloud: str) -> str:
         """Return why a cloud's own list is not available, else empty. Takes seconds."""

@@ -68,6 +68,9 @@ class Following:
     def _asking(self, entry: Entry) -> None:
         found = self.sky.launches(cluster_name(entry.id))
         requests = [one for one in found if one.active or not entry.starts]
+        if found and not requests:  # it may have started before this was asked
+            clusters = self.sky.clusters(cluster_name(entry.id), refresh=True)
+            requests = [*found] if any(c.state is ClusterState.UP for c in clusters) else []
         if requests:
             self._move(entry, stage=Stage.LAUNCHING, request=requests[-1].id)
         elif self._lasts_s(entry) > ASK_LIMIT_S:

@@ -154,24 +154,26 @@ def join(
     brought = read_content(content)
     files, endpoints = brought.files, list(brought.rendezvous)
     holder = label.holder
+    pool = "".join(c for c in label.pool if c.isalnum() or c == "-")
+    folder = root / "joined" / f"{pool}.{holder.role.value}.{holder.name}"
+    config = folder / (f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml")
     with used_once(root, label):
+        if holder.pool_uid.encode() not in (disk.read_bytes(config) or holder.pool_uid.encode()):
+            raise CredentialError(
+                f"`{folder}` belongs to another pool of this name",
+                "if that pool is gone, remove the folder; the bundle is as good as before",
+            )
         if endpoints:
             token = claiming.own_token(root / "joined" / "claims.json", label.id, now)
             with _on_disk(root / "joined", files, holder) as credentials:
                 claim(holder, token, endpoints, credentials)
-        pool = "".join(c for c in label.pool if c.isalnum() or c == "-")
-        folder = root / "joined" / f"{pool}.{holder.role.value}.{holder.name}"
-        of_role = f"{holder.role.value}.yaml" if holder.role in _COMMANDS else "proxy.yaml"
-        there = disk.read_bytes(folder / of_role)
-        if there is not None and holder.pool_uid.encode() not in there:  # of another pool's
-            folder = folder.with_name(f"{folder.name}.{holder.pool_uid}")
         for name, text in files.items():
             place = folder / name
             disk.make_folder(place.parent)
             disk.write_whole(place, text)
     destroy(file)
     alone = not endpoints and holder.role is not Role.RENDEZVOUS
-    return Joined(holder, folder / of_role, _COMMANDS.get(holder.role, "proxy"), alone)
+    return Joined(holder, config, _COMMANDS.get(holder.role, "proxy"), alone)
 
 
 @contextlib.contextmanager

@@ -104,8 +104,7 @@ def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
         raise StateError(f"there is no `{config}`", "`fogft join` writes it")
     words = (command, "--config", str(config))
     environment = config.with_suffix(".env")
-    of = config.parent.name if config.stem == command else config.stem  # as `join` names them
-    name = f"fogft-{command}-{of}.service"
+    name = f"fogft-{command}-{config.stem}.service"
     return [_unit(name, words, config, environment, system=system)]
 
 
@@ -151,9 +150,14 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
 
     A pool's replace the processes, if any, that run it now.
     """
-    disk.write_whole(units[0].environment, environment())
     if not where.folder.is_dir():
         disk.make_folder(where.folder)
+    needs = f"EnvironmentFile={units[0].environment}\n".replace("%", "%%").encode()
+    there = disk.read_bytes(where.folder / units[0].name)
+    if there is not None and needs not in there:
+        told = f"`{units[0].name}` runs something else"
+        raise StateError(told, "remove it, or rename this configuration: a unit bears its name")
+    disk.write_whole(units[0].environment, environment())
     for unit in units:
         disk.write_whole(where.folder / unit.name, unit.text)
         (where.folder / unit.name).chmod(0o644)

@@ -63,7 +63,7 @@ class HistoryFile:
 
     def recent(self, count: int = 20) -> list[Event]:
         """Return the last events, oldest first."""
-        return _read_events(self._path, count)
+        return _read_events(self._path)[-count:]
 
     def _load(self) -> History:
         events = _read_events(self._path)
@@ -90,10 +90,10 @@ def _append_durably(path: Path, line: bytes) -> None:
         os.close(descriptor)
 
 
-def _read_events(path: Path, last: int = 0) -> list[Event]:
+def _read_events(path: Path) -> list[Event]:
     """Return the events of a file, without a torn last line and what else is damaged."""
     events = []
-    for line in (disk.read_bytes(path) or b"").splitlines()[-last:]:
+    for line in (disk.read_bytes(path) or b"").splitlines():
         with contextlib.suppress(ValueError, RecursionError):
             events.append(from_plain(Event, json.loads(line)))
     return events

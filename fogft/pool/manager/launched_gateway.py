@@ -15,7 +15,7 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.buying import PlannedLaunch
-from fogft.planning.gateway import GatewayPlan, plan_gateway, resources
+from fogft.planning.gateway import LOST_S, GatewayPlan, plan_gateway, resources
 from fogft.planning.observed.history import History
 
 ASK_EVERY_S = 10.0
@@ -38,7 +38,7 @@ class LaunchedGateway:
         self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
     ) -> GatewayPlan:
         """Return the next step. The cloud must have answered."""
-        if observed.links is None or not 0 <= observed.now - self._looked_at < ASK_EVERY_S:
+        if observed.links is None or not 0 <= observed.now - self._looked_at < LOST_S / 2:
             self._watched_since = observed.now
         self._looked_at = observed.now
         if self.is_up(observed.now):

@@ -260,8 +260,7 @@ class ServiceQueue:
 
     def overdue(self, job: Job, now: float) -> None:
         """Note that a running job is past its deadline; it keeps its slot for a while."""
-        usual_s = most_quiet_s(self._longest_s or _ABANDONED_AFTER_S)
-        self._overdue.append((now + min(usual_s, _ABANDONED_AFTER_S), job))
+        self._overdue.append((now + _ABANDONED_AFTER_S, job))
 
     def abandoned(self, now: float) -> list[Job]:
         """Return the overdue jobs whose response counts as lost; their slots are free."""

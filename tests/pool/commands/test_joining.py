@@ -80,17 +80,16 @@ def test_a_robot_joins_from_one_file(file: Path, tmp_path: Path) -> None:
         assert stat.S_IMODE(path.stat().st_mode) == (0o700 if path.is_dir() else 0o600), path
 
 
-def test_another_pool_of_the_same_name_joins_beside_it(
-    file: Path, store: PoolStore, tmp_path: Path
-) -> None:
-    """Its proxy may run from what is there."""
-    first = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
-    written = first.config.read_text()
-    first.config.write_text(written.replace(UID, "f" * 16))
-    file.write_bytes(issued(store, Role.ROBOT, "ada"))
-    second = joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
-    assert second.config.parent.name == f"{first.config.parent.name}.{UID}"
-    assert first.config.read_text() == written.replace(UID, "f" * 16)
+def test_what_another_pool_of_the_same_name_has_set_up_stays(file: Path, tmp_path: Path) -> None:
+    """Its proxy may run from there. The bundle is still good once that is removed."""
+    folder = tmp_path / "home" / "joined" / "pool.robot.ada"
+    folder.mkdir(parents=True)
+    (folder / "proxy.yaml").write_text(f"pool_uid: {'f' * 16}")
+    with pytest.raises(CredentialError, match="belongs to another pool"):
+        joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
+    assert [path.name for path in folder.iterdir()] == ["proxy.yaml"]
+    (folder / "proxy.yaml").unlink()
+    assert joining.join(file, PASSPHRASE, tmp_path / "home", NOW).config.parent == folder
 
 
 def test_a_replica_by_hand_joins_too(tmp_path: Path) -> None:

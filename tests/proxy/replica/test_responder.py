@@ -429,19 +429,6 @@ def test_a_response_that_never_comes_frees_its_room_in_the_end():
     assert scene.client.forgotten == [1]
 
 
-def test_one_lost_response_of_a_quick_service_does_not_keep_its_room_for_a_minute():
-    scene = Scene(outstanding=1)
-    scene.ask(A)
-    scene.clock.now += 0.02
-    scene.answer(0)
-    scene.ask(B, remaining_s=2.0)
-    for _ in range(2):
-        scene.clock.now += 2.1
-        scene.responder.tick()
-    scene.ask(C)
-    assert len(scene.client.calls) == 3
-
-
 def test_a_crash_ends_what_waits_too_and_does_not_blame_it():
     """A robot bars a replica that crashed on a request three times; this one was not begun."""
     scene = Scene(outstanding=1)

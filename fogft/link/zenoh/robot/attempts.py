@@ -364,10 +364,9 @@ class Attempts:
 
     def _unpack(self, attempt: OpenAttempt, answer: Answer, *, packed: bool) -> None:
         """Take an answer that is still wanted aside; decompress it, if it was asked to be."""
-        bad = Refusal.MALFORMED if packed else Refusal.LOST
 
         def done(payload: bytes | None) -> None:
-            refusal = bad if payload is None else None
+            refusal = Refusal.MALFORMED if payload is None else None
             unpacked = replace(answer, payload=payload, refusal=refusal)
             if not self._close(attempt, unpacked):
                 self._came_late(attempt, unpacked)
@@ -375,7 +374,7 @@ class Attempts:
         taken = attempt.reads_packed or not packed
         content = answer.payload or b""
         if not taken or not self._unpacker.put("answers", content, done, packed=packed):
-            done(None)
+            done(None if packed else content)
 
     def _came_late(self, attempt: OpenAttempt, answer: Answer) -> None:
         """Take the answer to an attempt that was forgotten, or has ended."""
