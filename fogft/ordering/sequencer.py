@@ -115,7 +115,8 @@ class Sequencer:
         wanted = set(replicas)
         self._versions, self._draining = versions or {}, frozenset(draining)
         for replica in [r for r in self._peers if r not in wanted]:
-            del self._peers[replica]
+            for index in self._peers.pop(replica).open:  # it may yet apply them
+                self._deaths.setdefault(index, {})[replica] = 0
             self._fenced.pop(replica, None)
             self._gave_no_checkpoint(replica)
         for replica in sorted(wanted - self._peers.keys()):
@@ -139,7 +140,8 @@ class Sequencer:
             return
         for replica, peer in self._peers.items():
             if peer.phase is Phase.UNCLAIMED and peer.retry_at <= now:
-                self._claim(replica, peer)
+                if not self._waits_for_others(replica):
+                    self._claim(replica, peer)
             elif peer.phase is Phase.CLAIMED:
                 self._replicas.bring(replica, peer)
                 self._claim_again(replica, peer, now)
@@ -153,6 +155,11 @@ class Sequencer:
     def _claim(self, replica: int, peer: Peer) -> None:
         peer.phase = Phase.ASKED
         self._replicas.order(replica, Op.CLAIM)
+
+    def _waits_for_others(self, replica: int) -> bool:
+        """Whether it died, not alone, over what another works on: that shows whether it kills."""
+        over = [n for n, d in self._deaths.items() if 0 < d.get(replica, 0) < sum(d.values())]
+        return any(n in one.open for n in over for one in self._peers.values())
 
     def _claim_again(self, replica: int, peer: Peer, now: float) -> None:
         """Claim anew one that waits for long: it may have applied more since it was asked."""

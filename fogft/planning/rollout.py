@@ -13,7 +13,7 @@ from enum import Enum
 
 from fogft.model.groups import is_current, replica_hash
 from fogft.model.reason import NOTICES, Cause, Reason, because
-from fogft.model.replica import LinkState, supply
+from fogft.model.replica import LinkState
 from fogft.model.spec import PoolSpec
 from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment, Health, Verdict
@@ -29,7 +29,7 @@ CLOUD_FAILURES = 3
 ERRORS_MIN = 5
 ERRORS_MARGIN = 0.02
 _SURE = 3.0  # standard deviations: chance alone stops about one update in a thousand
-_THE_CLOUDS = (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS, *NOTICES)
+_THE_CLOUDS = (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS, Cause.NOT_LISTED, *NOTICES)
 
 
 class UpdateState(str, Enum):
@@ -145,11 +145,9 @@ def _launches_fail(history: History, began_at: float) -> Reason | None:
     since = max(began_at, proven_at)
     causes = [
         failure.cause
-        for place, failures in history.failures.items()
+        for failures in history.failures.values()
         for failure in failures
         if failure.at > since and failure.cause not in _THE_CLOUDS
-        # A spot VM that is no longer listed was preempted.
-        if failure.cause is not Cause.NOT_LISTED or place.endswith(supply("", on_demand=True))
     ]
     if len(causes) < CLOUD_FAILURES:
         return None

@@ -68,7 +68,7 @@ class Following:
     def _asking(self, entry: Entry) -> None:
         found = self.sky.launches(cluster_name(entry.id))
         requests = [one for one in found if one.active or not entry.starts]
-        if found and not requests:  # it may have started before this was asked
+        if found and not requests and self._lasts_s(entry) <= ASK_LIMIT_S:  # it may have started
             clusters = self.sky.clusters(cluster_name(entry.id), refresh=True)
             requests = [*found] if any(c.state is ClusterState.UP for c in clusters) else []
         if requests:

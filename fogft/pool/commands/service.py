@@ -85,7 +85,7 @@ def names_of(pool: str) -> dict[str, str]:
 
 def of_pool(paths: PoolPaths, *, system: bool) -> list[Unit]:
     """Return the units of a pool's manager and client proxies."""
-    pool, environment = paths.folder.name, paths.folder / "service.env"
+    pool, environment = paths.folder.name, paths.folder.resolve() / "service.env"
     manager = ("manager", "--no-proxy", pool)
     proxy = ("proxy", "--spare", "--config", str(paths.proxy_config))
     return [
