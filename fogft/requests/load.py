@@ -32,8 +32,7 @@ _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
 _MANY = 16.0  # requests ahead: behind more, a time tells little of what is unusual
 _FULL_OVER_S, _ASKED_OVER_S, _DEMAND_STEP_S = 10.0, 30.0, 0.1
-# How many times as long as usual an answer takes that shows a slow spell, and for how many times
-# that long other replicas are preferred while they are free.
+# An answer that takes so many times as long as usual shows a slow spell of so many times that.
 SLOW, _SLOW_FOR = 2.5, 5.0
 _OFTEN = 0.5  # of the time something waits: there are too few replicas
 _UNANSWERED = 1.15  # times what full ones answer is asked: no chance
