@@ -106,7 +106,7 @@ class Unpacker:
         self._waiting: dict[str, deque[tuple[bytes, Done, bool]]] = {}
 
     def put(self, peer: str, content: bytes, done: Done, *, packed: bool = True) -> bool:
-        """Decompress a payload, then call `done`.
+        """Decompress a payload, if it is `packed`, then call `done` in the peer's thread.
 
         False where too much of this peer waits, or there can be no more threads.
         """

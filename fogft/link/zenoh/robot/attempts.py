@@ -358,11 +358,11 @@ class Attempts:
                 self._credit.heard(attempt.mark)  # requests of one connection arrive in order
             aside = packed or len(answer.payload or b"") > _ASIDE_BYTES
             if aside and self.window.holds(attempt):
-                self._unpack(attempt, answer, packed=packed)
+                self._take_aside(attempt, answer, packed=packed)
             elif not self._close(attempt, answer):
                 self._came_late(attempt, answer)
 
-    def _unpack(self, attempt: OpenAttempt, answer: Answer, *, packed: bool) -> None:
+    def _take_aside(self, attempt: OpenAttempt, answer: Answer, *, packed: bool) -> None:
         """Take an answer that is still wanted aside; decompress it, if it was asked to be."""
 
         def done(payload: bytes | None) -> None:
