@@ -6,16 +6,16 @@ field stands at a multiple of its own size, counted from behind the header of fo
 """
 
 import re
+import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from struct import Struct
 
 from fogft.model.type_definition import Fields
 
 HEADER_BYTES = 4
 _KEPT_BYTES = 16 << 10
-_BYTE_ORDERS = {b"\x00\x00": Struct(">I"), b"\x00\x01": Struct("<I")}
+_BYTE_ORDERS = {b"\x00\x00": struct.Struct(">I"), b"\x00\x01": struct.Struct("<I")}
 # A middleware may fill a message's end up to a multiple of its widest field. Fast DDS also leaves
 # what it reserved for gaps between fields and did not need: less than the message is long.
 _MOST_PADDING = 7
@@ -40,28 +40,17 @@ class _Uncheckable(Exception):
 
 
 class _Bytes:
-    """A message's bytes, and where the booleans stand that were stepped over."""
+    """A message's bytes, and where the booleans stand that were stepped over.
+
+    An offset may lie behind the end: that is found out when something is read there, or at last.
+    """
 
     __slots__ = "booleans", "length_at", "payload", "size"
 
-    def __init__(self, payload: bytes, length_at: Struct) -> None:
-        self.payload, self.length_at = payload, length_at
+    def __init__(self, payload: bytes, length_at: struct.Struct) -> None:
+        self.payload, self.length_at = payload, length_at.unpack_from
         self.size = len(payload)
         self.booleans: list[int] = []
-
-    def length(self, at: int) -> tuple[int, int]:
-        """Return a length that stands at an offset, aligned, and the offset behind it."""
-        at += -(at - HEADER_BYTES) % 4
-        if at + 4 > self.size:
-            raise _Malformed("it ends within a length")
-        return self.length_at.unpack_from(self.payload, at)[0], at + 4
-
-    def skip(self, at: int, size: int) -> int:
-        """Return the offset behind so many bytes."""
-        end = at + size
-        if end > self.size:
-            raise _Malformed(f"it ends {end - self.size} bytes early")
-        return end
 
     def check_booleans(self, first: int, end: int, step: int) -> None:
         """Make sure that each `step`-th byte between two offsets is 0 or 1."""
@@ -106,8 +95,10 @@ class Shape:
             return ""
         try:
             end = self._root.walk(_Bytes(payload, length_at), HEADER_BYTES)
-        except _Malformed as error:
-            return str(error)
+            if end > len(payload):
+                raise _Malformed(f"it ends {end - len(payload)} bytes early")
+        except (_Malformed, struct.error) as error:
+            return str(error) if isinstance(error, _Malformed) else "it ends within a length"
         left = len(payload) - end
         if left > _MOST_PADDING + end - HEADER_BYTES:
             return f"{left} bytes are left over"
@@ -121,7 +112,8 @@ class Shape:
                 raise _Uncheckable(name)
             kinds = [self._kind(kind, (*within, name)) for _, kind in self._fields[name]]
             # ROS 2 gives a message without fields one byte.
-            self._kinds[name] = _one_after_another(kinds or [_number("uint8")])
+            kinds = kinds or [_number("uint8")]
+            self._kinds[name] = kinds[0] if len(kinds) == 1 else _one_after_another(kinds)
         return self._kinds[name]
 
     def _kind(self, kind: str, within: tuple[str, ...]) -> _Kind:
@@ -141,31 +133,32 @@ def _number(kind: str) -> _Kind:
     size = NUMBER_BYTES[kind]
 
     def walk(data: _Bytes, at: int) -> int:
-        return data.skip(at - (at - HEADER_BYTES) % -size, size)
+        return at - (at - HEADER_BYTES) % -size + size
 
     def walk_boolean(data: _Bytes, at: int) -> int:
-        end = data.skip(at, 1)
         data.booleans.append(at)
-        if data.payload[at] > 1:
-            data.check_booleans(at, end, 1)
-        return end
+        if data.payload[at : at + 1] > b"\1":
+            data.check_booleans(at, at + 1, 1)
+        return at + 1
 
     return _Kind(walk_boolean if kind == "boolean" else walk, size, True)
 
 
 def _string(bound: int) -> _Kind:
     def walk(data: _Bytes, at: int) -> int:
-        length, at = data.length(at)
+        at += -(at - HEADER_BYTES) % 4
+        length: int = data.length_at(data.payload, at)[0]
         if bound and length > bound + 1:  # with the zero at its end
             raise _Malformed(f"a text of at most {bound} bytes has {length - 1}")
-        return data.skip(at, length)
+        return at + 4 + length
 
     return _Kind(walk, 4, False)
 
 
 def _sequence(of: _Kind, bound: int) -> _Kind:
     def walk(data: _Bytes, at: int) -> int:
-        count, at = data.length(at)
+        at += 4 + -(at - HEADER_BYTES) % 4
+        count: int = data.length_at(data.payload, at - 4)[0]
         if bound and count > bound:
             raise _Malformed(f"a sequence of at most {bound} elements has {count}")
         if count > data.size - at:  # each has a byte at the least
@@ -198,7 +191,9 @@ def _several(of: _Kind, count: int, data: _Bytes, at: int) -> int:
         if count and of.has_fixed_size and (at - began) % of.align == 0:
             known = len(data.booleans)
             size = of.walk(data, at) - at
-            end = data.skip(at, size * count)
+            end = at + size * count
+            if end > data.size:
+                return end
             for boolean in data.booleans[known:]:
                 data.check_booleans(boolean, end, size)
                 data.booleans.extend(range(boolean + size, end, size))

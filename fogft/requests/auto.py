@@ -95,18 +95,19 @@ class Auto(Learning):
             return ()
         for replica in able:  # what others answered first it may never end: `more` does not see it
             known = self._replicas[replica]
-            if known.at_work:
+            if known.at_work and known.ended_at < known.oldest_begun:
                 self._doubts(replica, known.oldest_begun, now)
         quick = self._quick(able, now) if now < self._slow_until and not self._busy else able
         best = self._best(request, quick, now)
         known = self._replicas[best]
+        if len(able) == 1:
+            known.asked(request, now)
+            return able  # there is nobody to hedge it at
         self._busy = known.slots <= 1 and self._demand.rate * known.service_s > _BUSY * len(able)
         self._spares.request(known.service_s, len(able), now)
         if self._spares.open and not known.free(now):
             self._spares.made_wait(_WAIT * known.service_s)
         overdue_at = known.asked(request, now)
-        if len(able) == 1:
-            return able  # there is nobody to hedge it at
         left_free = self._spares.left_free_by(request)
         copied = left_free < len(able) - 1 and not self.dear and not self._busy
         others = able if copied else self._stale(able, now)

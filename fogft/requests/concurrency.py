@@ -32,13 +32,7 @@ class ConcurrencyLimit:
         self._took_s: list[float] = []
         self._kept: tuple[int, float] | None = None  # during a trial: the limit to compare with
         self._tried: dict[int, float] = {}  # when each limit was last found not to be better
-
-    @property
-    def in_hand(self) -> int:
-        """How many the service is given."""
-        on_trial = self._given is not None or not self._tried or self._kept is not None
-        more = 0 if on_trial or self.takes_s >= IN_HAND_S else 1
-        return min(self.limit + more, max(self.limit, self._most))
+        self.in_hand = self.limit  # how many the service is given
 
     def finished(self, level: int, took_s: float, now: float) -> None:
         """Learn from an answer; at its start `level` requests were running, itself included."""
@@ -51,11 +45,15 @@ class ConcurrencyLimit:
         else:
             most_s = _OUTLIER * self.service_s or each_s
             self.service_s += _WEIGHT * (min(each_s, most_s) - self.service_s)
-        if self._given is not None or level != self.limit:
+        if self._given is not None:
             return
-        self._took_s.append(took_s)
-        if len(self._took_s) >= _SAMPLES:
-            self._judge(now)
+        if level == self.limit:
+            self._took_s.append(took_s)
+            if len(self._took_s) >= _SAMPLES:
+                self._judge(now)
+        on_trial = not self._tried or self._kept is not None
+        more = 0 if on_trial or self.takes_s >= IN_HAND_S else 1
+        self.in_hand = min(self.limit + more, max(self.limit, self._most))
 
     def _judge(self, now: float) -> None:
         """Enough was seen of this limit: end a trial, or begin one."""

@@ -24,7 +24,7 @@ class Trace(NamedTuple):
     refused: dict[int, Refusal]  # each replica that refused it, and its last reason
 
 
-@dataclass
+@dataclass(slots=True)
 class Pending:
     """A request that awaits its answer. Moments are monotonic seconds.
 

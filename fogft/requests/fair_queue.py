@@ -11,32 +11,34 @@ Not here: how many may wait or run at once (`concurrency`, `proxy.replica.respon
 """
 
 import heapq
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
 
-@dataclass(order=True)
+@dataclass(eq=False)
 class _Entry(Generic[T]):
-    rank: float
-    order: int
-    id: bytes = field(compare=False)
-    robot: str = field(compare=False)
-    item: T | None = field(compare=False)
+    id: bytes
+    robot: str
+    item: T | None
+
+
+_Ranked = tuple[float, int, _Entry[T]]  # no two have the same number
 
 
 class _Robot(Generic[T]):
     def __init__(self, given: float) -> None:
-        self.heap: list[_Entry[T]] = []  # entries that were removed stay until they come up
+        self.heap: list[_Ranked[T]] = []  # entries that were removed stay until they come up
         self.waiting = 0
         self.given = given
 
-    def first(self) -> _Entry[T]:
-        while self.heap[0].item is None:
+    def standing(self) -> tuple[float, _Ranked[T]]:
+        """Return its turn: who was given least is next; among equals the earliest deadline."""
+        while self.heap[0][2].item is None:
             heapq.heappop(self.heap)
-        return self.heap[0]
+        return self.given, self.heap[0]
 
 
 class FairQueue(Generic[T]):
@@ -56,11 +58,11 @@ class FairQueue(Generic[T]):
 
     def put(self, id: bytes, robot: str, deadline: float, item: T) -> None:
         """Queue an item. Its id must not be queued already."""
-        entry = _Entry(self._sign * deadline, next(self._order), id, robot, item)
+        entry = _Entry(id, robot, item)
         queue = self._robots.get(robot)
         if queue is None:
             queue = self._robots[robot] = _Robot(self._turn)
-        heapq.heappush(queue.heap, entry)
+        heapq.heappush(queue.heap, (self._sign * deadline, next(self._order), entry))
         queue.waiting += 1
         self._entries[id] = entry
 
@@ -68,10 +70,8 @@ class FairQueue(Generic[T]):
         """Remove and return the next item; None if empty."""
         if not self._robots:
             return None
-        queue = min(self._robots.values(), key=_standing)
-        entry = queue.first()
-        self._turn = queue.given
-        queue.given += 1.0
+        self._turn, (_, _, entry) = min([queue.standing() for queue in self._robots.values()])
+        self._robots[entry.robot].given += 1.0
         return self._remove(entry)
 
     def not_served(self, robot: str) -> None:
@@ -92,7 +92,7 @@ class FairQueue(Generic[T]):
         if not queue.waiting:
             del self._robots[entry.robot]
         elif len(queue.heap) > 2 * queue.waiting + 16:
-            queue.heap = [kept for kept in queue.heap if kept.item is not None]
+            queue.heap = [kept for kept in queue.heap if kept[2].item is not None]
             heapq.heapify(queue.heap)
         return item
 
@@ -106,8 +106,8 @@ class FairQueue(Generic[T]):
             most = own
         elif most.waiting <= (own.waiting if own is not None else 0) + 1:
             return None  # equal shares: nobody has too much
-        last = max(entry for entry in most.heap if entry.item is not None)
-        if most is own and last.rank <= self._sign * deadline:
+        rank, _, last = max(ranked for ranked in most.heap if ranked[2].item is not None)
+        if most is own and rank <= self._sign * deadline:
             return None
         return self._remove(last)
 
@@ -116,11 +116,6 @@ class FairQueue(Generic[T]):
         own = self._robots.get(robot)
         before, rank = 0, self._sign * deadline
         if own is not None:
-            before = sum(1 for e in own.heap if e.item is not None and e.rank <= rank)
+            before = sum(1 for at, _, e in own.heap if e.item is not None and at <= rank)
         others = (queue.waiting for name, queue in self._robots.items() if name != robot)
         return before + sum(min(waiting, before + 1) for waiting in others)
-
-
-def _standing(queue: _Robot[T]) -> tuple[float, _Entry[T]]:
-    """Who was given least is next; among equals the earliest deadline."""
-    return queue.given, queue.first()

@@ -41,8 +41,8 @@ class CMessage:
         if not self.address:
             raise RosError(f"no memory for a {self._name}")
 
-    def read(self, payload: bytes) -> None:
-        """Fill the message from serialised bytes.
+    def read(self, payload: bytes) -> CDLL:
+        """Fill the message from serialised bytes; return what to send it with.
 
         Raises Unreadable: They are no such message; what the message holds now is undefined.
         """
@@ -59,6 +59,7 @@ class CMessage:
         if code != rcl.OK:
             reason = rcl.error_text()
             raise Unreadable(f"{size} bytes are not a serialised {self._name}: {reason}")
+        return functions
 
     def write(self, functions: CDLL) -> bytes:
         """Return the message as serialised bytes. Raises RosError: out of memory."""
@@ -96,10 +97,6 @@ class _End:
         payload = self._taken.write(self._functions)
         self._functions = self._held if len(payload) < LARGE_BYTES else self._released
         return payload
-
-    def _functions_for(self, payload: bytes) -> CDLL:
-        small = len(payload) < LARGE_BYTES and not self._refused
-        return self._held if small else self._released
 
     def _check_sent(self, code: int, what: str) -> None:
         self._refused = code != rcl.OK
@@ -139,11 +136,12 @@ class ServiceEnd(_End):
 
     def respond(self, handle: bytes, payload: bytes) -> None:
         """Send a serialised response."""
-        self._sent.read(payload)
-        code = self._functions_for(payload).rcl_send_response(
-            self._pointer, handle, self._sent_address
-        )
-        self._check_sent(code, "response")
+        functions = self._sent.read(payload)
+        if self._refused:
+            functions = self._released
+        code = functions.rcl_send_response(self._pointer, handle, self._sent_address)
+        if code != rcl.OK or self._refused:
+            self._check_sent(code, "response")
 
 
 class ClientEnd(_End):
@@ -169,11 +167,12 @@ class ClientEnd(_End):
 
     def send(self, payload: bytes) -> int:
         """Send a serialised request; return its sequence number."""
-        self._sent.read(payload)
-        code = self._functions_for(payload).rcl_send_request(
-            self._pointer, self._sent_address, self._ticket_reference
-        )
-        self._check_sent(code, "request")
+        functions = self._sent.read(payload)
+        if self._refused:
+            functions = self._released
+        code = functions.rcl_send_request(self._pointer, self._sent_address, self._ticket_reference)
+        if code != rcl.OK or self._refused:
+            self._check_sent(code, "request")
         return self._ticket.value
 
 

@@ -8,7 +8,7 @@ owner's lock.
 import heapq
 from collections import OrderedDict
 
-from fogft.byte_limit import SharedByteLimit
+from fogft.byte_limit import SMALL_BYTES, SharedByteLimit
 from fogft.proxy.replica.service_queue import Job
 
 COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
@@ -61,12 +61,14 @@ class KnownRequests:
             self._deadlines = [due for due, job in live if job and job.deadline == due[0]]
             heapq.heapify(self._deadlines)
         self.held += 1
-        self.large.hold(job.robot, job.size)
+        if job.size > SMALL_BYTES:
+            self.large.hold(job.robot, job.size)
 
     def end(self, job: Job, answer: bytes | None = None) -> None:
         """Note that a job is done; its answer is kept for copies, within the bounds."""
         self.held -= 1
-        self.large.let_go(job.robot, job.size)
+        if job.size > SMALL_BYTES:
+            self.large.let_go(job.robot, job.size)
         if answer is None:
             return
         job.answer = answer

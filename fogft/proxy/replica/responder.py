@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 
+from fogft.byte_limit import SMALL_BYTES
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
@@ -184,7 +185,8 @@ class Responder:
         deadline = now + remaining_s
         full = queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s)
         size = len(incoming.payload)
-        if full or not self.known.large.has_room_for(incoming.robot, size):
+        large = self.known.large
+        if full or (size > SMALL_BYTES and not large.has_room_for(incoming.robot, size)):
             return Refusal.OVERLOADED, None
         if queue.waiting() + queue.at_work < self.held_limit:
             return None, None

@@ -111,7 +111,7 @@ class ServiceQueue:
         self._longest_given_s = max(given_s, self._longest_given_s * LONGEST_FADES)
 
     def _has_room(self, job: Job) -> bool:
-        if self.at_work and (job.alone or self._alone or self._batch_is_full):
+        if self.at_work and (job.alone or self._alone or (self._results and self._batch_is_full)):
             return False
         return self.at_work < (self.limit.limit if job.spare else self.limit.in_hand)
 
@@ -154,7 +154,7 @@ class ServiceQueue:
         What it returns may be past its deadline, or about to be while others wait that are not:
         then it was not begun and takes no room.
         """
-        if self.at_work >= self.limit.in_hand or self._alone:
+        if not self.waiting() or self.at_work >= self.limit.in_hand or self._alone:
             return None
         job = self._waiting.take()
         if job is not None and not self._has_room(job):

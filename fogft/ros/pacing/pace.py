@@ -198,7 +198,8 @@ class Pace:
 
     def take(self, client: ClientPace, now: float) -> bool:
         """Whether a response to a client may be sent now; if so, it counts as sent."""
-        client.refill(now)  # also where there is room: time is not saved up
+        if not client.untaken:
+            client.refill(now)  # also where there is room: time is not saved up
         if any(self.in_the_way(client, now)):
             return False
         self.send(client)
@@ -214,5 +215,5 @@ class Pace:
         for id, other in self.clients.items():
             if other.untaken:
                 other.refill(now)
-            if not other.has_room(self.sent) and (other is client or not other.silent(now)):
-                yield id, other
+                if not other.has_room(self.sent) and (other is client or not other.silent(now)):
+                    yield id, other

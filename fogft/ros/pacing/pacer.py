@@ -118,7 +118,7 @@ class Pacer:
         now = self.clock()
         id = self.client_of(handle)
         with self._lock:
-            client = self._pace.client(id, now)
+            client = self._pace.clients.get(id) or self._pace.client(id, now)
             client.requested(now, together=together)
             if client.probing in (Probing.ASKED, Probing.NO) and now >= client.ask_again_at:
                 client.ask_again_at = now + _ASK_AGAIN_S
@@ -136,7 +136,7 @@ class Pacer:
         now = self.clock()
         id = self.client_of(handle)
         with self._lock:
-            client = self._pace.client(id, now)
+            client = self._pace.clients.get(id) or self._pace.client(id, now)
             if client.waiting or client.finding_until or not self._pace.take(client, now):
                 if client.hold(handle, payload, now):
                     self._held[id] = client

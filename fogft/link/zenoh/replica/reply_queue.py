@@ -99,7 +99,8 @@ class ReplyQueue:
         if isinstance(first, QueryEnd):
             return first
         together, size = [first], len(first.payload)
-        while first.joins and len(together) < batch_frames.LIMIT:
+        joins = first.joins
+        while joins and len(together) < batch_frames.LIMIT:
             try:
                 reply = self.replies.get_nowait()
             except Empty:
@@ -160,12 +161,14 @@ class ReplyQueues:
             if queue is None or queue.waiting >= _REFUSALS_LIMIT:
                 return
             too_large = size > MESSAGE_BYTES_LIMIT - _HEAD_BYTES
-            dropped = queue.waiting >= REPLIES_LIMIT or not queue.large.has_room(size) or too_large
+            full = queue.waiting >= REPLIES_LIMIT
+            dropped = full or too_large or not (small or queue.large.has_room(size))
             if dropped:
                 refusal = Refusal.MALFORMED.text("too large") if too_large else Refusal.LOST
                 reply.payload, reply.refusal, size = b"", refusal, 0
             queue.waiting += 1
-            queue.large.add(size)
+            if size > SMALL_BYTES:
+                queue.large.add(size)
             queue.replies.put(reply)
         self.counters.add("reply_dropped" if dropped else counted)
 
@@ -218,7 +221,8 @@ class ReplyQueues:
             with self._lock:
                 queue.waiting -= len(sizes)
                 for size in sizes:
-                    queue.large.remove(size)
+                    if size > SMALL_BYTES:
+                        queue.large.remove(size)
             del taken  # its payloads, while this thread waits
 
     def _guarded(self, step: Callable[[], object]) -> object:
