@@ -60,7 +60,7 @@ class InputBytes(Structure):
 class OutputBytes(Structure):
     """``rcutils_uint8_array_t`` that rmw grows as it needs."""
 
-    _fields_ = (("buffer", c_void_p), *_LENGTHS)
+    _fields_ = (("buffer", POINTER(c_char)), *_LENGTHS)
 
 
 class _ErrorString(Structure):

@@ -10,7 +10,7 @@ Owns: C messages and buffers. Not here: threads and locks (`node`), types (`type
 (`rcl`).
 """
 
-from ctypes import CDLL, addressof, byref, c_int64, string_at
+from ctypes import CDLL, addressof, byref, c_int64
 from functools import lru_cache
 from typing import Any
 
@@ -28,6 +28,7 @@ class CMessage:
     def __init__(self, message_type: Any) -> None:
         kind = type(message_type)
         self._held, self._released = rcl.load()
+        self.functions = self._held  # those for a message as large as the last that was written
         self._type_support = rcl.address(kind._TYPE_SUPPORT)
         self._destroy = rcl.destroy_function(rcl.address(kind._DESTROY_ROS_MESSAGE))
         self._name = message_type.__name__
@@ -61,13 +62,14 @@ class CMessage:
             raise Unreadable(f"{size} bytes are not a serialised {self._name}: {reason}")
         return functions
 
-    def write(self, functions: CDLL) -> bytes:
+    def write(self) -> bytes:
         """Return the message as serialised bytes. Raises RosError: out of memory."""
-        code = functions.rmw_serialize(self.address, self._type_support, self._output_address)
+        code = self.functions.rmw_serialize(self.address, self._type_support, self._output_address)
         if code != rcl.OK:
             raise RosError(f"a {self._name} cannot be serialised: {rcl.error_text()}")
-        output = self._output
-        return string_at(output.buffer, output.length)
+        payload: bytes = self._output.buffer[: self._output.length]
+        self.functions = self._held if len(payload) < LARGE_BYTES else self._released
+        return payload
 
     def close(self) -> None:
         """Free the message and the buffer. Repeatable."""
@@ -82,7 +84,6 @@ class _End:
 
     def __init__(self, entity: Any, taken_type: Any, sent_type: Any) -> None:
         self._held, self._released = rcl.load()
-        self._functions = self._held
         self._handle = entity.handle  # keeps the rcl handle alive
         self._pointer: int = entity.handle.pointer
         self._taken = CMessage(taken_type)
@@ -92,11 +93,6 @@ class _End:
         self._refused = False  # the last send: the next may wait for room, up to 0.1 s
         self._header = rcl.RequestHeader()
         self._header_reference = byref(self._header)
-
-    def _write_taken(self) -> bytes:
-        payload = self._taken.write(self._functions)
-        self._functions = self._held if len(payload) < LARGE_BYTES else self._released
-        return payload
 
     def _check_sent(self, code: int, what: str) -> None:
         self._refused = code != rcl.OK
@@ -125,11 +121,11 @@ class ServiceEnd(_End):
 
     def take(self) -> tuple[bytes, bytes] | None:
         """Return the next serialised request and the bytes of its header."""
-        code = self._functions.rcl_take_request(
+        code = self._taken.functions.rcl_take_request(
             self._pointer, self._header_reference, self._taken_address
         )
         if code == rcl.OK:
-            return self._write_taken(), bytes(self._header)
+            return self._taken.write(), bytes(self._header)
         if code == rcl.SERVICE_TAKE_FAILED:
             return None
         raise RosError(f"a request cannot be taken: {rcl.error_text()}")
@@ -156,11 +152,11 @@ class ClientEnd(_End):
 
     def take(self) -> tuple[int, bytes] | None:
         """Return the next response: sequence number and bytes."""
-        code = self._functions.rcl_take_response(
+        code = self._taken.functions.rcl_take_response(
             self._pointer, self._header_reference, self._taken_address
         )
         if code == rcl.OK:
-            return self._header.sequence_number, self._write_taken()
+            return self._header.sequence_number, self._taken.write()
         if code == rcl.CLIENT_TAKE_FAILED:
             return None
         raise RosError(f"a response cannot be taken: {rcl.error_text()}")
@@ -192,7 +188,7 @@ def self_test() -> None:
     message = CMessage(parameter)
     try:
         message.read(bytes(serialize_message(expected)))
-        written = message.write(rcl.load()[0])
+        written = message.write()
     finally:
         message.close()
     if deserialize_message(written, parameter) != expected:

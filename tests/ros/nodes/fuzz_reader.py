@@ -10,7 +10,6 @@ import sys
 from typing import Any
 
 from fogft.errors import RosError
-from fogft.ros import rcl
 from fogft.ros.serialised import CMessage
 from fogft.ros.types import load_service_type
 
@@ -56,7 +55,7 @@ def main(seed: int, rounds: int, names: list[str]) -> None:
             for _ in range(rounds):
                 try:
                     message.read(corrupted(chance.choice(goods), chance))
-                    goods = [*goods[-20:], message.write(rcl.load()[0])]
+                    goods = [*goods[-20:], message.write()]
                     read += 1
                 except RosError:
                     refused += 1
