@@ -15,6 +15,7 @@ from fogft.ordering.orders import Op, OrderError, OrderId, decode, encode
 from fogft.ordering.sequencer import Handover, Sequencer
 from fogft.proxy.robot.order_mark import OrderMark
 from fogft.requests.decide import Decide, Judgement, Means, Pending, Reachable, Send
+from fogft.requests.pending import POISON_DEATHS
 
 log = logging.getLogger(__name__)
 
@@ -157,9 +158,10 @@ class ServiceOrder(Decide):
         if current is not None:
             op, _, number = current
             kills = self._term.refused(replica, op, number, refusal, self._clock(), detail=detail)
-            if kills:
-                log.error("request_kills service=%s request=%s", self._name,
-                          self._requests.get(number, b"").hex())  # fmt: skip
+            if kills and pending is not None:
+                pending.deaths = POISON_DEATHS  # it is given up
+            elif kills:
+                log.error("request_poison service=%s number=%d", self._name, number)
         self._wake_if_due()
 
     def declined(self, id: bytes, replica: int, now: float) -> None:

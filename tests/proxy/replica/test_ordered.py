@@ -288,6 +288,33 @@ def test_whether_it_can_answer_is_asked_while_another_thread_begins_a_term(scene
         taking.result()
 
 
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_request_over_which_every_service_dies_ends_as_poison(tmp_path, waits, caplog):
+    """Its caller is told what is set for a deadline, if it waits still; the next is applied."""
+    scene = Scene(tmp_path, on_timeout=OnTimeout.EMPTY)
+    scene.run()
+    scene.rounds = 8  # so that it does not expire
+    scene.dispatcher.submit(b"kills", "h1")
+    scene.run()
+    if not waits:
+        scene.clock.now += 6.0
+        scene.dispatcher.tick()
+    for responder, clients in zip(scene.responders, scene.clients, strict=True):
+        assert [payload for payload, _ in clients.service.calls] == [b"kills"]
+        clients.service.calls.clear()
+        responder.crashed()
+        responder.use(clients)
+        scene.run()
+        responder.tick(alive=True)
+    assert scene.responses == [("h1", b"empty")]
+    count = scene.dispatcher.report()
+    assert (count["poison"], count["empty"], count["pending"]) == (waits, not waits, 0)
+    assert "request_poison service=/s" in caplog.text
+    scene.dispatcher.submit(b"q2", "h2")
+    scene.run()
+    assert any(clients.service.calls for clients in scene.clients)
+
+
 def test_requests_wait_until_a_replica_has_joined(tmp_path):
     scene = Scene(tmp_path, replicas=1)
     scene.clients[0].restore.there = False
