@@ -6,6 +6,7 @@ sees the others in the replica's words. Who is asked is decided in `auto` and `c
 
 import math
 from enum import IntFlag
+from itertools import islice
 from typing import NamedTuple
 
 from fogft.requests.latency import Latencies
@@ -247,7 +248,8 @@ class ReplicaLoad:
         gain = max(_USUAL_GAIN, 1.0 / max(1, self.told - NEW))
         self.usual_s += gain * (load.service_s - self.usual_s)
         if seen > there:  # the ends of some were lost
-            for lost in [id for id in self.at_work if id != request][: seen - there]:
+            oldest = islice((id for id in self.at_work if id != request), seen - there)
+            for lost in list(oldest):
                 del self.at_work[lost]
 
     def answered(self, request: bytes, load: Load | None, now: float) -> None:
