@@ -210,7 +210,11 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     def told(what: str) -> None:
         output.say(f"ended {what}")
 
-    shutdown.end(store, composition.cloud_of, told=told, warned=output.warn)
+    try:
+        shutdown.end(store, composition.cloud_of, told=told, warned=output.warn)
+    except KeyboardInterrupt:
+        output.say(f"interrupted: `fogft down {store.name}` does the rest")
+        raise typer.Exit(130) from None
     if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
         told(f"{len(swept)} shared-memory files of dead processes")
     if elsewhere:

@@ -145,7 +145,7 @@ def _scalar(kind: Any) -> Read:
         if isinstance(raw, str):
             raw.encode()  # a lone surrogate cannot be written again
         elif not -_MOST <= raw <= _MOST:  # nor NaN
-            raise ValueError(f"{raw!r:.40} is too large")
+            raise ValueError(f"{raw!r:.40} is out of range")
         return kind(raw)
 
     return read

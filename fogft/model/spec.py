@@ -315,7 +315,7 @@ class PoolSpec:
     availability: AvailabilitySpec | None = key(
         Map(AvailabilitySpec, short=("target",)),
         "Fraction of time that at least one replica must answer; sets the number of replicas, with "
-        "`replicas` as the minimum. `0.9995` is short for `{target: 0.9995}`.",
+        "`replicas`, if given, as the minimum. `0.9995` is short for `{target: 0.9995}`.",
         default=None,
     )
     placement: PlacementSpec = key(

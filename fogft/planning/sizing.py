@@ -13,7 +13,7 @@ from fogft.model.groups import Group, groups_of, shares
 from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import Observed, Offer, Placement
-from fogft.model.schedule import wish
+from fogft.model.schedule import window_at, wish
 from fogft.model.spec import PoolSpec
 from fogft.planning.availability import expected, full_together, replicas_needed, unavailability_of
 from fogft.planning.listing import Listing, Scale, catalogue
@@ -56,12 +56,13 @@ def size(inputs: Inputs, running: int = 0) -> Size:
     spec, intent, observed, _ = inputs
     groups = groups_of(spec)
     now = wish(spec, observed.wall_clock)
+    window = spec.schedule and window_at(spec.schedule, observed.wall_clock)
     notes = [Reason(Cause.SCHEDULED_AHEAD)] if now.ahead else []
     cap = observed.below(now.max_usd_per_hour)
     total = now.replicas
     if intent.stopping or intent.is_scaled(spec):
         total = intent.wanted(spec, observed.wall_clock)
-    elif spec.availability and total == spec.replicas:
+    elif spec.availability and not (now.ahead or (window and window.replicas is not None)):
         total, unmet = _for_target(inputs, spec.availability, cap, running)
         notes += because(unmet)
     return Size(groups, shares(groups, total), cap, tuple(notes))

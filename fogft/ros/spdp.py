@@ -80,18 +80,26 @@ def first_port(domain_id: int) -> int:
 
 
 def _send(message: bytes, domain_id: int) -> None:
-    peers = re.split(r"[;\s]+", os.environ.get("ROS_STATIC_PEERS", ""))
+    _tell(message, domain_id, _LOOPBACK)
+    for peer in filter(None, re.split(r"[;\s]+", os.environ.get("ROS_STATIC_PEERS", ""))):
+        on_thread(_tell, message, domain_id, peer, name="peer")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending:
-        for host in filter(None, [_LOOPBACK, *peers]):
-            for id in range(_IDS):
-                with contextlib.suppress(OSError):
-                    sending.sendto(message, (host, first_port(domain_id) + _ID_GAIN * id))
         with contextlib.suppress(OSError):
             for index, _ in socket.if_nameindex():
                 with contextlib.suppress(OSError):
                     through = struct.pack("=4s4si", b"", b"", index)
                     sending.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, through)
                     sending.sendto(message, (_GROUP, BASE_PORT + DOMAIN_GAIN * domain_id))
+
+
+def _tell(message: bytes, domain_id: int, host: str) -> None:
+    with (
+        contextlib.suppress(OSError, UnicodeError),  # it has no such name
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending,
+    ):
+        address = socket.gethostbyname(host)  # without a network that takes seconds
+        for port in range(first_port(domain_id), 1 << 16, _ID_GAIN)[:_IDS]:
+            sending.sendto(message, (address, port))
 
 
 def declare_gone(prefix: bytes, domain_id: int) -> None:

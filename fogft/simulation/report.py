@@ -116,8 +116,10 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"some boots take longer than `health.start_limit_s` ({limit_s:g} s): such launches "
             "count as failed"
         )
-    if any(line.length_s < scenario.length_s for line in scenario.prices.values()):
-        notes.append("the recorded prices end before the simulation does: the last one holds on")
+    replayed = (line.length_s for line in scenario.recorded.values())
+    known_s = max(scenario.length_s, min(replayed, default=0.0))
+    if any(line.length_s < known_s for line in scenario.prices.values()):
+        notes.append("recorded prices end before traces or simulation do: the last one holds on")
     if not scenario.recorded:
         return scenario, notes
     lengths = {place: line.length_s for place, line in scenario.recorded.items()}

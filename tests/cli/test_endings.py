@@ -44,6 +44,16 @@ def test_a_defect_of_ours_keeps_its_trace(monkeypatch):
         run_failing(monkeypatch, ZeroDivisionError("defect"))
 
 
+def test_a_down_that_is_interrupted_says_what_does_the_rest(home, monkeypatch, capsys):
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    lay_down(home)
+    monkeypatch.setattr("fogft.pool.manager.shutdown.end", interrupted)
+    assert main.run(["down", "--yes"]) == 130
+    assert capsys.readouterr().err == "interrupted: `fogft down planner` does the rest\n"
+
+
 def test_a_file_that_is_not_ours_is_an_error_and_no_trace(tmp_path, monkeypatch, capsys):
     home = tmp_path / "home"
     home.write_text("no folder")
@@ -60,6 +70,18 @@ def test_what_a_locale_cannot_write_is_replaced(home):
         [sys.executable, "-c", script], env=environ, capture_output=True, check=True
     )
     assert done.stdout == b"?\n"
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_without_stdout_or_stderr_the_work_is_done_all_the_same(home, tmp_path, closed):
+    """No file that is opened may take the place of either."""
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -m fogft init echo --into {tmp_path / 'new'} {closed}"],
+        env={**os.environ, "FOGFT_HOME": str(home)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "new" / "pool.yaml").read_text().count("done:") == 0
 
 
 def test_a_full_disk_behind_stdout_is_an_error_and_no_trace(home, tmp_path):

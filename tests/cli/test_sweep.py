@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,9 +15,9 @@ from fogft import disk
 from fogft.cli import main
 from fogft.cloud.local import processes
 from fogft.cloud.sky import adapter as sky
-from fogft.errors import CloudUnreachable
+from fogft.errors import CloudError, CloudUnreachable
 from fogft.pool.commands import preview
-from fogft.pool.commands.sweep import left_of
+from fogft.pool.commands.sweep import clouds_used, left_of
 from fogft.pool.folder.paths import PoolPaths
 from tests.cloud.conftest import Local
 from tests.fakes.pools import SPEC, STATUS, lay_down
@@ -73,6 +74,15 @@ def test_what_a_living_manager_owns_is_left_alone(home, machines, capsys):
     assert line.endswith("pool `planner` has no manager")
     assert "`fogft sweep --end` ends them" in err
     assert machines.machine(id), "nothing is ended unasked"
+
+
+def test_a_cloud_that_could_not_be_used_is_no_cloud_that_was_used(home, monkeypatch):
+    """A `plan` without SkyPilot fails, and leaves no folder for which `sweep` asks it."""
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    monkeypatch.setitem(sys.modules, "sky", None)
+    with pytest.raises(CloudError, match="SkyPilot cannot be used here"):
+        sky.make(home / "sky")
+    assert clouds_used() == ["local"]
 
 
 def test_the_machines_of_a_pool_that_was_exported_are_left_to_who_manages_it_now(

@@ -318,6 +318,15 @@ def test_the_pool_is_whole_when_its_window_opens_and_shrinks_after():
     assert len(ours(world)) == 2
 
 
+def test_a_windows_number_holds_also_where_it_is_the_usual_one():
+    """A target sets the number outside of it only."""
+    opens = NOW - 22 * 3600 - 13 * 60 - 20 + 23 * 3600
+    target = AvailabilitySpec(target=0.9995, no_room=0.0)
+    asked = replace(with_window(1, None), replicas=1, availability=target)
+    assert World(asked, offers=SPOT, now=opens + 60.0).plan().wanted == 1
+    assert World(asked, offers=SPOT, now=opens - 10_000.0).plan().wanted == 2
+
+
 def test_a_lower_cap_ends_the_dearest_and_keeps_one():
     asked = spec(3, max_usd_per_hour=0.25)
     dear = replica(0, price=0.3, of=asked)

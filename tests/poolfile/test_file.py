@@ -211,6 +211,11 @@ MISTAKES = {
         "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`",
     ),
     # types
+    "time for a number": (
+        pool("max_hours: 1:30"),
+        "pool.yaml:4: fogft.max_hours: must be a number, not the text `1:30`",
+        "write a number of hours above 0 and at most 8000, such as `max_hours: 2.5`",
+    ),
     "text for a whole number": (
         pool("replicas: two"),
         "pool.yaml:4: fogft.replicas: must be a whole number, not the text `two`",

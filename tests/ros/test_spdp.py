@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import socket
 import struct
+import threading
+
+import pytest
 
 from fogft.ros import spdp
 from fogft.ros.joining import Pauses
@@ -43,6 +46,36 @@ def test_a_killed_participant_is_declared_gone_once_it_is_known(ros_domain: int)
         for prefix in (known[:-1], b"\x07" + known[1:], known):
             spdp.declare_gone(prefix, ros_domain)
         assert other.recv(1 << 16) == spdp.gone(known), "nothing came before it"
+
+
+def test_a_peer_whose_name_nobody_knows_holds_up_nothing(
+    ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without a network a look-up takes seconds, and a takeover must not wait for it."""
+    begun, over = threading.Event(), threading.Event()
+
+    def look_up(host: str) -> str:
+        if host == "127.0.0.1":
+            return host
+        begun.set()
+        assert over.wait(LIMIT_S)
+        raise OSError(host)
+
+    monkeypatch.setattr(socket, "gethostbyname", look_up)
+    monkeypatch.setenv("ROS_STATIC_PEERS", "robot;other")
+    known = b"\x01\x0f" + bytes(range(10))
+    with listening(ros_domain, 60) as other:
+        spdp.declare_gone(known, ros_domain)
+        assert other.recv(1 << 16) == spdp.gone(known)
+        assert begun.wait(LIMIT_S)
+    over.set()
+
+
+def test_the_highest_domain_has_fewer_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+    monkeypatch.setattr(socket.socket, "sendto", lambda _, message, place: told.append(place[1]))
+    spdp.declare_gone(b"\x01\x0f" + bytes(range(10)), 232)
+    assert max(told) == 65534
 
 
 def test_a_stop_that_dds_does_not_outlast_is_noticed_once() -> None:

@@ -32,7 +32,7 @@ def trace(data=(1, 1, 0, 1), gap_s=300, **more):
         (trace(data=[1, "up"]), r"data\[1\]: .up. is not of type `float`"),
         (trace(data=[1, True]), r"data\[1\]: True is not of type `float`"),
         (trace(data=[1, 0.5]), r"data\[1\]: 0.5 is not a number of machines"),
-        (trace(data=[1, float("nan")]), r"data\[1\]: nan is too large"),
+        (trace(data=[1, float("nan")]), r"data\[1\]: nan is out of range"),
         (trace(times=[0, 300]), "times: must be a list as long as `data`"),
         (trace(times=[0, 300, 200, 500]), r"times\[2\]: -100 s after the sample before it"),
         (trace(times=[0, 300, 1500, 1800]), r"times\[2\]: 1200 s after the sample before it"),

@@ -64,6 +64,8 @@ def make(folder: Path) -> SkyCloud:
     # Robots of one image have one user and one host name, but each should have its own id.
     machine = hashlib.sha256(read_bytes(MACHINE_ID) or b"").hexdigest()[:8]
     owner = f"{user}-{socket.gethostname()}"[:50] + f"-{machine}"
+    if not folder.exists() and importlib.util.find_spec("sky") is None:
+        InstalledSky().load()  # raises: without a launch no folder says that clouds were used
     google = importlib.util.find_spec("google") and importlib.util.find_spec("google.auth")
     providers = [Aws(), Gcp()] if google else [Aws()]
     return SkyCloud(folder, InstalledSky(), providers, owner=owner)

@@ -63,7 +63,7 @@ def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
         @functools.wraps(call)
         def limited(self: InstalledSky, *args: Any) -> Any:
             def run() -> Any:
-                self._load()
+                self.load()
                 return call(self, *args)
 
             return self.within(limit_s, subject.format(*args), run)
@@ -154,7 +154,7 @@ class InstalledSky:
         """List one cluster, or all for None. `refresh` asks the clouds: it takes seconds."""
 
         def run() -> Sequence[Cluster]:
-            self._load()
+            self.load()
             modes = self.sky.StatusRefreshMode
             mode = modes.FORCE if refresh else modes.NONE
             names = None if name is None else [name]
@@ -272,7 +272,7 @@ class InstalledSky:
         return self._settings.uploaded(clouds)
 
     def _log(self, lines: int, read: Callable[..., object]) -> str:
-        self._load()
+        self.load()
         out = io.StringIO()
         with contextlib.suppress(CloudError):  # a log that is missing must not hide the failure
             self.within(
@@ -282,7 +282,8 @@ class InstalledSky:
             )
         return out.getvalue()
 
-    def _load(self) -> None:
+    def load(self) -> None:
+        """Import SkyPilot. Raises CloudError: it cannot be used here."""
         with self._lock:
             if self.sdk is not None:
                 return

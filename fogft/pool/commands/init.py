@@ -5,7 +5,6 @@ A file that is already there is never overwritten unless that was asked for.
 
 import json
 import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,7 +40,7 @@ def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Pa
         _check_room(target, written[:-1], force)
         for relative in names:
             (target / relative).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(source / relative, target / relative)
+            (target / relative).write_bytes((source / relative).read_bytes())
         form = json.dumps(schema.pool_schema(), indent=2) + "\n"
         written[-1].write_text(form, encoding="utf-8")  # which its first line names, for editors
     except OSError as error:
