@@ -11,6 +11,7 @@ from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption, Slot
 from fogft.errors import FogftError, known_slots
 from fogft.pool.commands import composition
+from fogft.pool.folder.paths import home
 
 if TYPE_CHECKING:
     from fogft.cloud.local.chaos import Chaos
@@ -136,7 +137,7 @@ def clear() -> None:
 def _chaos() -> Chaos:
     from fogft.cloud.local.chaos import Chaos
 
-    return Chaos(composition.local_root())
+    return Chaos(home() / composition.LOCAL)
 
 
 def _machine(pool: str | None, slot: int) -> ReplicaId:

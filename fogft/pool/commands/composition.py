@@ -7,7 +7,6 @@ Not here: what a command does to a pool (its siblings).
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fogft.errors import CloudError, PoolNotFound
@@ -69,17 +68,12 @@ def make_cloud(name: str) -> Cloud:
     if name == SKY:
         from fogft.cloud.sky import adapter
 
-        return adapter.make(home() / "sky")
+        return adapter.make(home() / SKY)
     from fogft.cloud.local.cloud import LocalCloud
 
-    return LocalCloud(local_root())
+    return LocalCloud(home() / LOCAL)
 
 
 def cloud_of(identity: Identity) -> Cloud:
     """Return the cloud that a pool runs on."""
     return make_cloud(identity.cloud)
-
-
-def local_root() -> Path:
-    """Return where the local cloud keeps its machines."""
-    return home() / "local"
