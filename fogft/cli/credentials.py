@@ -96,8 +96,7 @@ def list_(as_json: AsJson = False, pool: PoolOption = None) -> None:
         (e.holder.role.value, e.holder.short, e.state(now), utc(e.not_after), e.serial[:16])
         for e in entries
     ]
-    names = ("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL")
-    show_table(names, rows)
+    show_table(("ROLE", "NAME", "STATE", "VALID UNTIL", "SERIAL"), rows)
 
 
 @credentials.command(cls=Command, epilog="fogft credentials revoke robot ada")
