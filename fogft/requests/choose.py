@@ -123,9 +123,7 @@ class Learning(Choose):
     def _doubts(self, replica: int, begun: float, now: float) -> bool:
         """Whether a replica is doubted, by an attempt that began then."""
         known = self._replicas[replica]
-        was = known.doubted
-        if known.doubt(begun, now) and not was:
-            self.news = True  # what else it has goes to another, too
+        self.news |= not known.doubted and known.doubt(begun, now)  # what else it has moves, too
         return known.doubted
 
     def hangs(self, replica: int) -> None:

@@ -64,10 +64,7 @@ class ConcurrencyLimit:
         self._kept = None
         if kept is not None:
             limit_before, rate_before = kept
-            better = rate >= _NEAR * rate_before if tried < limit_before else (
-                rate * _NEAR >= rate_before
-            )  # fmt: skip
-            if not better:
+            if rate < rate_before * (_NEAR if tried < limit_before else 1.0 / _NEAR):
                 self._tried[tried] = now
                 self._set(limit_before)
                 return

@@ -248,8 +248,7 @@ class ReplicaLoad:
         gain = max(_USUAL_GAIN, 1.0 / max(1, self.told - NEW))
         self.usual_s += gain * (load.service_s - self.usual_s)
         if seen > there:  # the ends of some were lost
-            oldest = islice((id for id in self.at_work if id != request), seen - there)
-            for lost in list(oldest):
+            for lost in [*islice((id for id in self.at_work if id != request), seen - there)]:
                 del self.at_work[lost]
 
     def answered(self, request: bytes, load: Load | None, now: float) -> None:

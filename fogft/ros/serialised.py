@@ -94,12 +94,9 @@ class _End:
         self._header = rcl.RequestHeader()
         self._header_reference = byref(self._header)
 
-    def _check_sent(self, code: int, what: str) -> None:
-        self._refused = code != rcl.OK
-        if code == rcl.TIMEOUT:
-            raise NotFoundYet(f"a {what} cannot be sent: {rcl.error_text()}")
-        if self._refused:
-            raise RosError(f"a {what} cannot be sent: {rcl.error_text()}")
+    def _unsent(self, code: int, what: str) -> RosError:
+        kind = NotFoundYet if code == rcl.TIMEOUT else RosError
+        return kind(f"a {what} cannot be sent: {rcl.error_text()}")
 
     def _check_name(self, found: bytes | None, name: str) -> None:
         """Make sure that the address is what we take it for."""
@@ -136,8 +133,9 @@ class ServiceEnd(_End):
         if self._refused:
             functions = self._released
         code = functions.rcl_send_response(self._pointer, handle, self._sent_address)
-        if code != rcl.OK or self._refused:
-            self._check_sent(code, "response")
+        self._refused = code != rcl.OK
+        if self._refused:
+            raise self._unsent(code, "response")
 
 
 class ClientEnd(_End):
@@ -167,8 +165,9 @@ class ClientEnd(_End):
         if self._refused:
             functions = self._released
         code = functions.rcl_send_request(self._pointer, self._sent_address, self._ticket_reference)
-        if code != rcl.OK or self._refused:
-            self._check_sent(code, "request")
+        self._refused = code != rcl.OK
+        if self._refused:
+            raise self._unsent(code, "request")
         return self._ticket.value
 
 

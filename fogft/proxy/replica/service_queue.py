@@ -99,7 +99,8 @@ class ServiceQueue:
         self._unanswered = 0  # of what was passed on, whether room is kept for it or not
         self._last_deadline = 0.0
         self.held_until = NEVER  # nothing is begun before, or before `release`
-        self._results, self._batch = results, 0  # passed on since it was seen to have taken all
+        self._batch = 0  # passed on since it was seen to have taken all
+        self._batch_limit = _BATCH if results else NEVER
         self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
 
     def put(self, job: Job) -> None:
@@ -111,13 +112,9 @@ class ServiceQueue:
         self._longest_given_s = max(given_s, self._longest_given_s * LONGEST_FADES)
 
     def _has_room(self, job: Job) -> bool:
-        if self.at_work and (job.alone or self._alone or (self._results and self._batch_is_full)):
+        if self.at_work and (job.alone or self._alone or self._batch >= self._batch_limit):
             return False
         return self.at_work < (self.limit.limit if job.spare else self.limit.in_hand)
-
-    @property
-    def _batch_is_full(self) -> bool:
-        return self._results and self._batch >= _BATCH
 
     def has_free_slot(self, now: float) -> bool:
         """Whether nothing waits, and the service can start one more (almost) at once."""
@@ -227,7 +224,7 @@ class ServiceQueue:
 
     def hold_batch(self, now: float) -> float | None:
         """Do the same if a batch is full, until the action server is seen to have taken it."""
-        return self.hold(now, _BATCH_LIMIT_S) if self._batch_is_full else None
+        return self.hold(now, _BATCH_LIMIT_S) if self._batch >= self._batch_limit else None
 
     def release(self, until: float | None = None) -> None:
         """End a `hold`, if there is one; with `until` that one only."""

@@ -105,15 +105,13 @@ class ReplyQueue:
                 reply = self.replies.get_nowait()
             except Empty:
                 break
-            if not isinstance(reply, Reply):
-                self._taken.append(reply)
-                break
-            size += len(reply.payload)
-            fits = size <= batch_frames.BYTES_LIMIT
-            if not fits or not reply.joins or reply.stream is not first.stream:
-                self._taken.append(reply)
-                break
-            together.append(reply)
+            if isinstance(reply, Reply) and reply.joins and reply.stream is first.stream:
+                size += len(reply.payload)
+                if size <= batch_frames.BYTES_LIMIT:
+                    together.append(reply)
+                    continue
+            self._taken.append(reply)
+            break
         return together
 
 
