@@ -164,7 +164,7 @@ def _sequence(of: _Kind, bound: int) -> _Kind:
         if count > data.size - at:  # each has a byte at the least
             raise _Malformed(f"it ends within a sequence of {count} elements")
         known = len(data.booleans)
-        end = _several(of, count, data, at)
+        end = _several(of, count, data, at, keep=False)
         del data.booleans[known:]  # only what has a fixed size is stepped over unseen
         return end
 
@@ -183,7 +183,7 @@ def _one_after_another(kinds: list[_Kind]) -> _Kind:
     return _Kind(walk, align, all(kind.has_fixed_size for kind in kinds))
 
 
-def _several(of: _Kind, count: int, data: _Bytes, at: int) -> int:
+def _several(of: _Kind, count: int, data: _Bytes, at: int, *, keep: bool = True) -> int:
     """Step over some values of one type, all at once where each takes as much as the one before."""
     while count:
         began, at = at, of.walk(data, at)
@@ -196,6 +196,6 @@ def _several(of: _Kind, count: int, data: _Bytes, at: int) -> int:
                 return end
             for boolean in data.booleans[known:]:
                 data.check_booleans(boolean, end, size)
-                data.booleans.extend(range(boolean + size, end, size))
+                data.booleans += range(boolean + size, end, size) if keep else ()
             return end
     return at

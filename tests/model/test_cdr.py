@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -76,6 +77,18 @@ def test_a_huge_count_costs_no_time() -> None:
     """A count of four billion in a few bytes is seen at once."""
     points = Shape("m", {"m": (("p", "sequence<P>"),), "P": (("x", "string"),)})
     assert points.fault(LITTLE + b"\xff\xff\xff\xff" + bytes(40)) != ""
+
+
+def test_a_long_sequence_of_booleans_takes_no_memory_of_its_own() -> None:
+    shape = Shape("message", {"message": (("flags", "sequence<boolean>"),)})
+    count = 1 << 20
+    payload = LITTLE + struct.pack("<I", count) + bytes(count)
+    tracemalloc.start()
+    try:
+        assert shape.fault(payload) == ""
+        assert tracemalloc.get_traced_memory()[1] < count // 4
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_message_without_fields_has_one_byte() -> None:
