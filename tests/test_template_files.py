@@ -151,11 +151,11 @@ class TestRefusals:
 
     def test_the_disk_is_full(self, tmp_path, monkeypatch):
         def full(*_):
-            raise OSError(28, "No space left on device", "x")
+            raise OSError(28, "No space left on device")  # writing names no file
 
-        monkeypatch.setattr(shutil, "copyfile", full)
+        monkeypatch.setattr(Path, "write_bytes", full)
         assert self.refuse(tmp_path, "echo", tmp_path) == (
-            "`x` cannot be written: No space left on device",
+            f"`{tmp_path}` cannot be written: No space left on device",
             "choose another folder with `--into DIR`",
         )
 

@@ -129,6 +129,9 @@ class ScriptedSky:
 
     # -- the surface --------------------------------------------------------------------------
 
+    def load(self) -> None:
+        pass
+
     def launch(self, task: Mapping[str, Any], name: str, group: str = "") -> str:
         self._meet("launch", name)
         request = Request(f"r{next(self._counter)}", active=True)
