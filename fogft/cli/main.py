@@ -63,8 +63,8 @@ def main(args: Sequence[str] | None = None) -> None:
     """Run the command line and exit the process."""
     while (free := os.open(os.devnull, os.O_RDWR)) < 3:  # of a closed stream: no file may take it
         os.set_inheritable(free, True)
-    sys.stdout, sys.stderr = sys.stdout or os.fdopen(1, "w"), sys.stderr or os.fdopen(2, "w")
-    os.close(free)
+    nowhere = os.fdopen(free, "w", errors="replace")
+    sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
     if isinstance(sys.stdout, io.TextIOWrapper):  # not every locale has all characters
         sys.stdout.reconfigure(errors="replace")
     sys.exit(run(sys.argv[1:] if args is None else args))

@@ -291,6 +291,7 @@ class Sequencer:
             peer.open.discard(index)
             if reason in (Refusal.FORGOTTEN, Refusal.MALFORMED):
                 peer.acked = max(peer.acked, index)
+                self._applied_to = max(self._applied_to, index)
                 return False
             expected = orders.read_index(detail) if reason is Refusal.GAP else None
             if expected is not None and not (peer.joined and peer.went_back >= _GOES_BACK):

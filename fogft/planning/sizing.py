@@ -56,13 +56,13 @@ def size(inputs: Inputs, running: int = 0) -> Size:
     spec, intent, observed, _ = inputs
     groups = groups_of(spec)
     now = wish(spec, observed.wall_clock)
-    window = spec.schedule and window_at(spec.schedule, observed.wall_clock)
+    window = spec.schedule and not now.ahead and window_at(spec.schedule, observed.wall_clock)
     notes = [Reason(Cause.SCHEDULED_AHEAD)] if now.ahead else []
     cap = observed.below(now.max_usd_per_hour)
     total = now.replicas
     if intent.stopping or intent.is_scaled(spec):
         total = intent.wanted(spec, observed.wall_clock)
-    elif spec.availability and not (now.ahead or (window and window.replicas is not None)):
+    elif spec.availability and total == spec.replicas and not (window and window.replicas):
         total, unmet = _for_target(inputs, spec.availability, cap, running)
         notes += because(unmet)
     return Size(groups, shares(groups, total), cap, tuple(notes))

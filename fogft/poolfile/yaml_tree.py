@@ -141,7 +141,7 @@ class _Loader(yaml.SafeLoader):
     def _scalar(self, node: yaml.ScalarNode, path: str) -> str | int | float | bool | None:
         text: str = node.value
         line = node.start_mark.line + 1
-        if node.tag in _AS_WRITTEN or ":" in text:  # to base 60 no newer YAML counts
+        if node.tag in _AS_WRITTEN or (":" in text and node.tag in _CONVERTED):  # not base 60
             if any(c == "\0" or "\ud800" <= c <= "\udfff" for c in text):
                 raise self._error(line, path, "holds a character that is not text", "remove it")
             return text

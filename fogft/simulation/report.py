@@ -116,8 +116,7 @@ def _fitting(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"some boots take longer than `health.start_limit_s` ({limit_s:g} s): such launches "
             "count as failed"
         )
-    replayed = (line.length_s for line in scenario.recorded.values())
-    known_s = max(scenario.length_s, min(replayed, default=0.0))
+    known_s = min((x.length_s for x in scenario.recorded.values()), default=scenario.length_s)
     if any(line.length_s < known_s for line in scenario.prices.values()):
         notes.append("recorded prices end before traces or simulation do: the last one holds on")
     if not scenario.recorded:

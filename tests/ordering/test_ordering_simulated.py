@@ -6,9 +6,11 @@ import random
 
 import pytest
 
-from fogft.ordering import peer
+from fogft.model.refusal import Refusal
+from fogft.ordering import orders, peer
 from fogft.ordering.catching_up import WINDOW
-from fogft.ordering.orders import Op
+from fogft.ordering.orders import Op, Promise
+from fogft.ordering.sequencer import Sequencer
 from tests.nightly import by_day
 from tests.ordering.linearizability import Call, counter, key_value, linearizable
 from tests.ordering.ordering_world import World
@@ -233,6 +235,33 @@ def test_a_request_over_which_every_service_dies_ends_without_effect(replicas):
     assert world.answers() == [1, 2, 3, 4]
     assert world.deaths == max(2, replicas)
     assert {host.state for host in world.hosts.values()} == {4}
+
+
+@pytest.mark.parametrize("reason", [Refusal.MALFORMED, Refusal.FORGOTTEN])
+def test_one_of_which_a_replica_has_no_answer_but_the_effect_keeps_it_though_that_leaves(reason):
+    sequencer = Sequencer(1 << 32)
+    sequencer.reach({1, 2}, 0.0)
+
+    def brought_up(now):
+        sequencer.tick(now)
+        for order in sequencer.take():
+            if order.op is Op.CLAIM:
+                said = orders.encode_promise(Promise(orders.START, True))
+                sequencer.replied(order.replica, order.op, order.index, said)
+            elif order.op is Op.JOIN:
+                sequencer.replied(order.replica, order.op, order.index, orders.encode_index(1))
+
+    for now in (1.0, 2.0, 3.0):
+        brought_up(now)
+    number = sequencer.submit(b"question")
+    assert {order.replica for order in sequencer.take()} == {1, 2}
+    sequencer.refused(2, Op.APPLY, number, reason, 4.0)
+    sequencer.reach({1}, 4.0)
+    for now in (5.0, 10.0, 15.0):
+        assert not sequencer.refused(1, Op.APPLY, number, Refusal.CRASHED, now)
+        for later in (1.0, 2.0, 3.0):
+            brought_up(now + later)
+    assert sequencer.log.get(number) == b"question"
 
 
 def test_one_that_a_replica_out_of_reach_may_have_applied_keeps_its_effect():

@@ -327,6 +327,16 @@ def test_a_windows_number_holds_also_where_it_is_the_usual_one():
     assert World(asked, offers=SPOT, now=opens - 10_000.0).plan().wanted == 2
 
 
+def test_a_targets_number_is_launched_before_a_window_of_fewer_ends():
+    window = WindowSpec(frozenset(range(7)), 20 * 3600, 22 * 3600 + 15 * 60, 1, None)  # in 100 s
+    target = AvailabilitySpec(target=0.99999, no_room=0.0)
+    asked = spec(2, schedule=ScheduleSpec("UTC", (window,), 600.0), availability=target)
+    usual = World(asked, offers=SPOT, now=NOW + 200.0).plan().wanted
+    assert usual > 2
+    assert World(asked, offers=SPOT, now=NOW).plan().wanted == usual
+    assert World(asked, offers=SPOT, now=NOW - 3600.0).plan().wanted == 1
+
+
 def test_a_lower_cap_ends_the_dearest_and_keeps_one():
     asked = spec(3, max_usd_per_hour=0.25)
     dear = replica(0, price=0.3, of=asked)

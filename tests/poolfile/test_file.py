@@ -211,6 +211,11 @@ MISTAKES = {
         "write `package/srv/Name`, such as `type: std_srvs/srv/SetBool`",
     ),
     # types
+    "a tag on a text with a colon": (
+        pool(top="envs: {a: !secret x:y}"),
+        "pool.yaml:1: envs.a: the tag `!secret` is not allowed",
+        "remove it",
+    ),
     "time for a number": (
         pool("max_hours: 1:30"),
         "pool.yaml:4: fogft.max_hours: must be a number, not the text `1:30`",
