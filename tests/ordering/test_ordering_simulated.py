@@ -251,7 +251,7 @@ def test_one_of_which_a_replica_has_no_answer_but_the_effect_keeps_it_though_tha
             elif order.op is Op.JOIN:
                 sequencer.replied(order.replica, order.op, order.index, orders.encode_index(1))
 
-    for now in (1.0, 2.0, 3.0):
+    for now in (1.0, 2.0):
         brought_up(now)
     number = sequencer.submit(b"question")
     assert {order.replica for order in sequencer.take()} == {1, 2}
@@ -259,7 +259,7 @@ def test_one_of_which_a_replica_has_no_answer_but_the_effect_keeps_it_though_tha
     sequencer.reach({1}, 4.0)
     for now in (5.0, 10.0, 15.0):
         assert not sequencer.refused(1, Op.APPLY, number, Refusal.CRASHED, now)
-        for later in (1.0, 2.0, 3.0):
+        for later in (1.0, 2.0):
             brought_up(now + later)
     assert sequencer.log.get(number) == b"question"
 
