@@ -99,7 +99,8 @@ def _tell(message: bytes, domain_id: int, host: str) -> None:
     ):
         address = socket.gethostbyname(host)  # without a network that takes seconds
         for port in range(first_port(domain_id), 1 << 16, _ID_GAIN)[:_IDS]:
-            sending.sendto(message, (address, port))
+            with contextlib.suppress(OSError):  # a firewall may let only some pass
+                sending.sendto(message, (address, port))
 
 
 def declare_gone(prefix: bytes, domain_id: int) -> None:

@@ -78,6 +78,18 @@ def test_the_highest_domain_has_fewer_ports(monkeypatch: pytest.MonkeyPatch) -> 
     assert max(told) == 65534
 
 
+def test_a_port_that_a_firewall_bars_bars_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+
+    def send(_: socket.socket, message: bytes, place: tuple[str, int]) -> None:
+        told.append(place[1])
+        raise PermissionError
+
+    monkeypatch.setattr(socket.socket, "sendto", send)
+    spdp.declare_gone(b"\x01\x0f" + bytes(range(10)), 0)
+    assert {7410, 7412, 7536} <= set(told)
+
+
 def test_a_stop_that_dds_does_not_outlast_is_noticed_once() -> None:
     """Fast DDS gives up on a participant 20 s after the last sign of life, sent every 3 s."""
     now = [100.0]

@@ -159,8 +159,7 @@ class ReplyQueues:
             if queue is None or queue.waiting >= _REFUSALS_LIMIT:
                 return
             too_large = size > MESSAGE_BYTES_LIMIT - _HEAD_BYTES
-            full = queue.waiting >= REPLIES_LIMIT
-            dropped = full or too_large or not (small or queue.large.has_room(size))
+            dropped = queue.waiting >= REPLIES_LIMIT or not queue.large.has_room(size) or too_large
             if dropped:
                 refusal = Refusal.MALFORMED.text("too large") if too_large else Refusal.LOST
                 reply.payload, reply.refusal, size = b"", refusal, 0
