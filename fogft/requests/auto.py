@@ -13,13 +13,12 @@ from typing import Any
 
 from fogft.model.replica import short
 from fogft.requests.choose import Learning
-from fogft.requests.load import NEVER, SLOW, Demand, Load
+from fogft.requests.load import ALIKE, NEVER, SLOW, Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
 TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
+_SLOW_TRIAL_EVERY = 20.0  # of its own service times, for one that others are preferred to
 _DOUBTED_TRIAL_EVERY_S = 1.0
-# More often at first: a first call may take seconds, and would bar all others.
-_FIRST_TRIALS, _FIRST_TRIAL_EVERY_S = 5, 0.1
 # Of spare copies, in service times:
 _REMEMBERED = 1000.0  # for how long it counts what they saved and cost
 _REMEMBERED_MOST = 10.0  # how much more they saved than they cost counts at most
@@ -63,12 +62,8 @@ class Spares:
         return self.left_free - (tries and self.left_free > 0)
 
     def saved(self, seconds: float) -> None:
-        """Note that a spare was first, and by how much."""
+        """Note by how much a spare was first; below zero, for how long a request waits for one."""
         self._balance_s += seconds
-
-    def made_wait(self, seconds: float) -> None:
-        """Note that a request has to wait for a spare, and for about how long."""
-        self._balance_s -= seconds
 
 
 class Auto(Learning):
@@ -106,11 +101,11 @@ class Auto(Learning):
         self._busy = known.slots <= 1 and self._demand.rate * known.service_s > _BUSY * len(able)
         self._spares.request(known.service_s, len(able), now)
         if self._spares.open and not known.free(now):
-            self._spares.made_wait(_WAIT * known.service_s)
+            self._spares.saved(-_WAIT * known.service_s)
         overdue_at = known.asked(request, now)
         left_free = self._spares.left_free_by(request)
         copied = left_free < len(able) - 1 and not self.dear and not self._busy
-        others = able if copied else self._stale(able, now)
+        others = able if copied else self._stale(able, best, now)
         spares = [other for other in others if other != best and self._takes_spare(other, now)]
         if copied and left_free:
             spares = spares[:-left_free]
@@ -138,12 +133,13 @@ class Auto(Learning):
         quick = [r for r in sound if now >= known[r].slow_until and known[r].alone_s <= most_s]
         return quick if any(known[r].free(now) for r in quick) else able
 
-    def _stale(self, able: Sequence[int], now: float) -> list[int]:
+    def _stale(self, able: Sequence[int], best: int, now: float) -> list[int]:
         """Return those of which nothing was heard for long: one spare copy shows how they do."""
-        stale = []
+        stale, slower_s = [], NEVER if self.dear else ALIKE * self._replicas[best].usual_s
         for replica in able:
             known = self._replicas[replica]
-            every_s = _FIRST_TRIAL_EVERY_S if known.told < _FIRST_TRIALS else TRIAL_EVERY_S
+            often_s = _SLOW_TRIAL_EVERY * known.usual_s if known.usual_s > slower_s else NEVER
+            every_s = min(TRIAL_EVERY_S, often_s)
             if known.doubted or known.asked_at <= now - every_s:
                 stale.append(replica)
         return stale
@@ -164,6 +160,7 @@ class Auto(Learning):
                 if now < due:
                     self._look(due)
                     return ()
+                free = [c for c in free if now >= self._replicas[c].slow_until]
                 if not free or self._tokens < 1.0:
                     self._look(now + _RETRY_S)
                     return ()

@@ -20,9 +20,10 @@ _RTT_GAIN = 0.1
 NEARLY = 0.8  # of what it usually takes
 # Times as slow or quick as most: by less than the first, by what is known over a long time, no
 # difference counts; by the second even one that is new does.
-_ALIKE, _ALIKE_LATELY = 1.7, 4.0
+ALIKE, _ALIKE_LATELY = 1.7, 4.0
 _USUAL_GAIN = 0.02
 NEW = 20  # words of a replica: they say little
+_FEW = 10  # answers: they do not show how it compares with others
 # Of what a request is expected to take, and of what is ever at work:
 _LATE, _STALLS = 1.2, 3.0
 _DOUBT_AFTER = 2.0
@@ -150,15 +151,14 @@ class ReplicaLoad:
 
     def free(self, now: float) -> bool:
         """Whether a request that arrives now is expected to start (almost) at once."""
-        if self.doubted:
-            return False
         ahead = self.ahead(now)
-        if ahead < max(1, self.slots):
-            return True
+        if self.doubted or ahead < max(1, self.slots):
+            return not self.doubted
         if not ahead == len(self.at_work) == 1:
             return False
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
-        return self._spent_s(now) >= NEARLY * ((self._rtt_s or 0.0) + self.service_s)
+        usual_s = (self._rtt_s or 0.0) + self.service_s
+        return NEARLY * usual_s <= self._spent_s(now) <= _LATE * usual_s
 
     def wait_s(self, now: float) -> float:
         """Return how long a request that arrives now is expected to wait: endless if in doubt."""
@@ -184,7 +184,7 @@ class ReplicaLoad:
         return self.doubted or now < self._avoided_until
 
     def expected_s(self, now: float, typical_s: float, usual_s: float) -> float:
-        """Return the expected latency of a request sent now; 0 where nothing is known: it is tried.
+        """Return the expected latency of a request sent now.
 
         Round trip, and one service time for it and for each request before it, less what the one at
         work has had; one that takes far too long is taken to go on for as long again. A replica
@@ -192,9 +192,11 @@ class ReplicaLoad:
         `usual_s` over a long time.
         """
         service_s = self.service_s
-        if typical_s / _ALIKE_LATELY < service_s < typical_s * _ALIKE_LATELY:
+        if self.latencies.samples < _FEW:
+            service_s = typical_s or SHORTEST_DELAY_S  # of none known the fewest ahead count
+        elif typical_s / _ALIKE_LATELY < service_s < typical_s * _ALIKE_LATELY:
             service_s = self.usual_s
-            if usual_s / _ALIKE < service_s < usual_s * _ALIKE:
+            if usual_s / ALIKE < service_s < usual_s * ALIKE:
                 service_s = typical_s
         rtt_s = self._rtt_s or 0.0
         left_s = service_s * (1 + self.ahead(now))
@@ -202,7 +204,7 @@ class ReplicaLoad:
             return rtt_s + left_s
         spent_s = self._spent_s(now)
         if spent_s <= _LATE * (rtt_s + service_s):
-            left_s -= min(spent_s, service_s)
+            left_s -= min(spent_s, NEARLY * service_s)  # not as good as one that is idle
         elif spent_s > _STALLS * (rtt_s + service_s):
             left_s += spent_s
         return rtt_s + left_s

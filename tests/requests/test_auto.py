@@ -133,7 +133,7 @@ def test_spares_that_cost_more_than_they_save_become_fewer_and_are_tried_again()
         spares.request(0.02, 3, n * 0.05)
         seen.append(spares.left_free)
         if n < 10:
-            spares.made_wait(0.02)
+            spares.saved(-0.02)
     assert seen[:3] == [0, 1, 2]
     assert seen[20] == 2  # and one has the request
     assert [left for left, before in zip(seen[1:], seen, strict=False) if left < before] == [1, 0]
@@ -144,7 +144,7 @@ def test_spares_that_save_more_than_they_cost_stay():
     for n in range(40):
         spares.request(0.02, 3, n * 0.05)
         spares.saved(0.1)
-        spares.made_wait(0.02)
+        spares.saved(-0.02)
     assert spares.left_free == 0
 
 
@@ -153,7 +153,7 @@ def test_some_requests_show_what_more_spares_would_save():
     spares = Spares()
     for n in range(5):
         spares.request(0.02, 3, n * 0.05)
-        spares.made_wait(0.02)
+        spares.saved(-0.02)
     tries = [spares.left_free_by(n.to_bytes(2, "big")) for n in range(0, 65536, 64)]
     assert set(tries) == {1, 2}
     assert 0.01 < tries.count(1) / len(tries) < 0.03
@@ -248,6 +248,18 @@ def test_a_late_hedge_never_goes_to_a_busy_replica():
     policy.first(A, (1,), 31.0)
     policy.first(B, (2,), 31.1)
     assert policy.more(A, {1: 31.0}, (2,), 31.13) == ()
+
+
+def test_a_late_hedge_never_goes_to_one_whose_last_answer_took_far_too_long():
+    """Where all have become slow it would only make others wait."""
+    policy = learned(r1=0.1, r2=0.1)
+    policy.first(B, (2,), 30.5)
+    policy.answered(B, {2: 30.5}, 2, idle(0.7), 31.2)
+    policy.first(A, (1,), 31.2)
+    assert policy.more(A, {1: 31.2}, (2,), 31.35) == ()
+    policy.first(B, (2,), 31.35)
+    policy.answered(B, {2: 31.35}, 2, idle(0.02), 31.37)
+    assert policy.more(A, {1: 31.2}, (2,), 31.38) == (2,)
 
 
 def test_what_a_doubted_replica_has_goes_to_another_though_that_is_busy_and_costs_no_token():

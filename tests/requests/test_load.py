@@ -123,11 +123,14 @@ def test_what_was_asked_fades_to_a_third_in_ten_seconds():
 # -- what is believed of one replica ----------------------------------------------------------
 
 
-def test_of_one_that_nobody_has_asked_nothing_is_expected_and_it_is_free():
-    """So it is tried first."""
+def test_one_that_nobody_has_asked_is_taken_for_like_the_others_and_is_free():
+    """Where nobody has been asked, the fewest requests ahead count."""
     found = ReplicaLoad()
-    assert (found.expected_s(0.0, 0.1, 0.1), found.wait_s(0.0), found.ahead(0.0)) == (0.0, 0.0, 0)
+    assert (found.expected_s(0.0, 0.1, 0.1), found.wait_s(0.0), found.ahead(0.0)) == (0.1, 0.0, 0)
     assert found.free(0.0)
+    unknown, asked = ReplicaLoad(), ReplicaLoad()
+    asked.asked(A, 0.0)
+    assert unknown.expected_s(1.0, 0.0, 0.0) < asked.expected_s(1.0, 0.0, 0.0)
     assert not found.avoided(0.0)
     assert found.oldest_begun == NEVER
     assert found.delay_s == UNKNOWN_DELAY_S
@@ -159,6 +162,7 @@ def test_one_that_is_nearly_over_is_none_more_to_wait_for():
     nearly = 20.0 + NEARLY * 0.1
     assert not found.free(nearly - 0.001)
     assert found.free(nearly + 0.001)
+    assert not found.free(20.125), "it takes longer than it should"
     found.asked(B, 20.01)
     assert not found.free(nearly + 0.001)
     found.dropped(B)
@@ -180,7 +184,7 @@ def test_what_is_at_work_counts_for_what_is_left_of_it():
     found.asked(A, 20.0)
     assert found.expected_s(20.0, 0.1, 0.1) == pytest.approx(0.2)
     assert found.expected_s(20.06, 0.1, 0.1) == pytest.approx(0.14)
-    assert found.expected_s(20.11, 0.1, 0.1) == pytest.approx(0.1), "it is over at any moment"
+    assert found.expected_s(20.11, 0.1, 0.1) == pytest.approx(0.12), "an idle one is sure"
     assert found.expected_s(20.2, 0.1, 0.1) == pytest.approx(0.2), "it takes longer than it should"
     assert found.expected_s(20.5, 0.1, 0.1) == pytest.approx(0.7), "and so it may for as long again"
 

@@ -209,6 +209,22 @@ def test_while_replicas_slow_down_in_turns_an_idle_pool_does_as_well_as_with_all
     assert fmean(ratios) <= 1.05
 
 
+@pytest.mark.parametrize(
+    ("service", "load"), [("constant", 0.05), ("stalling", 0.3), ("exponential", 0.7)]
+)
+def test_while_all_slow_down_together_it_does_as_well_as_one_copy_to_the_shortest_queue(
+    service, load
+):
+    """None is left alone for long because it was asked only while it was slow."""
+    ratios = []
+    for seed in range(3, 3 + by_day(6, at_night=20)):
+        seconds = max(40.0, 20.0 / load)
+        worlds = served(AUTO, service, load, seconds=seconds, seed=seed, spells="together")
+        better = one_copy(shortest, service, load, seconds, seed, "together")
+        ratios.append((p99(worlds) - 2 * ONE_WAY_S) / better)
+    assert fmean(ratios) <= 1.05
+
+
 @pytest.mark.parametrize("robots", [1, 5])
 @pytest.mark.parametrize("service", sorted(SERVICES))
 def test_nearly_full_they_end_as_much_as_one_queue_before_them_without_copies(service, robots):
