@@ -16,7 +16,7 @@ from fogft.requests.choose import Learning
 from fogft.requests.load import ALIKE, NEVER, SLOW, Demand, Load
 
 BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
-TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
+_TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
 _SLOW_TRIAL_EVERY = 20.0  # of its own service times, for one that others are preferred to
 _DOUBTED_TRIAL_EVERY_S = 1.0
 # Of spare copies, in service times:
@@ -139,7 +139,7 @@ class Auto(Learning):
         for replica in able:
             known = self._replicas[replica]
             often_s = _SLOW_TRIAL_EVERY * known.usual_s if known.usual_s > slower_s else NEVER
-            every_s = min(TRIAL_EVERY_S, often_s)
+            every_s = min(_TRIAL_EVERY_S, often_s)
             if known.doubted or known.asked_at <= now - every_s:
                 stale.append(replica)
         return stale

@@ -151,14 +151,14 @@ class ReplicaLoad:
 
     def free(self, now: float) -> bool:
         """Whether a request that arrives now is expected to start (almost) at once."""
-        ahead = self.ahead(now)
-        if self.doubted or ahead < max(1, self.slots):
-            return not self.doubted
-        if not ahead == len(self.at_work) == 1:
+        if self.doubted:
             return False
+        ahead = self.ahead(now)
+        if ahead < max(1, self.slots):
+            return True
         # One of ours that is nearly over: callers ask again as soon as the first has answered.
-        usual_s = (self._rtt_s or 0.0) + self.service_s
-        return NEARLY * usual_s <= self._spent_s(now) <= _LATE * usual_s
+        one, takes_s = ahead == len(self.at_work) == 1, (self._rtt_s or 0.0) + self.service_s
+        return one and NEARLY * takes_s <= self._spent_s(now) <= _LATE * takes_s
 
     def wait_s(self, now: float) -> float:
         """Return how long a request that arrives now is expected to wait: endless if in doubt."""
@@ -188,8 +188,8 @@ class ReplicaLoad:
 
         Round trip, and one service time for it and for each request before it, less what the one at
         work has had; one that takes far too long is taken to go on for as long again. A replica
-        that is about as quick as most is taken for equal: those take `typical_s` a request lately,
-        `usual_s` over a long time.
+        that is about as quick as most, or has hardly answered, is taken for equal: those take
+        `typical_s` a request lately, `usual_s` over a long time.
         """
         service_s = self.service_s
         if self.latencies.samples < _FEW:
