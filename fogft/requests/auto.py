@@ -118,7 +118,7 @@ class Auto(Learning):
     def _spared(self, request: bytes, replicas: Sequence[int], now: float) -> Sequence[int]:
         for replica in replicas:
             self._spares.open[request, replica] = now
-            self._replicas[replica].asked(request, now)
+            self._replicas[replica].asked(request, now, spare=True)
         return replicas
 
     def _takes_spare(self, replica: int, now: float) -> bool:

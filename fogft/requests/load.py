@@ -225,11 +225,12 @@ class ReplicaLoad:
 
     # -- what happens ---------------------------------------------------------------------
 
-    def asked(self, request: bytes, now: float) -> float:
+    def asked(self, request: bytes, now: float, *, spare: bool = False) -> float:
         """Note an attempt about to be sent; return when it will be overdue."""
         ahead = self.ahead(now)
         overdue_s = _LATE * max(self.delay_s, (self._rtt_s or 0.0) + self.service_s * (1 + ahead))
-        share = min(1.0, (_MANY / (1 + ahead)) ** 2)
+        # A spare copy to a slow replica is no sample: requests avoid it meanwhile.
+        share = 0.0 if spare and now < self.slow_until else min(1.0, (_MANY / (1 + ahead)) ** 2)
         self.at_work[request] = now, now + overdue_s, share
         self.asked_at = now
         return now + overdue_s

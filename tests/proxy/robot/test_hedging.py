@@ -193,20 +193,26 @@ def test_auto_is_as_good_as_the_best_other_rule_from_idle_to_full(service, load)
     assert fmean(of_idle) <= 1.0
 
 
-@pytest.mark.parametrize("service", ["constant", "stalling"])
-def test_while_replicas_slow_down_in_turns_an_idle_pool_does_as_well_as_with_all_copies(service):
+@pytest.mark.parametrize(
+    ("service", "load", "most"),
+    [("constant", 0.05, 1.4), ("constant", 0.1, 1.05), ("stalling", 0.1, 1.05)],
+)
+def test_while_replicas_slow_down_in_turns_an_idle_pool_does_as_well_as_with_all_copies(
+    service, load, most
+):
     """What spare copies saved in one slow spell is remembered for the next.
 
-    Where they save nothing otherwise, the one that has become slow is asked no more meanwhile.
+    Where they save nothing otherwise, the one that has become slow is asked no more meanwhile, and
+    the first request there is hedged: what it was tried with since does not make it seem slow.
     """
     ratios = []
     for seed in range(3, 3 + by_day(4, at_night=12)):
         p99s = [
-            p99(served(mode, service, 0.1, seconds=200.0, seed=seed, spells="one by one"))
+            p99(served(mode, service, load, seconds=200.0, seed=seed, spells="one by one"))
             for mode in (AUTO, HedgingMode.ALL)
         ]
         ratios.append((p99s[0] - 2 * ONE_WAY_S) / (p99s[1] - 2 * ONE_WAY_S))
-    assert fmean(ratios) <= 1.05
+    assert fmean(ratios) <= most
 
 
 @pytest.mark.parametrize(
