@@ -1,4 +1,4 @@
-"""Start programs: one that cannot outlive this process, or one that does not depend on it."""
+"""Start child processes: one that cannot outlive this process, or one independent of it."""
 
 import os
 import signal
@@ -7,8 +7,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-# Asks the kernel for the signal, then becomes the program. A program of its own and not a
-# `preexec_fn`, which is unsafe in a process with threads. 1 is PR_SET_PDEATHSIG.
+# Asks the kernel for SIGKILL on the parent's death, then executes the command. A separate program
+# because a `preexec_fn` is unsafe in a process with threads. 1 is PR_SET_PDEATHSIG.
 _PROGRAM = """
 import ctypes, os, signal, sys
 ctypes.CDLL(None).prctl(1, int(signal.SIGKILL), 0, 0, 0)
@@ -19,12 +19,12 @@ os.execvp(sys.argv[2], sys.argv[2:])
 
 
 def tied(command: Sequence[str]) -> list[str]:
-    """Return a command that gets SIGKILL when the thread that starts it ends: use the main one."""
+    """Wrap a command to get SIGKILL when the thread that starts it ends: use the main thread."""
     return [sys.executable, "-IS", "-c", _PROGRAM, str(os.getpid()), *command]
 
 
 def how_it_ended(status: int) -> str:
-    """Return in words how a process ended, from its return code: negative for a signal."""
+    """Describe how a process ended, from its return code (negative for a signal)."""
     if status >= 0:
         return f"exited with status {status}"
     try:
@@ -40,7 +40,7 @@ def detached(
     folder: Path | None = None,
     environ: Mapping[str, str] | None = None,
 ) -> subprocess.Popen[bytes]:
-    """Start a process in a session of its own, its output appended to a log (0600)."""
+    """Start a process in its own session and append its output to a log (mode 0600)."""
     descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o600)
     try:
         return subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Count events by name, and log those that matter to people."""
+"""Count events by name, and log them less often the more they repeat."""
 
 import logging
 import threading

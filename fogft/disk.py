@@ -18,7 +18,7 @@ from fogft import poll
 from fogft.errors import StateError
 from fogft.model.plain import stored
 
-if sys.platform != "win32":  # where files are only read and written by one process
+if sys.platform != "win32":  # on Windows only one process uses the files
     import fcntl
 
 _PATIENCE_S = 0.2
@@ -40,7 +40,7 @@ def make_folder(path: Path) -> None:
 
 
 def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> None:
-    """Replace a file at once, or leave it; 0600; `durable`: survives a power cut (one fsync)."""
+    """Replace a file atomically, mode 0600; `durable`: it survives a power cut (one fsync)."""
     data = content.encode() if isinstance(content, str) else content
     os.close(_replaced(path, data, durable=durable))
 
@@ -64,15 +64,15 @@ def _replaced(path: Path, data: bytes, *, durable: bool) -> int:
 
 
 def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
-    """Replace a file with a value as JSON, on one line where it is not durable."""
-    # Indented it takes ten times as long.
+    """Replace a file with a value as JSON: indented if `durable`, else on one line."""
+    # Indentation takes ten times as long.
     write_whole(path, to_json(value) if durable else json.dumps(value), durable=durable)
 
 
 class Report:
-    """A JSON file that says how things are now, also where nothing else can be written.
+    """A JSON file with the current status, updated even when the disk takes no new file.
 
-    Then the last one, which stays open, is written over: a reader may then find it damaged.
+    In that case the previous file, kept open, is overwritten: a reader may then find it damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -92,7 +92,7 @@ class Report:
             self._open = new
 
     def _written_over(self, data: bytes) -> bool:
-        """Write over the file, with spaces up to its end; return whether there was room for it."""
+        """Overwrite the file in place, padded with spaces; return whether the data fitted."""
         with contextlib.suppress(OSError):
             if self._open is None:
                 self._open = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
@@ -102,7 +102,7 @@ class Report:
         return False
 
     def close(self) -> None:
-        """Close the last one. Repeatable."""
+        """Close the file that is kept open. Repeatable."""
         if self._open is not None:
             os.close(self._open)
             self._open = None
@@ -114,18 +114,18 @@ def to_json(value: Any) -> str:
 
 
 def read_bytes(path: Path) -> bytes | None:
-    """Return what a file holds, or None where there is none."""
+    """Return a file's content, or None if there is no file."""
     try:
         return path.read_bytes()
     except FileNotFoundError:
         return None
-    except OSError as error:  # a folder, a link to itself, another user's
+    except OSError as error:  # a folder, a link to itself, another user's file
         hint = "move it away, or let this user read it"
         raise StateError(f"`{path}` cannot be read: {error.strerror}", hint) from error
 
 
 def read_json(path: Path, hint: str = "") -> Any:
-    """Return what a JSON file holds, or None where there is no file."""
+    """Return the parsed content of a JSON file, or None if there is no file."""
     raw = read_bytes(path)
     if raw is None:
         return None
@@ -136,13 +136,13 @@ def read_json(path: Path, hint: str = "") -> Any:
 
 
 def read_as(cls: type[T], path: Path, hint: str = "") -> T | None:
-    """Return the value that a JSON file of ours describes, or None where there is no file."""
+    """Return the value stored in one of fogft's JSON files, or None if there is no file."""
     raw = read_json(path, hint)
     return None if raw is None else stored(cls, raw, f"`{path}` is damaged", hint)
 
 
 def read_or(path: Path, otherwise: T) -> T:
-    """Return the same; another value of that class where there is no file, or a damaged one."""
+    """Return the stored value, or `otherwise` if the file is missing or damaged."""
     try:
         return read_as(type(otherwise), path) or otherwise
     except StateError:
@@ -150,15 +150,15 @@ def read_or(path: Path, otherwise: T) -> T:
 
 
 class Lock:
-    """An exclusive lock on a file, which says its holder, until `release` or the process ends."""
+    """An exclusive lock on a file, which names its holder, until `release` or process exit."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._descriptor: int | None = None
 
     def acquire(self, *, wait: bool) -> bool:
-        """Take the lock; without `wait`, return False where another keeps it. Raises OSError."""
-        # `is_locked` holds it for an instant, so one refusal proves nothing.
+        """Take the lock; without `wait`, return False if another process has it. Raises OSError."""
+        # `is_locked` holds the lock for an instant, so one refusal proves nothing.
         until = time.monotonic() + _PATIENCE_S
         while not self.take(fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB):
             if time.monotonic() > until:
@@ -166,20 +166,20 @@ class Lock:
             time.sleep(0.01)
         assert self._descriptor is not None
         _wait_for_end(self._descriptor)
-        with contextlib.suppress(OSError):  # no room: then it says nothing
+        with contextlib.suppress(OSError):  # disk full: then the file names nobody
             os.ftruncate(self._descriptor, 0)
             os.pwrite(self._descriptor, str(os.getpid()).encode(), 0)
         return True
 
     def take(self, how: int) -> bool:
-        """Call flock; return False where it is told not to wait, and would have to."""
+        """Call flock; return False if `how` is non-blocking and the lock is taken."""
         creates = 0 if how & fcntl.LOCK_SH else os.O_CREAT
         try:
             descriptor = os.open(self._path, os.O_RDWR | creates | os.O_CLOEXEC, 0o600)
         except OSError as error:
             if error.errno != errno.EROFS:
                 raise
-            descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)  # that will do
+            descriptor = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)  # enough for flock
         try:
             fcntl.flock(descriptor, how)
         except BlockingIOError:
@@ -192,7 +192,7 @@ class Lock:
         return True
 
     def _was_replaced(self, descriptor: int) -> bool:
-        """Whether the file was removed, while we waited, and made anew."""
+        """Whether the lock file was removed and recreated while we waited."""
         ours = os.fstat(descriptor)
         try:
             return not ours.st_nlink and not os.path.samestat(ours, self._path.stat())
@@ -201,13 +201,13 @@ class Lock:
 
     @property
     def lost(self) -> bool:
-        """Whether its file was removed while we hold it: another may hold that of a new one."""
+        """Whether the lock file was removed while held: another process may hold a new one."""
         if self._descriptor is None or os.fstat(self._descriptor).st_nlink:
             return False
         return not self._path.exists() or self._was_replaced(self._descriptor)
 
     def release(self) -> None:
-        """Give the lock back. Repeatable."""
+        """Release the lock. Repeatable."""
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)
@@ -216,7 +216,7 @@ class Lock:
 def _wait_for_end(descriptor: int) -> None:
     """Wait until a killed process that had this lock has ended completely.
 
-    The kernel frees one lock after the other, and this one may come before those of DDS.
+    The kernel releases its locks one by one, and may release this one before those of DDS.
     """
     # Some Pythons lack `pidfd_open`.
     with contextlib.suppress(OSError, ValueError, AttributeError), contextlib.ExitStack() as stack:
@@ -228,20 +228,20 @@ def _wait_for_end(descriptor: int) -> None:
 
 
 def is_running(pid: int) -> bool:
-    """Whether a process has not begun to end: then it has no memory any more."""
+    """Whether a process is alive: one that has begun to exit has no memory left."""
     with contextlib.suppress(OSError):
         return any(map(int, Path(f"/proc/{pid}/statm").read_bytes().split()))
     return False
 
 
 def standby_lock(path: Path) -> Path:
-    """Return the lock that the next holder of a lock waits with."""
+    """Return the lock that a standby holds while it waits for another lock."""
     return path.with_name(f"{path.stem}-standby{path.suffix}")
 
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold a lock for a while; wait for it."""
+    """Wait for a lock and hold it within the `with` block."""
     lock = Lock(path)
     try:
         lock.acquire(wait=True)
@@ -268,16 +268,16 @@ def is_locked(path: Path) -> bool:
 
 
 def not_done(what: str, path: Path, error: OSError) -> StateError:
-    """Return the error for a file of ours that cannot be opened or written (`what`)."""
+    """Return the error for a file of fogft's that cannot be opened or written (`what`)."""
     hint = "check the disk's free space and the folder's owner"
     return StateError(f"`{path}` cannot be {what}: {error.strerror}", hint)
 
 
 def holder(lock: Path, *, said: bool = True) -> int | None:
-    """Return the process that holds a lock; None for nobody.
+    """Return the pid of the process that holds a lock, or None.
 
-    By the kernel's own list; in a container, where it may name another device, by what the holder
-    wrote, if that is to be believed (`said`).
+    Taken from the kernel's list; in a container, where that may name another device, from what
+    the holder wrote into the file, if that may be trusted (`said`).
     """
     try:
         stat = lock.stat()
@@ -287,7 +287,7 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
     wanted = f"{os.major(stat.st_dev):02x}:{os.minor(stat.st_dev):02x}:{stat.st_ino}"
     for line in lines:
         fields = line.split()
-        # READ is one that only looks whether it is locked.
+        # A READ lock belongs to a process that only checks whether the file is locked.
         if len(fields) >= 6 and fields[1:4:2] == ["FLOCK", "WRITE"] and fields[5] == wanted:
             pid = int(fields[4])
             return pid if pid > 0 else None
@@ -295,14 +295,14 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
 
 
 def said_holder(lock: Path) -> int | None:
-    """Return the process that wrote last that it holds a lock; None if none has."""
+    """Return the pid in a lock file, written by its last holder, or None."""
     with contextlib.suppress(OSError, ValueError):
         return max(0, int(lock.read_text())) or None
     return None
 
 
 def unwritable(folder: Path) -> str:
-    """Say why a folder's disk takes nothing more, `full` or `read-only`; else empty."""
+    """Return why a folder's disk cannot be written, `full` or `read-only`; empty if it can."""
     try:
         seen = os.statvfs(folder)
     except OSError:
@@ -314,7 +314,7 @@ def unwritable(folder: Path) -> str:
 
 
 def version(path: Path) -> tuple[int, int, int] | None:
-    """Return what differs once a file was replaced or written; None where there is none."""
+    """Return a value that changes when a file is replaced or written; None if there is no file."""
     try:
         stat = path.stat()
     except OSError:
@@ -323,18 +323,18 @@ def version(path: Path) -> tuple[int, int, int] | None:
 
 
 class Watched:
-    """Watches a file for being replaced; what is there `from_now` on is no change."""
+    """Watches a file for changes; with `from_now`, a file that exists already is not a change."""
 
     def __init__(self, path: Path, *, from_now: bool = False) -> None:
         self.path = path
         self._seen = version(path) if from_now else None
 
     def changed(self) -> bool:
-        """Return whether the file is there and is not the one seen at the last call."""
+        """Return whether the file exists and differs from the one seen at the last call."""
         found, before = version(self.path), self._seen
         self._seen = found or before
         return found not in (None, before)
 
     def forget(self) -> None:
-        """Take the file for one not seen yet: what was there could not be used."""
+        """Report the file as changed at the next call: what it held could not be used."""
         self._seen = None

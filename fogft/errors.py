@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 
 class FogftError(Exception):
-    """A failure that the user can understand and act on; `hint` says how, if that can be said."""
+    """A failure that the user can understand and act on; `hint`, if any, says how."""
 
     def __init__(self, message: str, hint: str = "") -> None:
         super().__init__(message)
@@ -17,7 +17,7 @@ class FogftError(Exception):
 class SpecError(FogftError):
     """A pool file is wrong. The message begins with ``file:line: key:``.
 
-    `key`, such as ``fogft.replicas``, is empty and `line` 0 where it is about none.
+    `key`, such as ``fogft.replicas``, is empty and `line` is 0 if the error concerns none.
     """
 
     def __init__(
@@ -30,7 +30,7 @@ class SpecError(FogftError):
 
     @classmethod
     def of_key(cls, key: str, what: str, hint: str = "") -> SpecError:
-        """Return the error of a key, to be placed by whoever knows the file and its lines."""
+        """Return an error about a key; the caller that knows the file adds its name and line."""
         return cls(f"{key}: {what}", hint, key=key, what=what)
 
 
@@ -39,7 +39,7 @@ class StateError(FogftError):
 
 
 class PoolNotFound(FogftError):
-    """There is no pool of that name here."""
+    """No pool of that name exists on this machine."""
 
 
 class PoolBusy(FogftError):
@@ -51,7 +51,7 @@ class RosError(FogftError):
 
 
 class Unreadable(RosError):
-    """Bytes are not a message of their type; sending them again cannot help."""
+    """Bytes are not a message of the expected type; a retry cannot help."""
 
 
 class WireError(FogftError):
@@ -88,5 +88,5 @@ def told(error: FogftError) -> str:
 
 
 def known_slots(slots: Iterable[int]) -> str:
-    """Return slots as a hint lists them: ``0, 1, 10``, or ``none``."""
+    """Format slots for a hint: ``0, 1, 10``, or ``none``."""
     return ", ".join(map(str, sorted(set(slots)))) or "none"

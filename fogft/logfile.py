@@ -15,7 +15,7 @@ def size(path: Path) -> int:
 
 
 def tail(path: Path, begin: int = 0, lines: int = TAIL_LINES) -> str:
-    """Return the last lines written to a log since it had a given size; empty without a log."""
+    """Return the last lines of a log, from offset `begin` on; empty without a log."""
     try:
         with path.open("rb") as file:
             file.seek(max(begin, size(path) - _TAIL_BYTES))
@@ -26,7 +26,7 @@ def tail(path: Path, begin: int = 0, lines: int = TAIL_LINES) -> str:
 
 
 def bound(path: Path, limit_bytes: int = LIMIT_BYTES, kept_bytes: int = KEPT_BYTES) -> None:
-    """Cut a log that has grown too long to its end. Writers append and are not disturbed."""
+    """Truncate a log that has grown too long, keeping its end. Appending writers are unaffected."""
     if size(path) <= limit_bytes:
         return
     with path.open("r+b") as file:

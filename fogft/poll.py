@@ -7,9 +7,9 @@ import socket
 def is_ready(
     file: int | socket.socket, timeout_s: float | None = 0.0, *, event: int = select.POLLIN
 ) -> bool:
-    """Wait until a file, socket or pidfd can be read, or what `event` says; return whether it can.
+    """Wait until a file, socket or pidfd is readable, or until `event`; return whether it is.
 
-    Also true where that would fail, as of one that is closed. None: no time limit.
+    Also true if reading would fail, for example from a closed file. None: no time limit.
     """
     waiting = select.poll()
     try:

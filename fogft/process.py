@@ -1,4 +1,4 @@
-"""What all processes of fogft share: logging, signals, systemd notification, faster start-up."""
+"""Used by all processes of fogft: logging, signals, systemd notification, faster start-up."""
 
 import contextlib
 import gc
@@ -18,7 +18,7 @@ ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 def start_log() -> None:
-    """Log to standard error, one line each, in UTC; lines of libraries from warnings on."""
+    """Log to standard error, one line per record, in UTC; from libraries, warnings and above."""
     logging.Formatter.converter = time.gmtime
     logging.basicConfig(
         stream=sys.stderr,
@@ -58,10 +58,10 @@ class Watchdog:
 
 
 class Hanging:
-    """Tells whether another process hangs: it is stopped, or its main thread never comes round.
+    """Detects a hung process: one that is stopped, or whose main loop makes no progress.
 
-    By the kernel's count of how often that thread went to sleep. It hangs after `limit_s`, of which
-    a pause of ours counts for little: we may have been asleep, and it as well.
+    It hangs if the kernel's count of its main thread's sleeps is the same for `limit_s`. A longer
+    gap between two looks counts as 2 s: this process, and the other, may have been asleep.
     """
 
     def __init__(self, limit_s: float, clock: Callable[[], float] = time.monotonic) -> None:
@@ -72,7 +72,7 @@ class Hanging:
         self._looked_at = clock()
 
     def look(self, pid: int | None) -> bool:
-        """Look at a process, or at another one than before; return whether it hangs."""
+        """Look at a process, the same as before or another one; return whether it hangs."""
         seen, now = (pid, _sleeps(pid)), self._clock()
         step_s = min(now - self._looked_at, _STEP_S)
         self._still_s = self._still_s + step_s if seen[1] and seen == self._seen else 0.0
@@ -95,7 +95,7 @@ def _sleeps(pid: int | None) -> str:
 
 
 def on_thread(run: Callable[..., object], *arguments: Any, name: str = "") -> threading.Thread:
-    """Start a thread that does not keep the process alive. RuntimeError: there can be no more."""
+    """Start a daemon thread. Raises RuntimeError if the system allows no more threads."""
     thread = threading.Thread(target=run, args=arguments, name=name or None, daemon=True)
     thread.start()
     return thread
@@ -110,10 +110,10 @@ def stop_on_signal() -> threading.Event:
 
 
 class Wakeup:
-    """Ends a wait, also from a signal's handler, which may interrupt who holds an Event's lock.
+    """Wakes a waiting thread, also from a signal handler.
 
-    Nor is it a queue: before Python 3.13 its `get` waits for ever where a signal is handled as its
-    time ends.
+    Not an Event: a handler may interrupt the thread that holds its lock. Not a queue: before Python
+    3.13, `get` waits for ever if a signal is handled just as its timeout ends.
     """
 
     def __init__(self) -> None:
@@ -121,14 +121,14 @@ class Wakeup:
         self._asleep.acquire()
 
     def wake(self) -> None:
-        """End the present wait, or the next one. Any thread, and handlers of signals."""
-        try:  # noqa: SIM105 - on the way of requests, where a context manager costs thrice
+        """End the current wait, or the next one. Any thread, or a signal handler."""
+        try:  # noqa: SIM105 - on the request path, where a context manager costs thrice as much
             self._asleep.release()
         except RuntimeError:
-            pass  # it has been ended already
+            pass  # already woken
 
     def wait(self, timeout_s: float) -> None:
-        """Wait to be woken, at most so long. One thread."""
+        """Wait to be woken, for at most `timeout_s`. One thread."""
         self._asleep.acquire(timeout=timeout_s)
 
 
@@ -136,22 +136,22 @@ _THREADS = "OPENBLAS_NUM_THREADS"
 
 
 def load_numpy() -> None:
-    """Load numpy, where there is one, without threads, unless the user has set their number.
+    """Import numpy, if installed, with a single BLAS thread, unless the user set their number.
 
-    ROS's types load it, and its OpenBLAS's threads spin before they sleep: 30 to 100 ms of a start.
+    ROS types import it, and OpenBLAS's threads spin before they sleep: 30 to 100 ms of start-up.
     """
     if _THREADS in os.environ:
         return
-    os.environ[_THREADS] = "1"  # OpenBLAS reads it as it is loaded
+    os.environ[_THREADS] = "1"  # OpenBLAS reads it when loaded
     try:
-        with contextlib.suppress(Exception):  # what is wrong with it, its next user tells
+        with contextlib.suppress(Exception):  # the next import of it reports the error
             importlib.import_module("numpy")
     finally:
         del os.environ[_THREADS]  # the user's command may want BLAS
 
 
 def begin_start() -> None:
-    """Disable garbage collection until `end_start`: what a start makes lives on."""
+    """Disable garbage collection until `end_start`: objects made at start-up live on."""
     gc.disable()
 
 

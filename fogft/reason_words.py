@@ -1,4 +1,4 @@
-"""Reasons in words, for command line, logs and reports. Nothing is decided from them."""
+"""Reasons in words, for the command line, logs and reports. No decision depends on them."""
 
 from collections.abc import Callable
 

@@ -1,4 +1,4 @@
-"""``fogft scale | drain | exclude | include``: write a running pool's intent."""
+"""``fogft scale | drain | exclude | include | retry``: change a running pool's intent."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def _scale(pool: str | None, by: int, *, wait: bool) -> None:
     store = composition.store_of(pool)
     now = time.time()
     wishes = change(store, lambda before: intent.scale(before, store.spec(), by, now))
-    since = time.time()  # what was seen before says nothing of it
+    since = time.time()  # earlier observations do not reflect the change
     spec = store.spec()
     before, after = (one.wanted(spec, now) for one in wishes)
     if wait:

@@ -63,7 +63,7 @@ SECTIONS: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
 }
 ANYWHERE = frozenset({"check", "init", "plan", "simulate"})  # the others need Linux
-_WHOLE = 1000  # of a description: it is folded, not cut
+_WHOLE = 1000  # characters of a description: it wraps and is not cut
 _COMMANDS = {name: row for names in SECTIONS.values() for name, row in names.items()}
 
 
@@ -99,7 +99,7 @@ def _elsewhere(name: str) -> Any:
 
 
 class Group(TyperGroup):
-    """A group of commands whose descriptions are folded, never cut."""
+    """A group of commands whose descriptions wrap and are never cut."""
 
     def sections(self) -> Iterable[tuple[str, Iterable[str]]]:
         """Return the titles of the lists, with the names of the commands in each."""
@@ -127,7 +127,7 @@ class Commands(Group):
         self.commands: Any = _Loaded(_COMMANDS)
 
     def sections(self) -> Iterable[tuple[str, Iterable[str]]]:
-        """Return the sections by what people want to do."""
+        """Return the sections, one for each kind of task."""
         return SECTIONS.items()
 
 
@@ -141,7 +141,7 @@ class Command(TyperCommand):
         super().__init__(*args, **{**options, "rich_markup_mode": None})
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse as usual; "nan" passes the check of every range, and is no number to anybody."""
+        """Parse as usual, but refuse "nan", which passes every range check."""
         rest: list[str] = super().parse_args(ctx, args)
         for one in self.get_params(ctx):
             if isinstance(value := ctx.params.get(one.name), float) and math.isnan(value):

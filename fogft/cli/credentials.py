@@ -189,7 +189,7 @@ def join(
     whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"
     output.say(f"this bundle is for {whom}")
     disk.make_folder(home())
-    logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # an error says what matters
+    logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # the error has the details
     joined = joining.join(bundle, _read_passphrase(passphrase_file), home(), time.time())
     output.data(str(joined.config))
     output.done(f"this machine has joined as {whom}")
@@ -216,7 +216,7 @@ def export(
 
     passphrase, is_new = _chosen_passphrase(passphrase_file)
     store = composition.store_of(pool)
-    if is_new:  # before the file is all that is left
+    if is_new:  # shown before the export, which leaves only the file
         output.say(f"passphrase: {passphrase}")
     identity = moving.export(
         *(store, home(), file, passphrase, time.time()),
@@ -278,7 +278,7 @@ def _role(text: str) -> Role:
 
 
 def _chosen_passphrase(file: Path | None) -> tuple[str, bool]:
-    """Return the passphrase in a file, else a new one; and whether it is new."""
+    """Return the passphrase in a file, or a new one, and whether it is new."""
     from fogft.pool.credentials.bundle import new_passphrase
 
     return (new_passphrase(), True) if file is None else (_read_passphrase(file), False)
@@ -288,7 +288,7 @@ def _read_passphrase(file: Path | None) -> str:
     if file is not None:
         try:
             text = sys.stdin.readline() if str(file) == "-" else file.read_text()
-            text.encode()  # stdin lets through what is no text in this locale
+            text.encode()  # stdin accepts bytes that are not text in this locale
         except (OSError, UnicodeError):
             raise FogftError(f"the passphrase file `{file}` cannot be read") from None
         found = text.splitlines()[0].strip() if text.strip() else ""

@@ -53,6 +53,6 @@ def _show(finding: Finding) -> None:
     verdict = finding.verdict.value
     text = output.indented(output.printable(finding.text), 26, sys.stdout)
     parts = (f"{verdict:<4}", _STYLES[verdict]), f"  {finding.check:<18}  {text}"
-    output.show(Text.assemble(*parts), folds=False)  # folded already, around whole paths
+    output.show(Text.assemble(*parts), folds=False)  # wrapped already, between whole paths
     if finding.advice:
         output.data(f"{'':<26}-> {output.indented(finding.advice, 29, sys.stdout)}")

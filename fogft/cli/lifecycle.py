@@ -96,7 +96,7 @@ def up(
     try:
         if startup.start(order) and not order.is_new and not upgrades:
             output.say("the pool had no manager: started a new one")
-        applied_at = time.time()  # what was seen before, or by an old manager, says nothing of it
+        applied_at = time.time()  # earlier observations, or an old manager's, do not count
         replaces = order.replaces_replicas or order.rolled_back or under_way or upgrades
         awaited = Awaited(
             frozenset(service.name for service in order.spec.services),
@@ -132,7 +132,7 @@ def up(
 
 
 def services_at_fault(status: PoolStatus) -> list[str]:
-    """Return the services without an answering replica; if types differ, only those that do."""
+    """Return the services without a ready replica; if types differ, only those that differ."""
     differing = {name for one in status.replicas for name in one.differing}
     return sorted(differing) or [one.name for one in status.services if not one.ready_replicas]
 
@@ -147,7 +147,7 @@ def _not_updated(status: PoolStatus) -> FogftError:
 
 
 def _replica_at_fault(reasons: Iterable[Reason]) -> str:
-    """Return the replica for which an update was given up; empty where it was for none."""
+    """Return the replica whose failure stopped an update; empty if there is none."""
     from fogft.model.reason import Cause
 
     for reason in reasons:
@@ -215,7 +215,7 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     except KeyboardInterrupt:
         output.say(f"interrupted: `fogft down {store.name}` does the rest")
         raise typer.Exit(130) from None
-    if swept := shared_memory.sweep():  # what killed ROS processes cannot remove themselves
+    if swept := shared_memory.sweep():  # killed ROS processes leave them behind
         told(f"{len(swept)} shared-memory files of dead processes")
     if elsewhere:
         output.done(f"`{store.name}` is removed here; another machine manages it")

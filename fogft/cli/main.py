@@ -1,10 +1,10 @@
 """The ``fogft`` command: runs a command and turns its outcome into an exit status.
 
-Exit status: 0 done; 1 a `FogftError`, or a file that fails, told without a stack trace; 2 wrong
-usage; 130 interrupted; 141 nobody reads stdout any more. Anything else is a defect of ours and
-keeps its trace.
+Exit status: 0 success; 1 a `FogftError` or a file error, shown without a stack trace; 2 wrong
+usage; 130 interrupted; 141 stdout was closed by its reader. Any other exception is a bug in fogft
+and keeps its stack trace.
 
-Imports that take long are made inside the command that needs them (tests/cli/test_elsewhere).
+Slow imports are made inside the command that needs them (tests/cli/test_elsewhere).
 """
 
 import errno
@@ -23,7 +23,7 @@ from fogft.errors import FogftError
 
 INTERRUPTED = 130
 STDOUT_CLOSED = 141
-# What Typer's checker of values says, and what we say.
+# Typer's words in errors about values, and fogft's.
 _OTHER_WORDS = (
     (" range.", "."),
     ("a valid integer", "a whole number"),
@@ -61,11 +61,11 @@ def root(
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run the command line and exit the process."""
-    while (free := os.open(os.devnull, os.O_RDWR)) < 3:  # of a closed stream: no file may take it
+    while (free := os.open(os.devnull, os.O_RDWR)) < 3:  # keeps files off closed streams
         os.set_inheritable(free, True)
     nowhere = os.fdopen(free, "w", errors="replace")
     sys.stdout, sys.stderr = sys.stdout or nowhere, sys.stderr or nowhere
-    if isinstance(sys.stdout, io.TextIOWrapper):  # not every locale has all characters
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not every locale can encode all characters
         sys.stdout.reconfigure(errors="replace")
     sys.exit(run(sys.argv[1:] if args is None else args))
 
@@ -86,9 +86,9 @@ def run(args: Sequence[str]) -> int:
 def _run(args: Sequence[str]) -> int:
     command = typer.main.get_command(app)
     if os.environ.get("_FOGFT_COMPLETE"):
-        command(prog_name="fogft")  # answers the shell, and exits
-    # Not `command(args)`: that ends on any broken pipe, a socket's too, without a word.
-    # The base class of wrong usage is in a private module of Typer.
+        command(prog_name="fogft")  # answers the shell and exits
+    # Not `command(args)`, which exits silently on any broken pipe, even a socket's.
+    # The base class of usage errors is in a private module of Typer.
     usage_error: type[Exception] = typer.BadParameter.__mro__[2]
     try:
         with command.make_context("fogft", list(args)) as context:

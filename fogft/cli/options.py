@@ -81,7 +81,7 @@ Plot = Annotated[
 
 
 def one_pool(argument: str | None, option: str | None) -> str | None:
-    """Return the pool that is named in either way; FogftError for two."""
+    """Return the pool named by the argument or the option. Raises FogftError if they differ."""
     if argument and option and argument != option:
         raise FogftError(f"two pools are named, `{argument}` and `--pool {option}`", "name one")
     return argument or option

@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from rich.console import Console, RenderableType
     from rich.text import Text
 
-# Wide enough that nothing is ever cut: a terminal breaks a long line by itself.
+# Wide enough that nothing is ever cut: a terminal wraps long lines by itself.
 _UNLIMITED = 100_000
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # which a log may have, and which says nothing
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")  # colours that a log may contain
 
 
 def data(text: str) -> None:
-    """Write lines of data to stdout, flushed, with unprintable characters removed."""
+    """Write lines of data to stdout, flushed, with control characters escaped."""
     print(printable(text), flush=True)
 
 
@@ -40,7 +40,7 @@ def json_data(value: Any) -> None:
 def show(*parts: RenderableType, stream: IO[str] | None = None, folds: bool = True) -> None:
     """Write tables, trees and lines below each other, to stdout by default.
 
-    On a terminal a line is folded between words if it `folds`; elsewhere nothing is folded or cut.
+    On a terminal, lines wrap between words if `folds`; elsewhere nothing is wrapped or cut.
     """
     stream = stream or sys.stdout
     drawn = _drawn(stream, *parts, limit=width(stream) if folds else None)
@@ -55,7 +55,7 @@ def cell(text: str, style: str = "") -> Text:
 
 
 def printable(text: str) -> str:
-    """Return text with control characters except newlines escaped, so it cannot move the cursor."""
+    """Escape control characters except newlines and tabs, so that text cannot move the cursor."""
     if text.isprintable():
         return text
     plain = _COLOUR.sub("", text)
@@ -142,7 +142,7 @@ def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
 
 
 def silenced_stdout() -> bool:
-    """Discard what is buffered for stdout if its reader is gone, as after ``| head``."""
+    """Discard buffered stdout if its reader is gone, as after ``| head``; return whether it is."""
     with contextlib.suppress(OSError, ValueError):
         poll = select.poll()
         poll.register(sys.stdout.fileno(), 0)
@@ -155,7 +155,7 @@ def silenced_stdout() -> bool:
 
 
 def _drawn(stream: IO[str], *parts: RenderableType, limit: int | None) -> str:
-    # With a height: of a dumb terminal rich else takes both to be small.
+    # With a height: otherwise rich assumes small values for both on a dumb terminal.
     console = _console(stream, width=limit or _UNLIMITED, height=25)
     with console.capture() as captured:
         console.print(*parts, sep="\n")
@@ -168,7 +168,7 @@ def _tagged(tag: str, style: str, text: str) -> None:
         return
     from rich.text import Text
 
-    told = Text.assemble((tag, style), " ", printable(text))  # whole: a command may be copied
+    told = Text.assemble((tag, style), " ", printable(text))  # not wrapped: users copy commands
     show(told, stream=sys.stderr, folds=False)
 
 

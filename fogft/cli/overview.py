@@ -1,4 +1,4 @@
-"""``fogft list | events | cost``: all pools at a glance, what happened and what it has cost."""
+"""``fogft list | events | cost``: all pools at a glance, a pool's history, and what it has cost."""
 
 from __future__ import annotations
 

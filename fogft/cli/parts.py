@@ -224,7 +224,7 @@ def remove(
 ) -> None:
     """Stop and delete the units. Replicas keep running; `fogft up` starts a manager."""
     where = units.services(system=system)
-    if pool is not None:  # it may have ended
+    if pool is not None:  # the pool may have ended
         names = list(units.names_of(pool).values())
     else:
         names = [unit.name for unit in _units(pool, gateway, rendezvous, system=system)]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from fogft.planning.explain import Considered
     from fogft.pool.commands.plan import PlanShown
 
-_MARGIN = 14  # of the summary: its labels stand there
+_MARGIN = 14  # of the summary, for its labels
 _HEADER = ("SLOT", "LOCATION", "INSTANCE", "KIND", "$/H", "PRICE", "RTT", "LOST", "WHY NOT")
 
 
@@ -97,7 +97,7 @@ def _traffic_json(shown: PlanShown, service: ServiceSpec) -> dict[str, Any]:
 
 
 def _best_of_regions(found: Iterable[Considered]) -> list[Considered]:
-    """Return the chosen ones, and of each region and kind that got none the cheapest."""
+    """Return the chosen offers, and the cheapest of each region and kind without a chosen one."""
     out, seen = [], set()
     for one in found:
         place = one.offer.placement

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from fogft.pool.manager.status import UpdateStatus
 
 LOOK_EVERY_S = 0.2
-MANAGER_GONE_S = 3.0  # one that an `up` of another version, or the client proxy, replaces is back
+MANAGER_GONE_S = 3.0  # a manager restarted by another version's `up` or the proxy is back
 LIMIT_S = 300.0
 REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup` runs
 
@@ -31,9 +31,9 @@ REAL_LIMIT_S = 1800.0  # a VM boots, SkyPilot sets it up, then the user's `setup
 def announce(
     preview: Preview, joined: UpdateStatus | None = None, *, upgrade_from: str = ""
 ) -> None:
-    """Print what `up` is about to do; `joined` is an update under way to this very file.
+    """Print what `up` is about to do; `joined` is an update to this same file, in progress.
 
-    `upgrade_from` is the version of fogft by which the pool's manager runs, where it has one.
+    `upgrade_from` is the fogft version of the pool's running manager; empty if there is none.
     """
     spec = preview.spec
     for name, problem in preview.accounts.items():
@@ -99,7 +99,7 @@ def _show_launches(preview: Preview) -> None:
 
 
 def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tuple[Seen, Outcome]:
-    """Show a pool's progress until an `up` has an outcome; return it after the last status."""
+    """Show a pool's progress until `up` has an outcome; return the last status and the outcome."""
     from fogft.pool.commands import status
     from fogft.pool.commands.outcome import Outcome
 
@@ -152,7 +152,7 @@ def _shown() -> Iterator[Callable[[Seen], None]]:
 
 
 def _phase_lines() -> Callable[[Seen], None]:
-    """Return what says a line for each replica's change of phase, and for each new note."""
+    """Return a function that prints each change of a replica's phase and each new note."""
     known: dict[str, tuple[str, str]] = {}
     notes: set[str] = set()
 

@@ -179,7 +179,7 @@ _ROS_TIME = re.compile(r"\[[A-Z]+\] \[(\d{10}\.\d+)\]")
 def in_order(logs: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
     """Merge logs into (name, line), ordered by the timestamps of their lines.
 
-    A line without a time stays behind the one before it; the first ones before what follows.
+    A line without a timestamp follows the line before it; leading ones take the first timestamp.
     """
     stamped: list[tuple[str, str, str]] = []
     for name, lines in logs.items():
@@ -192,7 +192,7 @@ def in_order(logs: Mapping[str, Iterable[str]]) -> list[tuple[str, str]]:
 
 
 def _time_of(line: str) -> str:
-    if found := _ROS_TIME.match(line):  # of a node
+    if found := _ROS_TIME.match(line):  # a node's line
         at = datetime.datetime.fromtimestamp(float(found[1]), datetime.timezone.utc)
         return at.isoformat(timespec="milliseconds")
     found = _TIME.match(line)
@@ -200,7 +200,7 @@ def _time_of(line: str) -> str:
 
 
 class Tail:
-    """A growing log, read from its `last` lines on (None: all of it). It may be missing."""
+    """A growing log, read from its `last` lines on (None: from the start). It may be missing."""
 
     def __init__(self, path: Path, last: int | None) -> None:
         self._path = path

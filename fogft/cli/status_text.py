@@ -35,8 +35,8 @@ SERVICE_COLUMNS = (
 TOPIC_COLUMNS = ("TOPIC", "FROM", "HEARD BY", "RATE", "MESSAGES", "PASSED", "DROPPED", "REFUSED")
 RARE = ("FALLBACK", "UNANSWERED", "LATE", "WAITING")
 UNKNOWN = "?"
-_STRANGERS_SHOWN = 20  # fewer come of ports that are scanned, and of links that break off
-LOST = "unready"  # it has served, and does not now
+_STRANGERS_SHOWN = 20  # port scans and broken links cause fewer
+LOST = "unready"  # it has served, but does not now
 NUMBERS = ("$/H", "RTT", "FIRST", "AGE", *SERVICE_COLUMNS[1:], *TOPIC_COLUMNS[3:])
 
 
@@ -130,7 +130,7 @@ def notes(status: PoolStatus) -> list[Text]:
             )
         poisoned_at = row.counters.get("poisoned_at")
         if poisoned_at is not None:
-            poison = row.counters.get("poison", 0)  # none of those that the fallback has answered
+            poison = row.counters.get("poison", 0)  # without those that the fallback answered
             requests = {0: "requests", 1: "a request"}.get(poison, f"{poison} requests")
             at = time.strftime("%F %T", time.localtime(poisoned_at))
             found.append(
@@ -146,7 +146,7 @@ def notes(status: PoolStatus) -> list[Text]:
     if status.excluded:
         found.append(f"excluded: {', '.join(status.excluded)}")
     lines: list[Text] = []
-    for note in found:  # a log's last lines stand below what they explain
+    for note in found:  # a log's last lines go below the note that they explain
         first, *more = note.splitlines() or [""]
         lines.append(cell("note:", "bold cyan") + cell(f" {first}"))
         lines += [cell(f"  {line}") for line in more]
@@ -154,7 +154,7 @@ def notes(status: PoolStatus) -> list[Text]:
 
 
 def troubles(status: PoolStatus) -> list[str]:
-    """Return a sentence for each service or topic that does not get through, with the reason."""
+    """Return a sentence with the reason for each service or topic whose messages do not arrive."""
     found = [row.counters["trouble"] for row in status.services if row.counters.get("trouble")]
     for row in status.topics:
         if row.counters.trouble:
@@ -167,7 +167,7 @@ def troubles(status: PoolStatus) -> list[str]:
 def _replicas(
     rows: Sequence[ReplicaStatus], names: Sequence[str], width: int | None, links_known: bool
 ) -> list[RenderableType]:
-    """Return the table of replicas; details are in it if there is room, else below it."""
+    """Return the table of replicas, with their details in it if there is room, else below it."""
     from fogft.cli.table import table
 
     if not rows:
@@ -203,7 +203,7 @@ def _of_replica(row: ReplicaStatus, links_known: bool) -> dict[str, str | Text]:
 def _counted(
     names: Sequence[str], rows: list[list[str | Text]], width: int | None, optional: Sequence[str]
 ) -> list[RenderableType]:
-    """Return the table of what passes, whose first column is folded."""
+    """Return a table of traffic counters, whose first column may wrap."""
     from fogft.cli.table import table
 
     if not rows:
@@ -241,16 +241,16 @@ def _of_topic(row: TopicStatus, links_known: bool) -> list[str | Text]:
 
 
 def topology(drawn: Mapping[str, Any]) -> list[RenderableType]:
-    """Return a tree of gateways for each robot; nothing without gateways.
+    """Return a tree of gateways for each robot; empty without gateways.
 
-    How a link does is known for this machine's robot only, and for its own gateways.
+    Link states are known only for the links of this machine's robot to its own gateways.
     """
     if not drawn:
         return []
     from rich.tree import Tree
 
     gateways = {one["name"]: one for one in drawn["gateways"]}
-    # Of several links to a gateway, such as of two generations, the one that is up counts.
+    # Of several links to a gateway, such as to two generations, the one that is up counts.
     links = {one["name"]: one for one in sorted(drawn["links"], key=lambda x: x["state"] == "up")}
     here, named = drawn["robot"], drawn["robots"]
     robots = {here or "this robot": named.get(here, drawn["through"])}
@@ -286,7 +286,7 @@ def _gateway(gateway: Mapping[str, Any], link: Mapping[str, Any] | None) -> Text
 
 
 def show_table(header: Iterable[str], rows: Iterable[Iterable[str | Text]], **layout: Any) -> None:
-    """Write a table to stdout, folded to its width; `layout` as in `fogft.cli.table`."""
+    """Write a table to stdout, wrapped to its width; `layout` as in `fogft.cli.table`."""
     from fogft.cli.table import table
 
     output.show(table(header, rows, width=output.width(sys.stdout), **layout))

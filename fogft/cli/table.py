@@ -1,6 +1,6 @@
 """Tables that fit the terminal: text wraps between words, then columns move below.
 
-Numbers and words are never cut, and no column is left out but an empty one that says nothing.
+Numbers and words are never cut. Only an `optional` column without values is left out.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _GAP = 2
-_LEAST = 18  # of a folded column, where no word is longer
+_LEAST = 18  # width of a folded column, unless a word is longer
 _PIECE = re.compile(r"[^ /]*[ /]?")
 _EMPTY = frozenset({"", "-", "0"})
 
@@ -44,7 +44,7 @@ def table(
 ) -> RenderableType:
     """Return a table without rules, split into several that repeat the first column if needed.
 
-    Columns of `folds` may be folded; a terminal is spared `optional` ones of no or only 0 values.
+    Columns in `folds` may wrap; with `width`, `optional` ones that are empty or all 0 are left out.
     """
     cells = [[cell(one) if isinstance(one, str) else one for one in row] for row in rows]
     columns = [
@@ -80,7 +80,7 @@ def _column(name: str, cells: list[Text], folds: bool) -> _Column:
 
 
 def _parts(columns: list[_Column], width: int) -> list[list[_Column]]:
-    """Return the columns in as many tables as are needed, each with its text folded to fit."""
+    """Split the columns into as many tables as are needed, with their text wrapped to fit."""
     first, *rest = columns
     parts: list[list[_Column]] = []
     while rest or not parts:

@@ -1,1 +1,1 @@
-"""Checks of why a pool may not work here. Not here: how they are shown (`fogft.cli.doctor`)."""
+"""Checks for why a pool may not work here. Not here: their display (`fogft.cli.doctor`)."""

@@ -22,7 +22,7 @@ def examine(file: Path | None = None) -> Iterator[Finding]:
     """Check this machine, ROS 2, a pool file and the pools here; yield findings as they come."""
     spec = None if file is None else read(file)
     pools_here: tuple[str, ...] = ()
-    with suppress(OSError):  # `machine.state_folder` says so
+    with suppress(OSError):  # `machine.state_folder` reports it
         pools_here = tuple(composition.pools())
-    for check in ALL:  # some take seconds, and a report's age is told from now
+    for check in ALL:  # some take seconds, and a report's age is relative to now
         yield from run(check, Situation(home(), pools_here, spec, time.time()))

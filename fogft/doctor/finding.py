@@ -12,7 +12,7 @@ class Verdict(str, Enum):
     """How serious a finding is."""
 
     OK = "ok"
-    WARN = "warn"  # works, but will surprise
+    WARN = "warn"  # works, but may cause trouble
     FAIL = "fail"  # does not work
 
 
@@ -55,7 +55,7 @@ def fail(check: str, text: str, advice: str) -> Finding:
 
 
 def run(check: Check, situation: Situation) -> Iterator[Finding]:
-    """Run a check and yield what it finds as it finds it, also where it fails itself."""
+    """Run a check and yield its findings as they come, even if the check itself crashes."""
     try:
         yield from check(situation)
     except Exception as error:

@@ -14,7 +14,7 @@ from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.model.names import LINK_PORT
 
 _SHARED_MEMORY = Path("/dev/shm")
-# One segment of the shipped Fast DDS profile for each process, and a pool has a handful.
+# Each process maps a segment of the shipped Fast DDS profile, and a pool has a handful.
 _SHARED_MEMORY_WANTED_BYTES = 256 << 20
 _DISK_WANTED_BYTES = 200 << 20
 

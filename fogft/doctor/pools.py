@@ -1,4 +1,4 @@
-"""Checks of a pool file, of the pools on this machine, and of what lost pools left behind."""
+"""Checks of a pool file, of the pools on this machine, and of leftovers of lost pools."""
 
 import contextlib
 from collections.abc import Iterator
@@ -149,7 +149,7 @@ def processes(situation: Situation) -> Iterator[Finding]:
         if why := disk.unwritable(folder):
             remedy = "fix that: until then the manager launches nothing; it resumes by itself"
             yield fail("disk", f"pool `{pool}`: the disk of `{folder}` is {why}", remedy)
-        else:  # or its links' report is old for that
+        else:  # not before: the disk is why the links' report is old
             yield from judge_links(pool, seen)
 
 
@@ -177,7 +177,7 @@ def _judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
 
 
 def judge_traffic(pool: str, seen: Seen) -> Iterator[Finding]:
-    """Report clients that get no answers, and topics that do not get through."""
+    """Report clients that get no answers, and topics whose messages do not arrive."""
     for service in seen.status.services:
         if why := service.counters.get("trouble"):
             yield fail("middleware", f"pool `{pool}`: {why}", "see `fogft logs`")

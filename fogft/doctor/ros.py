@@ -1,6 +1,6 @@
 """Checks of ROS 2: installed, its middleware, its domain, its profile, and that it works.
 
-rclpy is imported in processes of their own only: a broken one can end the process.
+rclpy is imported only in separate processes: a broken installation can end the process.
 """
 
 import json
@@ -20,7 +20,7 @@ from fogft.ros import environment
 
 _LIMIT_S = 30.0
 _RMW_WITH_PROFILE = "rmw_fastrtps_cpp"
-# Above, the ports of DDS run into those that Linux gives to outgoing connections.
+# Above this, DDS's ports overlap those that Linux gives to outgoing connections.
 _LAST_SAFE_DOMAIN, _LAST_DOMAIN = 101, 232
 _KNOWN = {
     "rmw_cyclonedds_cpp": "works, but service calls between it and Fast DDS on one machine fail",
@@ -163,7 +163,7 @@ def discovery(_: Situation) -> Iterator[Finding]:
             result = _self_test("ask", name)
         finally:
             try:
-                answering.communicate(timeout=5)  # ends its input
+                answering.communicate(timeout=5)  # closes its input
             except subprocess.TimeoutExpired:
                 answering.kill()
     if "error" not in result:
@@ -209,11 +209,11 @@ def _self_test(*arguments: str) -> dict[str, Any]:
 
 
 def child_command(*arguments: str) -> list[str]:
-    """Return the command that tries ROS in a process of its own, which may crash."""
+    """Return the command that tests ROS in a separate process, which may crash."""
     return [sys.executable, "-m", "fogft.ros.self_test", *arguments]
 
 
 def _environ() -> dict[str, str]:
-    ours = str(Path(fogft.__file__).parent.parent)  # or fogft's sources are not importable there
+    ours = str(Path(fogft.__file__).parent.parent)  # makes fogft importable there
     path = filter(None, (ours, os.environ.get("PYTHONPATH")))
     return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}

@@ -1,6 +1,6 @@
 """Outcomes of one service's requests: counters, latencies and first responses.
 
-All methods are called under the dispatcher's lock, but `late`, which has its own.
+All methods are called under the dispatcher's lock, except `late`, which has its own.
 """
 
 import bisect
@@ -16,7 +16,7 @@ from fogft.model.replica import short
 
 _LATENCIES_KEPT = 2000
 _GONE_KEPT = 100  # replicas
-# Upper bounds of the histogram's buckets, seconds: from a local call to a planner that thinks.
+# Upper bounds of the histogram's buckets, seconds: from a local call to a slow planner.
 BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 OUTCOMES_COUNTED = (
     *("received", "sent", "answered", "late", "rejected", "silent", "empty"),
@@ -31,10 +31,10 @@ class Outcome(str, Enum):
     ANSWERED = "answered"  # by a replica
     FALLBACK = "fallback"  # by the fallback service
     EMPTY = "empty"  # with the default response
-    SILENT = "silent"  # with none
-    TURNED_AWAY = "turned_away"  # it was not taken
-    CANCELLED = "cancelled"  # its caller took it back
-    POISON = "poison"  # services died while they worked on it
+    SILENT = "silent"  # with no response
+    TURNED_AWAY = "turned_away"  # it was not accepted
+    CANCELLED = "cancelled"  # its caller withdrew it
+    POISON = "poison"  # services crashed while they worked on it
 
 
 @dataclass
@@ -47,7 +47,7 @@ class OfReplica:
 
 
 class Outcomes:
-    """Counts since the start, described by `metrics.proxies`. Replicas are numbers."""
+    """Counts since the start, described by `metrics.proxies`. Replicas are `ReplicaId.key`."""
 
     def __init__(self) -> None:
         self.count = dict.fromkeys(OUTCOMES_COUNTED, 0)
@@ -57,7 +57,7 @@ class Outcomes:
         self._buckets = [0] * (len(BUCKETS_S) + 1)
         self._took_s = 0.0
         self._late_lock = threading.Lock()
-        # When services last died over a request that was then given up; wall clock.
+        # When a request was last given up because services crashed on it; wall clock.
         self.poisoned_at: float | None = None
 
     def won(self, replica: int, took_s: float, size_bytes: int) -> None:
@@ -72,7 +72,7 @@ class Outcomes:
         self._took_s += took_s
 
     def refusal(self, reason: Refusal, replica: int | None = None) -> None:
-        """Count a refusal, also against the replica if it refused a request."""
+        """Count a refusal, also against the replica if its service is at fault."""
         self.refused[reason.value] = self.refused.get(reason.value, 0) + 1
         if replica is not None and Effect.FAULT in reason.effect:
             self.of[replica].ill += 1
@@ -83,7 +83,7 @@ class Outcomes:
         self.of[replica].ill += 1
 
     def keep(self, replicas: Collection[int]) -> None:
-        """Note that there are only these replicas: of the others the latest are remembered."""
+        """Keep the counts of these replicas; of all others, only the latest."""
         for gone in [key for key in self.of if key not in replicas][:-_GONE_KEPT]:
             del self.of[gone]
 

@@ -148,7 +148,7 @@ def _by_slot(by_replica: Mapping[str, int]) -> dict[str, int]:
 
 
 def _newest(links: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Return one link of each slot, of its newest generation: a series has one sample."""
+    """Return each slot's link of the newest generation: a series has only one sample."""
     ranked = sorted(links, key=lambda link: (link["generation"], link["state"] == "up"))
     return list({link["slot"]: link for link in ranked}.values())
 
@@ -214,5 +214,5 @@ def _listener(counts: Mapping[str, float]) -> Metric:
 
 
 def by_event(name: str, help: str, counts: Mapping[str, float]) -> Metric:
-    """Return counters by event."""
+    """Return counters of one name, by event."""
     return counter(name, help, ((n, {"event": str(event)}) for event, n in counts.items()))

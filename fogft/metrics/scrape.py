@@ -1,8 +1,8 @@
-"""Metrics as `prometheus-client` has them, made at a scrape, and served over plain HTTP.
+"""Metrics as `prometheus-client` objects, created for each scrape and served over plain HTTP.
 
-Nothing is counted through the library: counting on a request's way stays a plain addition. It is
-imported once an endpoint is asked for, like Python's HTTP server (`fogft.metrics.server`), so that
-a process that nobody scrapes never loads it.
+The library counts nothing: on the request path, counting stays a plain addition. It is imported
+once an endpoint is configured, like Python's HTTP server (`fogft.metrics.server`), so a process
+that nobody scrapes never loads it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def histogram(
 ) -> Metric:
     """Return histograms of one name, which ends in its unit.
 
-    `bounds` rise; one more bucket is without. `counted`: values by bucket, their sum, labels.
+    `bounds` ascend; one more bucket has none. `counted`: counts by bucket, sum of values, labels.
     """
     family = _family(name, "histogram", help, ())
     for counts, total, labels in counted:
@@ -71,12 +71,12 @@ def _family(name: str, kind: str, help: str, values: Values, suffix: str = "") -
 
 
 def _printable(labels: Labels) -> dict[str, str]:
-    """Return labels that can be sent: a lone surrogate cannot."""
+    """Return labels that can be encoded: lone surrogates are replaced."""
     return {key: value.encode(errors="replace").decode() for key, value in labels.items()}
 
 
 class Scrape:
-    """Metrics at an endpoint, which may change or be none; collected for each request."""
+    """Serves metrics at an endpoint, which may change or be empty; collected for each request."""
 
     def __init__(self, measure: Measure, labels: Labels) -> None:
         self._measure = measure
@@ -109,7 +109,7 @@ class Scrape:
     def at(self, endpoint: str) -> None:
         """Serve at ``host:port`` (port 0: any free port); empty to stop. Repeatable.
 
-        A port that cannot be had is logged, and nothing is served.
+        If the port cannot be bound, that is logged and nothing is served.
         """
         if endpoint == self._wanted:
             return

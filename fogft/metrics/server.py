@@ -1,6 +1,6 @@
 """The HTTP server that serves metrics.
 
-A slow or hostile scraper occupies a thread, but there are few: a newer connection ends the oldest.
+A slow or hostile scraper occupies a thread; there are few, so a new connection ends the oldest.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ class _Server(ThreadingMixIn, WSGIServer):
     def process_request(self, request: Any, client_address: Any) -> None:
         self._open[request] = None
         if len(self._open) > _AT_ONCE:
-            oldest = list(self._open)[0]  # noqa: RUF015 - in one step: other threads take theirs out
+            oldest = list(self._open)[0]  # noqa: RUF015 - atomic: other threads remove theirs
             self._open.pop(oldest, None)
             with contextlib.suppress(OSError):  # its thread closes it
                 oldest.shutdown(socket.SHUT_RDWR)

@@ -1,7 +1,7 @@
-"""OpenTelemetry spans of traced requests: one trace a request, from the robot to each replica.
+"""OpenTelemetry spans of traced requests: one trace per request, from the robot to each replica.
 
-A request's id, which every replica is given, is the trace's. A span's id follows from it and from
-who makes the span, so nothing is sent with a request, and the robot and its replicas report apart.
+A request's id, which every replica gets, is the trace id. A span's id is derived from it, the step
+and the replica, so no context is sent, and the robot and its replicas export independently.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _KINDS = {"request": "SERVER", "ask": "CLIENT", "replica": "SERVER", "run": "INTERNAL"}
-_STEPS = list(_KINDS)  # each within the one before it
-_LEFT_MS = 2000  # for what is not sent yet when the process ends
-# OpenTelemetry's own: where to send to. https://opentelemetry.io/docs/specs/otel/protocol/exporter/
+_STEPS = list(_KINDS)  # each is a child of the one before it
+_LEFT_MS = 2000  # to send the remaining spans when the process ends
+# OpenTelemetry's endpoint variables: https://opentelemetry.io/docs/specs/otel/protocol/exporter/
 _WANTED_BY = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 
 
@@ -49,7 +49,7 @@ class Spans:
     def asked(self, requests: Iterable[Mapping[str, Any]]) -> None:
         """Export the robot's side: a span for each request, and one for each replica asked.
 
-        Requests are as `Outcomes.note` has them, with ``service`` and moments on the wall clock.
+        Requests are as `Ledger.trace` keeps them, with ``service`` and times on the wall clock.
         """
         for line in requests:
             service, request = line["service"], bytes.fromhex(line["request"])
@@ -66,7 +66,7 @@ class Spans:
     def ran(self, request: bytes, service: str, replica: str, moments: tuple[float, ...]) -> None:
         """Export the replica's side: the request's time there, and its time in the service.
 
-        The moments are when it arrived, was passed on, and was answered; monotonic.
+        `moments`: when it arrived, was passed to the service, and was answered; monotonic.
         """
         past_s = time.time() - time.monotonic()
         arrived, begun, ended = (past_s + moment for moment in moments)

@@ -1,4 +1,4 @@
 """Values used everywhere: replicas, placements, membership, pool specs.
 
-Not here: reading them from files (`fogft.poolfile`), deciding by them (`planning`, `requests`).
+Not here: reading them from files (`fogft.poolfile`), and decisions (`planning`, `requests`).
 """

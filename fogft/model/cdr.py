@@ -1,8 +1,8 @@
-"""Whether bytes are a well-formed message of a type, checked before a middleware reads them. Pure.
+"""Check that bytes are a well-formed message of a type before a middleware reads them. Pure.
 
-A middleware that is given bytes it cannot read may fail, end its process, or read another message
-than was meant. Here nothing is decoded: whole runs of numbers are stepped over. In plain CDR each
-field stands at a multiple of its own size, counted from behind the header of four bytes.
+A middleware given bytes that it cannot read may fail, end its process, or read a different message.
+Nothing is decoded here: whole runs of numbers are skipped. In plain CDR each field is aligned to
+its own size, counted from the end of the four-byte header.
 """
 
 import re
@@ -16,8 +16,8 @@ from fogft.model.type_definition import Fields
 HEADER_BYTES = 4
 _KEPT_BYTES = 16 << 10
 _BYTE_ORDERS = {b"\x00\x00": struct.Struct(">I"), b"\x00\x01": struct.Struct("<I")}
-# A middleware may fill a message's end up to a multiple of its widest field. Fast DDS also leaves
-# what it reserved for gaps between fields and did not need: less than the message is long.
+# A middleware may pad a message's end to a multiple of its widest field. Fast DDS also leaves the
+# unused bytes that it reserved for gaps between fields: fewer than the message has.
 _MOST_PADDING = 7
 
 NUMBER_BYTES = {
@@ -32,17 +32,17 @@ _STRING = re.compile(r"string(?:<(?P<bound>\d+)>)?")
 
 
 class _Malformed(Exception):
-    """What is wrong, in words."""
+    """A message is malformed; the text says how."""
 
 
 class _Uncheckable(Exception):
-    """A field whose form is not the same in every middleware."""
+    """A field whose encoding differs between middlewares."""
 
 
 class _Bytes:
-    """A message's bytes, and where the booleans stand that were stepped over.
+    """A message's bytes, and the offsets of the booleans that were skipped.
 
-    An offset may lie behind the end: that is found out when something is read there, or at last.
+    An offset may lie beyond the end: this is detected by the next read there, or by `Shape.fault`.
     """
 
     __slots__ = "booleans", "length_at", "payload", "size"
@@ -53,22 +53,22 @@ class _Bytes:
         self.booleans: list[int] = []
 
     def check_booleans(self, first: int, end: int, step: int) -> None:
-        """Make sure that each `step`-th byte between two offsets is 0 or 1."""
+        """Check that each `step`-th byte between two offsets is 0 or 1."""
         highest = max(self.payload[first:end:step], default=0)
         if highest > 1:
             raise _Malformed(f"a boolean is {highest}")
 
 
-_Walk = Callable[[_Bytes, int], int]  # from an offset in the payload to the one behind the value
+_Walk = Callable[[_Bytes, int], int]  # from the offset of a value to the offset after it
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """How to step over a value of one type."""
+    """How to skip a value of one type."""
 
     walk: _Walk
-    align: int  # of its widest number; where it starts only matters modulo this
-    has_fixed_size: bool  # its size follows from where it starts
+    align: int  # of its widest number: its start offset only matters modulo this
+    has_fixed_size: bool  # its size depends only on its start offset
 
 
 class Shape:
@@ -77,7 +77,7 @@ class Shape:
     def __init__(self, root: str, fields: Mapping[str, Fields]) -> None:
         self._fields = fields
         self._kinds: dict[str, _Kind] = {}
-        # The last that was well-formed, if small: it is asked about again before it is sent.
+        # The last well-formed payload, if small: it is checked again before it is sent.
         self._good: bytes | None = None
         try:
             self._root: _Kind | None = self._message(root, ())
@@ -148,7 +148,7 @@ def _string(bound: int) -> _Kind:
     def walk(data: _Bytes, at: int) -> int:
         at += -(at - HEADER_BYTES) % 4
         length: int = data.length_at(data.payload, at)[0]
-        if bound and length > bound + 1:  # with the zero at its end
+        if bound and length > bound + 1:  # with the terminating zero
             raise _Malformed(f"a text of at most {bound} bytes has {length - 1}")
         return at + 4 + length
 
@@ -161,11 +161,11 @@ def _sequence(of: _Kind, bound: int) -> _Kind:
         count: int = data.length_at(data.payload, at - 4)[0]
         if bound and count > bound:
             raise _Malformed(f"a sequence of at most {bound} elements has {count}")
-        if count > data.size - at:  # each has a byte at the least
+        if count > data.size - at:  # each takes at least one byte
             raise _Malformed(f"it ends within a sequence of {count} elements")
         known = len(data.booleans)
         end = _several(of, count, data, at, keep=False)
-        del data.booleans[known:]  # only what has a fixed size is stepped over unseen
+        del data.booleans[known:]  # needed only to skip values of a fixed size in bulk
         return end
 
     return _Kind(walk, max(4, of.align), False)
@@ -184,7 +184,7 @@ def _one_after_another(kinds: list[_Kind]) -> _Kind:
 
 
 def _several(of: _Kind, count: int, data: _Bytes, at: int, *, keep: bool = True) -> int:
-    """Step over some values of one type, all at once where each takes as much as the one before."""
+    """Skip `count` values of one type, in bulk if each has the size of the one before."""
     while count:
         began, at = at, of.walk(data, at)
         count -= 1

@@ -1,6 +1,6 @@
-"""Pool file values about placement, numbers, schedule and price. Values only.
+"""Pool file values: placement, numbers, schedule and price. Data only.
 
-Each field that is made by `key` is a key of the pool file.
+Each field made by `key` is a key of the pool file.
 """
 
 import re
@@ -37,10 +37,10 @@ _CLOCK = re.compile(r"(\d{1,2}):(\d{2})")
 
 
 class Freshness(str, Enum):
-    """Which of a service's waiting requests goes first."""
+    """Which of a service's waiting requests is handled first."""
 
-    EVERY = "every"  # the one that came first, or whose deadline is nearest
-    LATEST = "latest"  # the newest: of a camera's images the older ones are worth less
+    EVERY = "every"  # the one that arrived first, or whose deadline is nearest
+    LATEST = "latest"  # the newest: for example camera images, which lose value with age
 
 
 class Spread(str, Enum):
@@ -51,9 +51,9 @@ class Spread(str, Enum):
 
 
 class Compression(str, Enum):
-    """Whether a service's payloads are compressed on thin links."""
+    """Whether a service's payloads are compressed on slow links."""
 
-    AUTO = "auto"  # where it pays, as measured
+    AUTO = "auto"  # where measurements show that it pays
     OFF = "off"
 
 
@@ -61,14 +61,14 @@ class UplinkPolicy(str, Enum):
     """How a service's requests use several uplinks."""
 
     PREFER = "prefer"  # the first that is up, in the order listed
-    FAILOVER = "failover"  # one until it fails, then the next; no way back before that one fails
+    FAILOVER = "failover"  # one until it fails, then the next; not back before that one fails
     ALL = "all"  # every one, at once
 
 
 class Speaks(str, Enum):
     """How a proxy speaks ROS."""
 
-    RCLPY = "rclpy"  # by the ROS 2 that is installed where it runs, whatever its middleware
+    RCLPY = "rclpy"  # through the ROS 2 installed where it runs, with any middleware
     ZENOH = "zenoh"  # as the nodes of `rmw_zenoh` do, with no ROS installed
 
 
@@ -97,8 +97,8 @@ class Middleware:
 class Correlation:
     """Correlation of replica outages within a zone, a region and a cloud.
 
-    Each is in [0, 1], and none above the one before. Those for a region and a cloud were measured
-    (docs/design/availability.md). A zone that has no room takes all of its machines: they are one.
+    Each is in [0, 1] and at most the one before. Those for a region and a cloud were measured
+    (docs/design/availability.md). A zone without capacity takes back all of its machines, hence 1.
     """
 
     zone: float = 1.0
@@ -263,7 +263,7 @@ _DAYS_FORM = Special("days of the week", _days, {"type": ["string", "array"]})
 class WindowSpec:
     """A weekly time window in the schedule's time zone; None for the pool's own number or cap.
 
-    Days are from 0 for Monday; times are seconds after midnight by the clock on the wall.
+    Days count from 0 for Monday; times are seconds after midnight, local time.
     """
 
     days: frozenset[int] = key(
@@ -303,7 +303,7 @@ class WindowSpec:
 
 @dataclass(frozen=True)
 class ScheduleSpec:
-    """Replicas and cap by the time of the week; launched `prelaunch_s` before a window begins."""
+    """Replicas and cap by time of the week; launches start `prelaunch_s` before a window begins."""
 
     time_zone: str = key(
         Text("a time zone", "write a time zone, such as `time_zone: Europe/Berlin`"),
@@ -413,4 +413,4 @@ class FallbackSpec:
         "start.",
         default=False,
     )
-    limit_s: float = 1.0  # its answer is awaited until so long past the deadline
+    limit_s: float = 1.0  # how long past the deadline its answer is awaited

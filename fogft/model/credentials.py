@@ -1,8 +1,8 @@
 """Certificate holders and their roles. Pure.
 
-A certificate's common name says who its holder is: ``role.name.generation.pool``, for
-instance ``robot.ada.2.0123456789abcdef``; a replica's name is its slot. A revoked name is
-revoked for good: who gets in again does so under the next generation.
+A certificate's common name identifies its holder: ``role.name.generation.pool``, for
+instance ``robot.ada.2.0123456789abcdef``; a replica's name is its slot. Revocation is
+permanent: a holder that is admitted again gets the next generation.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ NAME_PATTERN = re.compile(rf"[A-Za-z0-9]([A-Za-z0-9_-]{{0,{NAME_LIMIT - 2}}}[A-Z
 class Role(str, Enum):
     """The role of a certificate holder."""
 
-    ROBOT = "robot"  # asks
-    REPLICA = "replica"  # answers
-    GATEWAY = "gateway"  # answers robots, asks replicas
+    ROBOT = "robot"  # sends requests
+    REPLICA = "replica"  # answers requests
+    GATEWAY = "gateway"  # answers robots' requests, sends requests to replicas
     RENDEZVOUS = "rendezvous"  # keeps signed records; opens no link
     MANAGER = "manager"  # signs admission, topology and revocations; opens no connection
 
@@ -34,8 +34,8 @@ class Holder:
     """The holder that a certificate names."""
 
     role: Role
-    name: str  # of a replica its slot, as text
-    generation: int  # from 1; a rotation of keys or a launch of a slot makes the next one
+    name: str  # for a replica, its slot as text
+    generation: int  # from 1; incremented by each key rotation or launch of a slot
     pool_uid: str
 
     @property
@@ -55,7 +55,7 @@ def manager_of(pool_uid: str) -> Holder:
 
 
 def holder_of(common_name: str) -> Holder:
-    """Read a certificate's common name. Raises ValueError where it is none of ours."""
+    """Read a certificate's common name. Raises ValueError if it is not fogft's."""
     role, _, rest = common_name.partition(".")
     name, generation, uid = rest.split(".") if rest.count(".") == 2 else ("", "", "")
     if (
@@ -79,5 +79,5 @@ class CredentialPaths:
 
     @classmethod
     def of(cls, folder: Path, stem: str) -> CredentialPaths:
-        """Return those of a name in a folder."""
+        """Return the paths in a folder; `stem` names the certificate and the key."""
         return cls(folder / "ca.crt", folder / f"{stem}.crt", folder / f"{stem}.key")

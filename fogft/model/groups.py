@@ -1,8 +1,8 @@
 """Groups of replicas within one pool, and their slots. Pure.
 
-Where the pool file names no groups there is one. Slots tell the groups apart: group k has the slots
-from ``k * BLOCK`` on; the upper half of a block, from `STAND_INS` on, is for on-demand machines
-that stand in for spot ones.
+A pool file without groups has a single one. A slot identifies its group: group k has the slots from
+``k * BLOCK`` on; the upper half of a block, from `STAND_INS` on, is for on-demand machines that
+stand in for spot ones.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from fogft.model.spec import PoolSpec
 BLOCK = 200
 MAX_GROUPS = 8
 STAND_INS = BLOCK // 2
-# The manager launches all slots below; replicas that people start by hand stay out of its way.
+# The manager uses only lower slots; replicas started by hand use this one and those above.
 FIRST_BY_HAND = 2000
 GATEWAY_SLOT = FIRST_BY_HAND - 1  # the machine of the gateway that a pool launches for itself
 LAST_BY_HAND = 999_999
@@ -83,7 +83,7 @@ def task_at(spec: PoolSpec, slot: int) -> dict[str, Any]:
 
 
 def sales(spec: PoolSpec) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-    """Return the resources to get prices for, by group name; twice for one that mixes markets."""
+    """Return the resources to price, by group name; two entries for a group that mixes markets."""
     found: list[tuple[str, Mapping[str, Any]]] = []
     for group in groups_of(spec):
         if group.on_demand.base or group.on_demand.fallback:
@@ -105,7 +105,7 @@ def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:
 
 
 def shares(groups: tuple[Group, ...], total: int) -> tuple[int, ...]:
-    """Distribute replicas over groups as in the file; differences affect the last groups first."""
+    """Distribute replicas over groups as in the file; the last groups change first."""
     counts = [group.replicas for group in groups]
     counts[-1] += max(0, total - sum(counts))
     for index in reversed(range(len(counts))):

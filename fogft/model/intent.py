@@ -1,6 +1,6 @@
 """The user's changes besides the pool file: scale, drain, exclude, down. Pure.
 
-The command line writes what an operation returns, the manager reads it.
+The command line writes the intent that an operation returns; the manager reads it.
 """
 
 import re
@@ -20,15 +20,15 @@ LOCATION = re.compile(r"[\w.-]+(/[\w.-]+){0,2}")
 class Intent:
     """The user's changes to a pool.
 
-    Once the file's `replicas` are not what `target` was `scaled_from`, the file decides again.
+    `target` applies while the file's `replicas` equals `scaled_from`; otherwise the file decides.
     """
 
-    target: Count | None = None  # wanted by `scale`; None when the pool file decides
+    target: Count | None = None  # number set by `fogft scale`; None if the pool file decides
     scaled_from: Count | None = None
-    drained: Mapping[int, int] = field(default_factory=dict)  # slot -> up to which generation
+    drained: Mapping[int, int] = field(default_factory=dict)  # slot -> last generation to replace
     excluded: frozenset[str] = frozenset()  # ``cloud``, ``cloud/region`` or all three
     stopping: bool = False
-    began_at: Moment = 0.0  # when `max_hours` began anew; 0: they count from the pool's creation
+    began_at: Moment = 0.0  # when `max_hours` was restarted; 0: it counts from the pool's creation
     retried_at: Moment = 0.0
 
     def wanted(self, spec: PoolSpec, now: float) -> int:
@@ -53,7 +53,7 @@ class Intent:
 
 
 def scale(intent: Intent, spec: PoolSpec, change: int, now: float) -> Intent:
-    """Change the number of replicas by `change`. At what the file wants, the file decides again."""
+    """Change the number of replicas by `change`; at the file's own number, `target` is cleared."""
     if spec.availability is not None:
         raise FogftError(
             f"`{spec.name}` cannot be scaled: `availability` sets its number of replicas",
@@ -97,7 +97,7 @@ def include(intent: Intent, location: str) -> Intent:
 
 
 def retry(intent: Intent, now: float) -> Intent:
-    """Resume launching a pool file that was given up."""
+    """Resume launching a pool file that the manager gave up on."""
     return replace(intent, retried_at=now)
 
 

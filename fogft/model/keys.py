@@ -1,8 +1,8 @@
 """Descriptions of pool file keys, each beside the dataclass field that it sets. Pure.
 
-A field of a specification's dataclass is made by `key`. The reader of the pool file, the JSON
-Schema, the page `docs/reference/pool-file.md`, the ROS parameters and the proxies' configuration
-files all come from that.
+`key` makes a field of a specification's dataclass. The reader of the pool file, the JSON Schema,
+the page `docs/reference/pool-file.md`, the ROS parameters and the proxies' configuration files
+are all derived from these fields.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 DAY_S = 86_400.0
-LONGEST_S = 1e7  # what a request's header can carry
+LONGEST_S = 1e7  # the longest duration that a request's header can carry
 
 
 @dataclass(frozen=True)
@@ -48,15 +48,15 @@ class OneOf:
 
 @dataclass(frozen=True)
 class Text:
-    """A text of some form.
+    """A string of a given form.
 
-    With `has_parts` the proxies are told of further ones that no file may name, such as the types
-    of an action's parts.
+    With `has_parts`, proxies' configurations may hold further values that no pool file may hold,
+    such as the types of an action's parts.
     """
 
-    what: str  # it must be, such as ``a service name``
+    what: str  # description of the form, such as ``a service name``
     hint: str
-    check: Callable[[str], str] = str  # returns it as it is kept; raises ValueError: what is wrong
+    check: Callable[[str], str] = str  # returns the value to keep; raises ValueError if it is wrong
     suggest: Callable[[str], str] = lambda text: ""  # what was probably meant; empty for nothing
     has_parts: bool = False
 
@@ -74,7 +74,7 @@ def only(is_right: Callable[[str], object], what: str = "") -> Callable[[str], s
 
 @dataclass(frozen=True)
 class Listed:
-    """A list of different texts."""
+    """A list of distinct strings."""
 
     of: Text
     most: int
@@ -83,7 +83,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class Table:
-    """A map from texts to numbers."""
+    """A map from strings to numbers."""
 
     of: Number
     name: Text
@@ -91,17 +91,17 @@ class Table:
 
 @dataclass(frozen=True)
 class Map:
-    """A map whose keys are a dataclass's."""
+    """A map with the keys of a dataclass."""
 
     of: type
     hint: str = ""
-    short: tuple[str, ...] = ()  # keys that a plain value in place of the map stands for
+    short: tuple[str, ...] = ()  # keys that a plain value in place of the map sets
     off: bool = False  # whether `false` in its place means None
 
 
 @dataclass(frozen=True)
 class Maps:
-    """A list of such maps, each with a unique name."""
+    """A list of maps with the keys of a dataclass, each with a unique name."""
 
     of: type
     hint: str
@@ -157,7 +157,7 @@ def words(form: Form) -> str:  # noqa: PLR0911
 
 
 def checked(form: Form, value: Any) -> Any:
-    """Return a value of a proxy's configuration key. Raises ValueError if its form forbids it."""
+    """Check and return a value in a proxy's configuration. Raises ValueError if it is invalid."""
     match form:
         case Text() if not form.has_parts:
             try:
@@ -181,14 +181,14 @@ class Key:
 
     form: Form
     help: str
-    name: str = ""  # where the field is called otherwise
-    usual: str = ""  # the default in words, where the value says nothing to people
-    advanced: bool = False  # whether it stands under `advanced`
+    name: str = ""  # the key's name, if not the field's
+    usual: str = ""  # the default in words, if the value itself means nothing to users
+    advanced: bool = False  # whether it belongs under `advanced`
     parameter: bool = False  # whether it is a ROS parameter of the client proxy
 
 
 class Entry(NamedTuple):
-    """One field of a dataclass, by its name there and in files."""
+    """One field of a dataclass, with its name there and in files."""
 
     field: str
     name: str
@@ -210,7 +210,7 @@ def key(
     kw_only: bool = False,
     **more: Any,
 ) -> Any:
-    """Return a dataclass's field that is a key of the pool file; `more` is the rest of `Key`."""
+    """Return a dataclass field that is a key of the pool file; `more` sets the rest of `Key`."""
     said = {"key": Key(form, help, **more)}
     return field(default=default, default_factory=default_factory, kw_only=kw_only, metadata=said)
 
@@ -220,7 +220,7 @@ ORDINARY = Key(Free(""), "")
 
 
 def entries_of(cls: Any) -> list[Entry]:
-    """Return all fields of a dataclass, in order, by the names they have in files."""
+    """Return all fields of a dataclass, in order, with their names in files."""
     found = []
     for one in dataclasses.fields(cls):
         said: Key = one.metadata.get("key", ORDINARY)

@@ -1,6 +1,6 @@
 """Membership: which replicas exist and where, written by the manager, read by proxies. Pure.
 
-What an old manager wrote late never replaces what its successor wrote: see `Membership.epoch`.
+A late write by an old manager never replaces one by its successor: see `Membership.epoch`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from fogft.model.topology import Topology, trouble
 class Found(Enum):
     """How a proxy finds a replica."""
 
-    BY_CLOUD = "cloud"  # at the endpoint that the cloud tells
-    BY_RECORD = "record"  # there, or where its own record says that it is
+    BY_CLOUD = "cloud"  # at the endpoint that the cloud reports
+    BY_RECORD = "record"  # at that endpoint, or at the one in the replica's own record
     BY_DOOR = "door"  # it dials in
 
     @classmethod
@@ -44,9 +44,9 @@ def members_of(
     found: Found = Found.BY_CLOUD,
     by_hand: Iterable[ReplicaId] = (),
 ) -> tuple[Member, ...]:
-    """Return the members to hold links to: ours, not ending, not revoked, and can be found.
+    """Return the members to hold links to: this pool's, not ending, not revoked, and findable.
 
-    Those started by hand, which no cloud lists, come last: the highest generation of each slot
+    Replicas started by hand, which no cloud lists, come last: the highest generation of each slot
     that no machine has.
     """
     members = tuple(
@@ -87,7 +87,7 @@ def successor(
     revoked: Collection[str] = (),
     topology: Topology | None = None,
 ) -> Membership | None:
-    """Return the next membership to write, or None when nothing would change."""
+    """Return the next membership to write; None if nothing changes or a newer manager wrote."""
     topology = topology or Topology()
     if current is None or current.pool_uid != pool_uid:
         return Membership(pool, pool_uid, epoch, 1, members, frozenset(revoked), topology)
@@ -108,7 +108,7 @@ def to_dict(membership: Membership) -> dict[str, Any]:
 
 
 def from_dict(raw: Any) -> Membership:
-    """Read a membership back. Raises StateError where it is none, or damaged."""
+    """Read a membership back. Raises StateError if it is not one, or damaged."""
     try:
         content = {key: value for key, value in raw.items() if key != "checksum"}
         if raw["checksum"] != checksum(content):

@@ -1,7 +1,7 @@
 """Identifiers that both ends derive: Zenoh keys, certificate names, request ids.
 
-A connection is known by pool, slot, service and type, never by an address, so a replica
-that is launched again elsewhere resumes the same connection.
+A connection is identified by pool, slot, service and type, never by an address, so a replica
+that is relaunched elsewhere resumes the same connection.
 
 Source: FogROS2-SGC's construction of identifiers, extended to connections by FogROS2-FT.
 """
@@ -14,9 +14,9 @@ from typing import Annotated
 from fogft.model.keys import Text, only
 
 REQUEST_ID_BYTES = 16
-GATEWAY_SLOTS = 1 << 32  # from here on, slots are gateways
+GATEWAY_SLOTS = 1 << 32  # slots from here on belong to gateways
 # SkyPilot's names of clouds, kept so that reading a pool file needs no SkyPilot;
-# `tests/sky/test_installed.py` holds them to the installed one's.
+# `tests/sky/test_installed.py` compares them with the installed version's.
 VM_CLOUDS = (
     *("aws", "azure", "cudo", "do", "fluidstack", "gcp", "hyperbolic", "ibm", "lambda", "mithril"),
     *("nebius", "oci", "paperspace", "primeintellect", "runpod", "scp", "seeweb", "shadeform"),
@@ -33,7 +33,7 @@ POOL_NAME_PATTERN = re.compile(r"[a-z0-9]([a-z0-9-]{0,38}[a-z0-9])?")
 
 
 def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str:
-    """Return the 32 hexadecimal digits that permanently name a connection."""
+    """Return the 32 hexadecimal digits that permanently identify a connection."""
     digest = hashlib.sha256()
     for part in (pool_uid, str(slot), service, type_name):
         encoded = part.encode()
@@ -41,13 +41,13 @@ def connection_id(pool_uid: str, slot: int, service: str, type_name: str) -> str
     return digest.hexdigest()[:32]
 
 
-# What stands behind a slot's prefix in its keys: the queries that carry a connection's answers,
-# probes, signed records, ids of requests that are no longer wanted, and all of its services.
+# Suffixes of a slot's keys: queries that carry a connection's answers, probes, signed records,
+# ids of requests that are no longer wanted, and all of its services.
 ANSWERS, PROBE, RECORDS, CANCEL, SERVICES = "answers", "probe", "records", "cancel", "s/*"
 
 
 def slot_key(pool_uid: str, slot: int, what: str) -> str:
-    """Return a Zenoh key of a slot, which may serve only keys of this form."""
+    """Return a Zenoh key of a slot; a slot may serve only keys of this form."""
     return f"fogft/{pool_uid}/{slot}/{what}"
 
 
@@ -58,7 +58,7 @@ def service_key(pool_uid: str, slot: int, service: str, type_name: str) -> str:
 
 
 def service_keys(pool_uid: str, slot: int, types: Mapping[str, str]) -> dict[str, str]:
-    """Return service -> Zenoh key of a slot, from service -> type."""
+    """Return a slot's Zenoh key for each service, given the type of each."""
     return {name: service_key(pool_uid, slot, name, kind) for name, kind in types.items()}
 
 

@@ -1,8 +1,8 @@
-"""Values as plain JSON data, and back. Pure.
+"""Convert values to plain JSON data and back. Pure.
 
-The types of a dataclass's fields say what may stand where. An `Annotated` type has checks besides,
-and a key of a pool file the check of its form. Unknown keys are left alone: a newer program may
-have written them.
+The types of a dataclass's fields define the accepted data. An `Annotated` type adds checks, and a
+key of a pool file the check of its form. Unknown keys are ignored: a newer version may have
+written them.
 """
 
 import dataclasses
@@ -21,7 +21,7 @@ T = TypeVar("T")
 Read = Callable[[Any], Any]
 
 LINE_LIMIT = 1000  # characters
-_MOST = 1e300  # further on there is no arithmetic
+_MOST = 1e300  # larger numbers would overflow in arithmetic
 
 
 class Misfit(ValueError):
@@ -34,10 +34,10 @@ class Misfit(ValueError):
 
 
 def within(least: float, most: float) -> Callable[[float], None]:
-    """Return a check of an `Annotated` number: that it is from `least` to `most`."""
+    """Return a check for `Annotated` that a number is from `least` to `most`."""
 
     def check(value: float) -> None:
-        if not least <= value <= most:  # nor NaN
+        if not least <= value <= most:  # also refuses NaN
             raise ValueError(f"{value!r:.40} is not from {least:g} to {most:g}")
 
     return check
@@ -62,15 +62,15 @@ def _check_line(text: str) -> None:
         raise ValueError(f"it has {len(text)} characters, at most {LINE_LIMIT}")
 
 
-Line = Annotated[str, _check_line]  # it may reach a terminal: no escape, no second line
+Line = Annotated[str, _check_line]  # it may reach a terminal: no escape sequence, no line break
 Seconds = Annotated[float, within(0, 1e12)]  # a duration
 Moment = Annotated[float, within(0, 2.5e11)]  # seconds since the epoch: a year of four digits
 
 
 def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
-    """Return a value as JSON data: classes as maps by the names of their keys, a set sorted.
+    """Return a value as JSON data: dataclasses as maps by key name, sets as sorted lists.
 
-    With `omit_defaults`, or for a class that has it, fields that have their defaults are left out.
+    With `omit_defaults`, or for a class with `omits_defaults`, default values are left out.
     """
     again = partial(to_plain, omit_defaults=omit_defaults)
     if isinstance(value, Enum):
@@ -90,7 +90,7 @@ def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:
 
 
 def from_plain(cls: type[T], raw: Any) -> T:
-    """Return the value that JSON data describes. Raises ValueError, which begins with the key."""
+    """Return the value that JSON data describes. Raises ValueError that begins with the key."""
     hint: Any = cls
     try:
         made: T = _reader(hint)(raw)
@@ -100,7 +100,7 @@ def from_plain(cls: type[T], raw: Any) -> T:
 
 
 def stored(cls: type[T], raw: Any, what: str, hint: str = "") -> T:
-    """Do the same for JSON data of ours: a StateError begins with ``what``."""
+    """Like `from_plain` for fogft's own files: raises StateError, which begins with `what`."""
     try:
         return from_plain(cls, raw)
     except ValueError as error:
@@ -143,8 +143,8 @@ def _scalar(kind: Any) -> Read:
         if not isinstance(raw, allowed) or (isinstance(raw, bool) and kind is not bool):
             raise ValueError(f"{raw!r:.40} is not of type `{kind.__name__}`")
         if isinstance(raw, str):
-            raw.encode()  # a lone surrogate cannot be written again
-        elif not -_MOST <= raw <= _MOST:  # nor NaN
+            raw.encode()  # fails on a lone surrogate, which could not be written back
+        elif not -_MOST <= raw <= _MOST:  # also refuses NaN
             raise ValueError(f"{raw!r:.40} is out of range")
         return kind(raw)
 
@@ -207,7 +207,7 @@ def _class(cls: Any, raw: Any) -> Any:
     return cls(**{entries[name].field: value for name, value in found.items()})
 
 
-@cache  # made as one is read: a class may contain itself
+@cache  # on first use: a class may contain itself
 def _fields(cls: Any) -> tuple[dict[str, keys.Entry], dict[str, Read]]:
     hints = typing.get_type_hints(cls, include_extras=True)
     entries = {one.name: one for one in keys.entries_of(cls)}
@@ -215,7 +215,7 @@ def _fields(cls: Any) -> tuple[dict[str, keys.Entry], dict[str, Read]]:
 
 
 def _of_key(entry: keys.Entry, read: Read) -> Read:
-    """Return a reader that keeps to what a pool file may say, or to the key's default."""
+    """Return a reader that accepts only what a pool file may say, or the key's default."""
     form, default = entry.key.form, entry.default
     if entry.key is keys.ORDINARY:
         return read

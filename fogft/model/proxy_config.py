@@ -47,10 +47,10 @@ class ProxyConfig:
     pool_uid: PoolUid
     credentials: CredentialPaths
     services: tuple[ServiceSpec, ...]
-    domain_id: DomainId | None = None  # ROS domain; ROS_DOMAIN_ID where it is not set
+    domain_id: DomainId | None = None  # ROS domain; if not set, ROS_DOMAIN_ID
     rendezvous: tuple[Endpoint, ...] = ()
-    records: Path | None = None  # what was learned from rendezvous, for the next start
-    announcements: Path | None = None  # what the manager signed for every replica
+    records: Path | None = None  # records learned from rendezvous, for the next start
+    announcements: Path | None = None  # signed by the manager for every replica
     metrics: EndpointOrEmpty = ""
     topics: tuple[TopicSpec, ...] = ()
     rmw: Speaks = Speaks.RCLPY
@@ -58,17 +58,17 @@ class ProxyConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ClientProxyConfig(ProxyConfig):
-    """Configuration of `fogft proxy` and `fogft gateway`, which passes `announcements` on."""
+    """Configuration of `fogft proxy`, and of `fogft gateway`, which forwards `announcements`."""
 
-    robot: Robot  # the name of this robot, or gateway
-    membership: Path  # which replicas there are; written by the manager
-    status: Path  # what the proxy reports to the manager
+    robot: Robot  # the name of this robot or gateway
+    membership: Path  # the list of replicas, written by the manager
+    status: Path  # the proxy's report to the manager
     lock: Path
-    suspect_after_s: LastsFor = 2.0  # without a probe reply, a replica is sent nothing more
+    suspect_after_s: LastsFor = 2.0  # then a replica without a probe reply gets no requests
     tell_losers: bool = True  # whether replicas are told which requests were answered elsewhere
-    dial_in: EndpointOrEmpty = ""  # what replicas are given that cannot be reached
-    dial_in_listen: EndpointOrEmpty = ""  # if not on that port of all addresses
-    uplinks: tuple[Interface, ...] = ()  # to use at once, the preferred one first
+    dial_in: EndpointOrEmpty = ""  # address given to replicas that cannot be reached
+    dial_in_listen: EndpointOrEmpty = ""  # where to listen, if not on that port of all addresses
+    uplinks: tuple[Interface, ...] = ()  # used at the same time, preferred first
     listen: EndpointOrEmpty = ""  # where a gateway listens for robots
 
 
@@ -78,18 +78,18 @@ class ServerProxyConfig(ProxyConfig):
 
     slot: Annotated[int, within(0, 999_999)]
     generation: Generation
-    run: str = ""  # starts the services in `workdir`; empty where they are started otherwise
-    spare: bool = False  # whether a second process of it is kept, for when the first dies
+    run: str = ""  # command that starts the services, in `workdir`; empty if something else does
+    spare: bool = False  # whether to keep a second `run` process for when the first dies
     listen: Endpoint = f"0.0.0.0:{LINK_PORT}"
     workdir: Path = Path()
     envs: Mapping[str, str] = field(default_factory=dict)
     notice: NoticeSource = "auto"
-    advertise: EndpointOrEmpty = ""  # where this replica is reached, if not where it listens
-    dial_out: tuple[Endpoint, ...] = ()  # robots that it dials, where it cannot be reached
+    advertise: EndpointOrEmpty = ""  # address at which this replica is reached, if not `listen`
+    dial_out: tuple[Endpoint, ...] = ()  # robots that it dials, if it cannot be reached
 
     @property
     def id(self) -> ReplicaId:
-        """Which replica this is."""
+        """The id of this replica."""
         return ReplicaId(self.pool_uid, self.slot, self.generation)
 
 

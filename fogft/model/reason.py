@@ -1,6 +1,6 @@
 """Reasons for events and delays: a cause with its data.
 
-Decisions compare causes. Words are made of a reason where people read it, by `reason_words`.
+Decisions compare causes. Where people read a reason, `reason_words` puts it into words.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ class Cause(str, Enum):
     """The causes. Their values are used in files and in JSON and do not change."""
 
     # A launch was refused or has failed.
-    CAPACITY = "capacity"  # full now: another place, or another time
+    CAPACITY = "capacity"  # full now: try another location, or later
     QUOTA = "quota"  # the account may not have more: waiting does not help
     CREDENTIALS = "credentials"  # expired, wrong, or without a permission
     SETUP = "setup"  # the pool file's `setup` failed: every place would do the same
     TIMEOUT = "timeout"  # it took too long
     ERROR = "error"
-    NOT_RUNNING = "not_running"  # of a timeout: what did not come
+    NOT_RUNNING = "not_running"  # detail of a timeout: what did not happen in time
     NOT_READY = "not_ready"
     NOT_SET_UP = "not_set_up"
 
@@ -29,11 +29,11 @@ class Cause(str, Enum):
     NOTICE_BY_REPLICA = "drains_itself"
     SILENT = "silent"
     DISAGREES = "disagrees"
-    MISREAD = "misread"  # its answers are no messages of the type
-    IGNORES = "ignores"  # it takes requests and never ends them
+    MISREAD = "misread"  # its answers are not messages of the type
+    IGNORES = "ignores"  # it takes requests and never completes them
     AT_RISK = "at_risk"
     SERVICE_AWAY = "service_away"
-    NOT_LISTED = "not_listed"  # its cloud lists it no more, and gave no notice
+    NOT_LISTED = "not_listed"  # its cloud no longer lists it, and gave no notice
 
     # Why a working replica is replaced.
     DRAINED = "drained"
@@ -43,7 +43,7 @@ class Cause(str, Enum):
     SUPERSEDED = "superseded"
     BETTER_SPREAD = "better_spread"
     BETTER_SCORE = "better_score"
-    SPOT_AGAIN = "spot_again"  # it moves to the market that is meant for it
+    SPOT_AGAIN = "spot_again"  # it moves back to its intended market
     ON_DEMAND_AGAIN = "on_demand_again"
 
     # Why a replica ends now.
@@ -78,9 +78,9 @@ class Cause(str, Enum):
     OTHER_MARKET = "other_market"
     CROWDED = "crowded"
     WORSE_SCORE = "worse_score"
-    CHOSEN = "chosen"  # of a worse score: what was chosen in its place
+    CHOSEN = "chosen"  # detail of a worse score: the offer chosen instead
 
-    NEVER_READY = "never_ready"  # a version is given up: none of its launches came to serve
+    NEVER_READY = "never_ready"  # a version is given up: none of its launches ever served
     LAUNCH_LIMIT = "launch_limit"
 
     # How many are wanted.
@@ -118,7 +118,7 @@ class Cause(str, Enum):
     NO_CERTIFICATE = "no_certificate"
     NO_RENDEZVOUS = "no_rendezvous"
     NOT_OFFERED = "not_offered"
-    OUTVOTED = "outvoted"  # not even half of the replicas offer a service
+    OUTVOTED = "outvoted"  # at most half of the replicas offer a service
     TROUBLE = "trouble"  # an error, in its own words
 
 
@@ -126,7 +126,7 @@ class Cause(str, Enum):
 class Reason:
     """A cause with its data. Fields that do not apply to the cause keep their defaults."""
 
-    omits_defaults: ClassVar[bool] = True  # plain data is the cause and what belongs to it
+    omits_defaults: ClassVar[bool] = True  # plain data has only the cause and its own fields
 
     cause: Cause
     slot: int | None = None
@@ -135,13 +135,13 @@ class Reason:
     name: str = ""  # of a service, a gateway or a file
     seconds: float | None = None  # how long, or until when
     count: int | None = None
-    of: int | None = None  # so many
+    of: int | None = None  # the total that `count` is part of
     share: float | None = None  # of one, such as a gain or an availability
-    target: float | None = None  # what that is held against
+    target: float | None = None  # what `share` is compared with
     usd_per_hour: float | None = None
-    limit_usd_per_hour: float | None = None  # what that is held against
-    words: str = ""  # what a cloud, a program or an error says: shown, never read
-    because: tuple[Reason, ...] = ()  # what led to it, the main reason first
+    limit_usd_per_hour: float | None = None  # what `usd_per_hour` is compared with
+    words: str = ""  # text of a cloud, a program or an error: shown, never parsed
+    because: tuple[Reason, ...] = ()  # the reasons that led to it, the main one first
 
 
 NOTICES = (Cause.NOTICE, Cause.NOTICE_BY_REPLICA)

@@ -1,11 +1,11 @@
 """Why a replica or its link refused a request, and the effect of each refusal. Pure.
 
-A new kind of refusal is a row here, the code that raises it, and a test. The comment above a row
+A new kind of refusal needs a row here, code that raises it, and a test. The comment above a row
 is published: `scripts/docs` writes it into docs/reference/diagnostics.md. Requests are refused
 in `proxy/replica/responder` (services), `.goals_once`, `.topics`, `.ordered_responder` with
 `ordering/replica` (services with `state`), `proxy/gateway/gateway`, `link/zenoh/replica` (who may
 not ask; `.reply_queue`: lost answers), and on the robot in `link/zenoh/robot/attempts` and
-`link/uplinks`. An older robot reads a new kind as UNKNOWN, without effect: one of three attempts.
+`link/uplinks`. An older robot reads a new kind as UNKNOWN, which only uses up one of 3 attempts.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ class Effect(Flag):
     """The effect of a refusal on the robot, besides asking another replica."""
 
     NONE = 0
-    BLAMELESS = auto()  # the replica never began: no sign against the request itself
-    FINAL = auto()  # asked again, this replica would run it twice, or refuse it again
-    FAULT = auto()  # it speaks against the service
+    BLAMELESS = auto()  # not held against the request: the replica may never have begun it
+    FINAL = auto()  # on a retry, this replica would run it twice, or refuse it again
+    FAULT = auto()  # counts against the service
     OTHER_UPLINK = auto()  # the same replica may be reached through another uplink
     GOALS_LOST = auto()  # the action server may have lost the goals that it had
 
@@ -30,7 +30,7 @@ class Refusal(str, Enum):
     effect: Effect
 
     def __new__(cls, text: str, effect: Effect = Effect.NONE) -> Refusal:
-        """Make a row."""
+        """Make a member from its text and effect."""
         kind = str.__new__(cls, text)
         kind._value_ = text
         kind.effect = effect
@@ -81,7 +81,7 @@ class Refusal(str, Enum):
     UNKNOWN = "unknown"
 
     def __str__(self) -> str:
-        """Return the kind as it travels."""
+        """Return the text that is sent for the kind."""
         return str(self.value)
 
     def text(self, detail: str = "") -> str:

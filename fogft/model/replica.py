@@ -1,6 +1,6 @@
 """Values used everywhere: replica, placement, machine, link report.
 
-Pure data, immutable, compared by value. The words are those of docs/reference/glossary.md.
+Pure data, immutable, compared by value. docs/reference/glossary.md defines the terms.
 """
 
 import re
@@ -35,7 +35,7 @@ class ReplicaId:
 
     @cached_property
     def key(self) -> int:
-        """Slot and generation in one number, by which one pool's requests know it."""
+        """Slot and generation in one number, which identifies a replica within its pool."""
         return self.slot << 32 | self.generation
 
     @property
@@ -67,12 +67,12 @@ class Placement:
 
     @cached_property
     def location(self) -> str:
-        """``cloud/region/zone``: what can be excluded, full or quarantined."""
+        """``cloud/region/zone``: the unit that can be excluded, full or quarantined."""
         return f"{self.cloud}/{self.region}/{self.zone}"
 
     @cached_property
     def supply(self) -> str:
-        """What can be out of capacity on its own: a location's spot or on-demand machines."""
+        """The unit that can run out of capacity: a location's spot or on-demand machines."""
         return supply(self.location, on_demand=not self.spot)
 
     @cached_property
@@ -96,20 +96,20 @@ class Offer:
 
     placement: Placement
     usd_per_hour: float
-    source: str = ""  # of the price: ``live``, ``catalogue``; empty where it is simulated
-    as_of: float = 0.0  # when it was true, in seconds since the epoch; 0 when that is not known
-    group: str = ""  # of the pool file that it suits; empty where there are none
-    extras_usd_per_hour: float = 0.0  # the part that is for its disk and its address
-    egress_usd_per_hour: float = 0.0  # the part that is for the responses that leave the cloud
+    source: str = ""  # of the price: ``live``, ``catalogue``; empty if it is simulated
+    as_of: float = 0.0  # when the price was valid, in seconds since the epoch; 0 if unknown
+    group: str = ""  # the pool file's group that it suits; empty without groups
+    extras_usd_per_hour: float = 0.0  # the part for its disk and its address
+    egress_usd_per_hour: float = 0.0  # the part for responses that leave the cloud
 
 
 class Phase(str, Enum):
-    """The phases of a replica's life. It only moves forward."""
+    """The phases of a replica's life. A replica only moves forward."""
 
-    PROVISIONING = "provisioning"  # asked of the cloud, not yet running
+    PROVISIONING = "provisioning"  # requested from the cloud, not yet running
     STARTING = "starting"  # the machine runs; the service does not answer yet
     READY = "ready"  # the service answers
-    DRAINING = "draining"  # answers, but is to go: nothing new is sent while others can
+    DRAINING = "draining"  # answers, but will end: gets no new requests while others can answer
     GONE = "gone"
 
 
@@ -124,9 +124,9 @@ class MachinePhase(str, Enum):
 
 @dataclass(frozen=True)
 class Machine:
-    """One of fogft's machines in a cloud's list. Moments are seconds since the epoch; 0: unknown.
+    """One of fogft's machines in a cloud's list. Times are seconds since the epoch; 0: unknown.
 
-    `notice` is of a preemption, where the list tells; elsewhere its link does (`LinkReport`).
+    `notice`: a preemption notice, if the list has it; otherwise see its link (`LinkReport`).
     """
 
     id: ReplicaId
@@ -136,13 +136,13 @@ class Machine:
     endpoint: str | None = None  # ``host:port`` where the server proxy listens, once known
     notice: bool = False
     usd_per_hour: float = 0.0
-    spec_hash: str = ""  # `PoolSpec.replica_hash` at its launch; another one means outdated
-    failure: Reason | None = None  # in its words, a log's last lines stand after a line break
-    progress: str = ""  # what the cloud says is being done there until it serves, for people
+    spec_hash: str = ""  # `PoolSpec.replica_hash` at launch; outdated if the pool's differs
+    failure: Reason | None = None  # its words may end in a line break and a log's last lines
+    progress: str = ""  # what the cloud reports it is doing before it serves, for people
     setting_up: bool = False
-    running_at: float = 0.0  # when it was seen to run
+    running_at: float = 0.0  # when it was seen running
     set_up_at: float = 0.0
-    pool: str = ""  # its name, as far as the cloud knows it
+    pool: str = ""  # its name, if the cloud knows it
 
 
 def by_id(machine: Machine) -> tuple[str, int, int]:
@@ -154,7 +154,7 @@ def by_id(machine: Machine) -> tuple[str, int, int]:
 class LinkState(str, Enum):
     """The state of a client proxy's link to a replica."""
 
-    CONNECTING = "connecting"  # never answered a probe yet
+    CONNECTING = "connecting"  # has not answered a probe yet
     UP = "up"  # the last probe was answered in time
     SUSPECT = "suspect"  # was up; the server proxy no longer answers probes
 
@@ -165,7 +165,7 @@ _DOUBTED_AFTER_ROUND_TRIPS = 3
 
 
 def doubted_after_s(rtt_s: float | None) -> float:
-    """Return after how many seconds without a probe reply a replica is in doubt."""
+    """Return the number of seconds without a probe reply after which a replica is in doubt."""
     return max(DOUBTED_AFTER_S, _DOUBTED_AFTER_ROUND_TRIPS * (rtt_s or 0.0))
 
 
@@ -175,33 +175,33 @@ class LinkReport:
 
     id: ReplicaId
     state: LinkState
-    ready: frozenset[str] = frozenset()  # services that it says it can answer now
-    leaving: bool = False  # it says that its machine will be taken
-    draining: bool = False  # it is leaving, or marked: nothing new while others can answer
-    at_risk: bool = False  # its cloud recommends to move it; it serves on meanwhile
-    disagrees: bool = False  # repeatedly, with a quorum; or one of the next two
-    misread: bool = False  # its answers were no responses
-    ignores: bool = False  # it never ends requests that others answer
+    ready: frozenset[str] = frozenset()  # services that it reports it can answer now
+    leaving: bool = False  # it reports that its machine will be taken
+    draining: bool = False  # leaving, or marked to end: no new requests while others can answer
+    at_risk: bool = False  # its cloud recommends moving it; it keeps serving meanwhile
+    disagrees: bool = False  # repeatedly, with the quorum; or one of the next two
+    misread: bool = False  # its answers could not be read as responses
+    ignores: bool = False  # it never completes requests that others answer
     heard_age_s: float | None = None  # since it last answered a probe; None if never
     silent_for_s: float = 0.0  # how long probes have gone unanswered; 0 while they are answered
     rtt_s: float | None = None
     in_flight: int = 0
     won: int = 0
     restarts: int = 0
-    strangers: int = 0  # connections at its port that nobody with a certificate had opened
-    version: str = ""  # of fogft on the replica; empty where it is not known
-    lease_age_s: float | None = None  # since it last heard of the manager; None if it never did
-    lease_left_s: float | None = None  # until it shuts down unless it hears of it; None for never
-    answered: int = 0  # requests that it has answered well, first or not
-    failed: int = 0  # those that came to a crash, a refusal or a response that was not ok
+    strangers: int = 0  # connections to its port by peers without a certificate
+    version: str = ""  # of fogft on the replica; empty if unknown
+    lease_age_s: float | None = None  # since it last heard from the manager; None if it never did
+    lease_left_s: float | None = None  # until it shuts down unless it hears from it; None: never
+    answered: int = 0  # requests that it answered successfully, first or not
+    failed: int = 0  # requests that ended in a crash, a refusal or a response that was not ok
     detail: str = ""  # last error in words (connection refused, wrong certificate, ...)
-    differs: bool = False  # a service's type is another than on the robot, or cannot be loaded
+    differs: bool = False  # a service's type differs from the robot's, or cannot be loaded
     differing: tuple[str, ...] = ()
-    offered: tuple[tuple[str, str], ...] = ()  # by `run`: name and type, where found out or wrong
+    offered: tuple[tuple[str, str], ...] = ()  # by `run`: name and type, if discovered or wrong
 
     @property
     def doubted(self) -> bool:
-        """Whether it was up and is silent for longer than answers take: the cloud is asked."""
+        """Whether it was up and is silent for longer than answers take, so the cloud is asked."""
         if self.state is LinkState.UP:
             return self.silent_for_s >= doubted_after_s(self.rtt_s)
         return self.state is LinkState.SUSPECT
@@ -212,22 +212,22 @@ class Observed:
     """All inputs of a plan besides the spec: the pool as observed at `now`."""
 
     now: float
-    machines: tuple[Machine, ...] | None  # the cloud's own list; None when it could not tell
+    machines: tuple[Machine, ...] | None  # the cloud's own list; None if it did not answer
     links: tuple[LinkReport, ...] | None = None  # None when there is no fresh report
     offers: tuple[Offer, ...] = ()
-    ending: frozenset[ReplicaId] = frozenset()  # already asked to end, and perhaps still listed
+    ending: frozenset[ReplicaId] = frozenset()  # already told to end, perhaps still listed
     rtt_s: Mapping[str, float] = field(default_factory=dict)  # from the robot, by ``cloud/region``
-    doubt_s: float = 0.0  # by so much the clock was set just now: the time of day goes without it
-    gateway: tuple[Machine, ...] = ()  # that was launched; more than one while it is replaced
+    doubt_s: float = 0.0  # how far the clock was just set; `wall_clock` leaves that out
+    gateway: tuple[Machine, ...] = ()  # the launched one; several while it is replaced
     standbys: tuple[Machine, ...] = ()  # machines that are stopped
 
     @property
     def wall_clock(self) -> float:
-        """The time of the week's windows: a clock that was set is believed after a while only."""
+        """The time for schedule windows: a clock that was set is trusted only after a while."""
         return self.now - self.doubt_s
 
     def below(self, cap: float | None) -> float | None:
-        """Return what a cap leaves for replicas."""
+        """Return what a cap leaves for replicas, after the gateway and the standbys."""
         if cap is None:
             return None
         return max(0.0, cap - sum(m.usd_per_hour for m in (*self.gateway, *self.standbys)))
@@ -235,10 +235,10 @@ class Observed:
 
 @dataclass(frozen=True)
 class Member:
-    """A replica that the client proxy should hold a link to, or a gateway in their place."""
+    """A replica that the client proxy should hold a link to, or a gateway in place of replicas."""
 
     id: ReplicaId
-    endpoint: EndpointOrEmpty  # empty where it is not known yet, or the replica dials out
+    endpoint: EndpointOrEmpty  # empty if not known yet, or if the replica dials out
     draining: bool = False
     gateway: str = ""  # its name; empty for a replica
     version: Annotated[str, only(_VERSION.fullmatch)] = ""  # `Machine.spec_hash`, if known
@@ -261,7 +261,7 @@ class Membership:
 
     pool: str
     pool_uid: PoolUid
-    epoch: Count  # the writing manager's lease
+    epoch: Count  # of the writing manager's lease
     version: Count  # counts its writes
     members: tuple[Member, ...] = ()
     revoked: frozenset[str] = frozenset()  # common names of certificates; only ever grows

@@ -1,6 +1,6 @@
 """ROS 2's rules for names in a pool file. Pure: nothing is looked up.
 
-Kept equal to what ROS itself accepts by tests/ros/test_service_names.
+tests/ros/test_service_names compares them with what ROS itself accepts.
 
 Source: the ROS 2 design documents on topic and service names and on interface
 definitions; `rmw_validate_full_topic_name` and rosidl's own patterns.
@@ -35,7 +35,7 @@ def absolute_service_name(name: str) -> str:
 
 
 def is_below(name: str, namespace: str) -> bool:
-    """Whether an absolute name is in a namespace, or in one below it; all are in the empty one."""
+    """Whether an absolute name is in a namespace or below it; the empty one contains all names."""
     return name.startswith(namespace.rstrip("/") + "/")
 
 
@@ -54,12 +54,12 @@ is_message_type = partial(_is_type, kind="msg")
 is_action_type = partial(_is_type, kind="action")
 
 
-# Every node has these: parameters, loggers, its types, its life cycle.
+# Packages of services that nodes have anyway: parameters, loggers, types, life cycle.
 _OF_ROS = frozenset(("rcl_interfaces", "type_description_interfaces", "lifecycle_msgs"))
 
 
 def is_application(node: str) -> bool:
-    """Whether a node is an application's: neither hidden, as ros2cli's daemon, nor a proxy."""
+    """Whether a node belongs to an application: not hidden (like ros2cli's daemon), not a proxy."""
     return not node.startswith(("_", "fogft_"))
 
 

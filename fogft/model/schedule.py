@@ -1,6 +1,6 @@
-"""Replicas and cap by the time of the week. Pure: `now` is an argument.
+"""Replicas and cap by time of the week. Pure: `now` is an argument.
 
-Windows are told by the clock on the wall, so they follow daylight-saving time.
+Windows are in local time, so they follow daylight-saving time.
 """
 
 import datetime
@@ -13,7 +13,7 @@ from fogft.model.spec import PoolSpec
 
 
 class Wish(NamedTuple):
-    """The wanted replicas and cap at a time; `ahead` if for a window that has not begun."""
+    """The desired replicas and cap at a time; `ahead` if for a window that has not begun."""
 
     replicas: int
     max_usd_per_hour: float | None
@@ -21,7 +21,7 @@ class Wish(NamedTuple):
 
 
 def zone(name: str) -> datetime.tzinfo:
-    """Return a time zone by its name. Raises ValueError where this machine knows none."""
+    """Return a time zone by its name. Raises ValueError if this machine does not know it."""
     if name == "UTC":
         return datetime.timezone.utc
     try:
@@ -41,8 +41,8 @@ def window_at(schedule: ScheduleSpec, moment: float) -> WindowSpec | None:
 def wish(spec: PoolSpec, now: float) -> Wish:
     """Return the replicas and the cap that the file wants now.
 
-    Within `prelaunch_s` before a window that wants more replicas, its number holds, and
-    the higher of both caps. Every minute of that time is looked at: a window may be shorter.
+    Within `prelaunch_s` before a window that wants more replicas, its number and the higher of
+    both caps apply. Each minute of that time is checked: a window may be shorter than it.
     """
     schedule, usual = spec.schedule, Wish(spec.replicas, spec.max_usd_per_hour)
     if schedule is None:
@@ -78,13 +78,13 @@ def _holds(window: WindowSpec, today: int, second: int) -> bool:
 
 
 def next_change(schedule: ScheduleSpec, now: float) -> float:
-    """Return when `wish` can next change: a window begins, is near or ends.
+    """Return the next time that `wish` may change: a window begins, is near or ends.
 
-    Where the clock on the wall is changed before that, it may come early; never late.
+    If local time is shifted before then, the result may be early, but never late.
     """
     local = datetime.datetime.fromtimestamp(now, zone(schedule.time_zone))
     second = local.hour * 3600 + local.minute * 60 + local.second + local.microsecond / 1e6
     times = {float(t) for w in schedule.windows for t in (w.begins_s, w.ends_s)}
-    times |= {t - schedule.prelaunch_s for t in times}  # a window may want fewer than its end
+    times |= {t - schedule.prelaunch_s for t in times}  # of ends too: more may be wanted after
     shifted = {t + shift for t in times for shift in (-3600.0, 0.0, 3600.0)}
     return now + min((t - second) % DAY_S or DAY_S for t in shifted)

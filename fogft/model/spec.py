@@ -51,7 +51,7 @@ from fogft.model.state import StateSpec
 from fogft.model.topic import ActionSpec, TopicSpec
 from fogft.model.topology import LAUNCHED, Gateway, LaunchedGateway, Topology
 
-CONCURRENCY_LIMIT = 512  # a replica holds no more requests
+CONCURRENCY_LIMIT = 512  # most requests that a replica holds
 MAX_HOURS = 8000  # the certificates last 365 days
 # Keys of `resources` that say where a machine may be, not what it is.
 _WHEREABOUTS = frozenset({"infra", "cloud", "region", "zone", "any_of", "ordered", "job_recovery"})
@@ -225,9 +225,9 @@ class ServiceSpec:
 
     @property
     def advertised(self) -> Advertise:
-        """When it is offered: as configured, else while it can be answered.
+        """When the service is offered: as configured, else while a replica can answer.
 
-        One that is answered with no replica at all, or whose requests are kept in order, stays.
+        One that answers without replicas, or keeps state, stays offered once a replica was ready.
         """
         if self.advertise is not None:
             return self.advertise
@@ -451,8 +451,8 @@ class PoolSpec:
         default=24.0,
     )
     task: Mapping[str, Any] = field(default_factory=dict)  # the file without its `fogft` section
-    discovered: tuple[ServiceSpec, ...] = ()  # where the file names no services
-    discovered_by: str = ""  # the hash of the replicas that told of them
+    discovered: tuple[ServiceSpec, ...] = ()  # used if the file names no services
+    discovered_by: str = ""  # the hash of the replicas that reported them
 
     @cached_property
     def derived(self) -> dict[Any, Any]:
@@ -466,11 +466,11 @@ class PoolSpec:
 
     @property
     def dials_out(self) -> bool:
-        """Whether nobody has to reach a replica: it dials a robot or a gateway."""
+        """Whether replicas dial a robot or a gateway, so that nothing has to reach them."""
         return bool(self.dial_in) or self.gateway.launch
 
     def behind(self, host: str) -> PoolSpec:
-        """Return this spec once its launched gateway is at `host`: all talk through it."""
+        """Return this spec with its launched gateway at `host`: all traffic goes through it."""
         gateway, rendezvous, door = self.gateway.endpoints(host)
         topology = Topology((Gateway(LAUNCHED, gateway),), through=(LAUNCHED,))
         return replace(self, topology=topology, rendezvous=(rendezvous,), dial_in=door)
@@ -479,13 +479,13 @@ class PoolSpec:
     def replica_hash(self) -> str:
         """16 hexadecimal digits that change when running replicas must be replaced.
 
-        Covers what a replica runs and serves, fogft on it, and the machine it needs; not how
+        Covers what a replica runs and serves, its fogft, and the machine it needs; not how
         many there are, how long the robot waits, or where machines may be.
         """
         return self.hash_with(self.task.get("resources"))
 
     def hash_with(self, resources: Any) -> str:
-        """Return the `replica_hash` of a replica with such `resources`."""
+        """Return the `replica_hash` of a replica with these `resources`."""
         asked = {
             "fogft": __version__,
             "services": sorted(
@@ -504,7 +504,7 @@ class PoolSpec:
 
 
 def _kinds_of_machine(resources: Any) -> list[str]:
-    """Return what the machines of a `resources` section are, without where: each kind once."""
+    """Return the kinds of machine in a `resources` section, each once, without their locations."""
     section = resources if isinstance(resources, Mapping) else {}
     choices = section.get("any_of") or section.get("ordered") or [{}]
     kinds = set()

@@ -1,4 +1,4 @@
-"""A topic that passes between the robot and its replicas, as values. Pure."""
+"""Topics and actions proxied between the robot and its replicas, as values. Pure."""
 
 from dataclasses import dataclass
 from enum import Enum
@@ -6,7 +6,7 @@ from enum import Enum
 from fogft.model.keys import DAY_S, Flag, Number, OneOf, Text, Whole, key, only
 from fogft.model.ros_names import is_action_type, is_message_type, service_name
 
-PREFIX = "topic "  # of a topic's name on the wire, where it stands beside services
+PREFIX = "topic "  # of a topic's name on the wire, to tell it from a service
 DEPTH_LIMIT = 1000
 
 
@@ -76,7 +76,7 @@ class TopicSpec:
 
     @property
     def key_name(self) -> str:
-        """Its name on the link, and in a replica's list of what is ready."""
+        """The topic's name on the link, and in a replica's list of ready services."""
         return PREFIX + self.name
 
 

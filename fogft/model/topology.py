@@ -1,7 +1,7 @@
 """Gateways: their upstream gateways, and the robots that use them. Pure.
 
-Whoever goes through gateways holds links to them and to no replica. A gateway may go through
-others; a loop is refused wherever a topology is read.
+A robot that uses gateways holds links to them and to no replica. A gateway may forward to other
+gateways; a loop is refused wherever a topology is read.
 """
 
 from collections.abc import Iterable, Mapping
@@ -16,7 +16,7 @@ from fogft.model.plain import Generation
 
 GATEWAYS_LIMIT = 64
 ROBOTS_LIMIT = 512
-LAUNCHED = "gateway"  # the name of the one that a pool launches for itself
+LAUNCHED = "gateway"  # the name of the gateway that a pool launches for itself
 
 _NAME = Text("a name", "use letters, digits and dashes, 28 at most", only(NAME_PATTERN.fullmatch))
 _NAMES = Listed(_NAME, GATEWAYS_LIMIT, least=0)
@@ -38,7 +38,7 @@ class Gateway:
         default=(),
         usual="the replicas",
     )
-    generations: tuple[Generation, ...] = ()  # of certificates that are good; two while they change
+    generations: tuple[Generation, ...] = ()  # of its valid certificates; two during a rotation
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class LaunchedGateway:
     )
 
     def endpoints(self, host: str) -> tuple[str, str, str]:
-        """Return where robots, whoever looks for others, and replicas dial it."""
+        """Return the addresses for robots, for its rendezvous, and for replicas that dial in."""
         gateway, rendezvous, door = (f"{host}:{self.port + n}" for n in range(3))
         return gateway, rendezvous, door
 
@@ -113,7 +113,7 @@ class Topology:
 
     @property
     def robots(self) -> dict[str, tuple[str, ...]]:
-        """Name of a robot -> its gateways; none for the replicas."""
+        """Robot name -> its gateways; empty for the replicas themselves."""
         return {route.name: route.gateways for route in self.routes}
 
     def __bool__(self) -> bool:
@@ -125,9 +125,9 @@ class Topology:
         return next((g for g in self.gateways if g.name == name), None)
 
     def neighbours(self, holder: Holder) -> tuple[Gateway, ...]:
-        """Return the gateways that a robot or gateway connects to; none: the replicas.
+        """Return the gateways that a robot or gateway connects to; if empty, the replicas.
 
-        One without a certificate cannot be talked to.
+        Gateways without a valid certificate are left out.
         """
         if holder.role is Role.GATEWAY:
             own = self.of(holder.name)
@@ -147,7 +147,7 @@ def certified(topology: Topology, generations: Mapping[str, Iterable[int]]) -> T
 
 
 def trouble(topology: Topology) -> str:
-    """Return the problem of a topology, in words; empty without one."""
+    """Return the problem with a topology, in words; empty if it is valid."""
     known = {gateway.name for gateway in topology.gateways}
     if len(known) < len(topology.gateways):
         return "a gateway is defined twice"
@@ -163,7 +163,7 @@ def trouble(topology: Topology) -> str:
 
 
 def find_loop(through: Mapping[str, Iterable[str]]) -> list[str]:
-    """Return the names along a loop, the first one repeated at the end; none without a loop."""
+    """Return the names along a loop, the first one repeated at the end; empty without a loop."""
     try:
         TopologicalSorter(through).prepare()
     except CycleError as error:

@@ -1,8 +1,8 @@
-"""Definitions of service types, and the differences between two of one name. Pure.
+"""Definitions of service types, and the differences between two of the same name. Pure.
 
-The robot and a replica load a type by its name, each from its own workspace: bytes of another
-definition would be read as numbers that look right and are not. Distributions with type hashes
-(Iron and later) tell sameness by them; else, or to say what differs, fields are compared.
+The robot and a replica load a type by its name, each from its own workspace: bytes of a different
+definition would decode to plausible but wrong values. With distributions that have type hashes
+(Iron and later) the hashes are compared; otherwise, or to say what differs, the fields are.
 """
 
 import re
@@ -24,15 +24,15 @@ Fields = tuple[tuple[Line, Line], ...]
 class Definition:
     """The definition of a service type on one machine. Hashes are empty where not known.
 
-    `fields` are of `REQUEST`, `RESPONSE` and each nested ``package/Message``: names and types, in
-    order, as the generated Python code tells them. `service_hash` is of the whole service, its
-    event message included, as `rmw_zenoh` writes it into names.
+    `fields` has the names and types, in order, of `REQUEST`, `RESPONSE` and each nested
+    ``package/Message``, as the generated Python code lists them. `service_hash` covers the whole
+    service including its event message, as in the names that `rmw_zenoh` uses.
     """
 
     hash: Line = ""  # of request and response: ``RIHS01_...+RIHS01_...``
     fields: Mapping[Line, Fields] = field(default_factory=dict)
     trouble: Line = ""
-    service_hash: Annotated[str, only(_HASH.fullmatch)] = ""  # it becomes part of a key
+    service_hash: Annotated[str, only(_HASH.fullmatch)] = ""  # it becomes part of a Zenoh key
 
     @property
     def known(self) -> bool:
@@ -41,7 +41,7 @@ class Definition:
 
 
 def nested(kind: str) -> str:
-    """Return the message that a field's type is made of; empty for numbers and texts."""
+    """Return the message type within a field's type; empty for numbers and strings."""
     found = _NESTED.match(kind)
     return found.group(1) if found else ""
 
@@ -53,7 +53,7 @@ def difference(type_name: str, here: Definition, there: Definition) -> str:
             return f"`{type_name}` cannot be loaded {side}: {definition.trouble}"
     if here.hash and here.hash == there.hash:
         return ""
-    if not (here.fields and there.fields):  # on either side only its hash is known
+    if not (here.fields and there.fields):  # on one side only the hash is known
         return _of_hashes(type_name, here.service_hash, there.service_hash)
     for part in (REQUEST, RESPONSE):
         found = _first_difference(part, part, here, there, set())

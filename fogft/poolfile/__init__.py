@@ -1,1 +1,1 @@
-"""The pool file, read, checked and compared. Not here: the values of it (`fogft.model`)."""
+"""The pool file, read, checked and compared. Not here: its values (`fogft.model`)."""

@@ -34,7 +34,7 @@ def _ours(spec: PoolSpec) -> dict[str, Any]:
 def _differences(
     before: Mapping[str, Any], after: Mapping[str, Any], kind: str = "", *, inside: bool = False
 ) -> list[str]:
-    """Return what differs between two maps, and in maps within them where `inside` is set."""
+    """Return the differences between two maps, and within their nested maps if `inside`."""
     found = []
     for key in [*after, *(key for key in before if key not in after)]:
         old, new = before.get(key), after.get(key)

@@ -1,4 +1,4 @@
-"""A process's configuration file, written and read by the table of its keys."""
+"""A process's configuration file, written and read by the fields of its dataclass."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
@@ -25,7 +25,7 @@ def document(config: Any, heading: str) -> str:
 
 
 def read(cls: type[T], path: Path, override: Mapping[str, Any] | None = None) -> T:
-    """Return a configuration, its paths absolute; `override` replaces keys of the file."""
+    """Return a configuration with absolute paths; `override` replaces keys of the file."""
     try:
         root = yaml_tree.tree(path.read_text(), str(path))
         raw = plain(root)
@@ -44,7 +44,7 @@ def read(cls: type[T], path: Path, override: Mapping[str, Any] | None = None) ->
 
 
 def _resolved(value: Any, base: Path) -> Any:
-    """Return a dataclass whose paths no longer depend on where a process runs."""
+    """Return a dataclass with its relative paths resolved against a folder."""
     changed: dict[str, Any] = {}
     for one in fields(value):
         held = getattr(value, one.name)

@@ -21,7 +21,7 @@ def read(path: Path | str, checks: Checks = UNCHECKED) -> PoolSpec:
 def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
     """Return all mistakes in a pool file, by line; only the first if it is not YAML.
 
-    What depends on something that is wrong is not judged: that may still be wrong then.
+    Values that depend on a mistake are not checked, and may be wrong once it is corrected.
     """
     found = Mistakes(keep=True)
     with found.step():
@@ -34,9 +34,9 @@ def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
 def parse(
     source: str, file: str, checks: Checks = UNCHECKED, folder: Path | None = None
 ) -> PoolSpec:
-    """Return the spec in a pool file's text; `workdir` is looked for in `folder`, if given.
+    """Return the spec in a pool file's text; `workdir` must exist in `folder`, if given.
 
-    The stem of `file` names the pool where the text does not.
+    The stem of `file` names the pool if the text does not.
     """
     if len(source) > MAX_BYTES:
         raise _too_large(file)

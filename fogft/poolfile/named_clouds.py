@@ -43,7 +43,7 @@ def cloud_named_by(spec: PoolSpec, source: str, file: Path) -> str:
 
 
 def clouds_named(spec: PoolSpec) -> list[str]:
-    """Return the clouds that a pool file's resources name, sorted; none if any will do."""
+    """Return the clouds that a pool file's resources name, sorted; empty if any will do."""
     return sorted({cloud for cloud, _ in _named_in(spec)})
 
 
@@ -66,7 +66,7 @@ def _named(resources: Mapping[str, Any], key: str) -> Iterator[tuple[str, str]]:
 
 
 def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield every alternative of a section, complete, with its key."""
+    """Yield each alternative of a `resources` section, merged with the shared keys, and its key."""
     base = {k: v for k, v in resources.items() if k not in ("any_of", "ordered")}
     found = [
         (f"resources.{key}[{index}]", entry)

@@ -1,4 +1,4 @@
-"""A service's policy as ROS parameters, each judged by the pool file's own reader. Pure."""
+"""A service's policy as ROS parameters, each checked by the pool file's own reader. Pure."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -37,9 +37,9 @@ def shown(spec: ServiceSpec) -> dict[str, Value]:
 
 
 def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
-    """Return a service's policy with other values for some keys.
+    """Return a service's policy with some values changed. Raises ValueError.
 
-    A `fallback_service` is left out where `on_timeout` asks for none any more.
+    `fallback_service` is dropped if `on_timeout` no longer uses it.
     """
     now = shown(spec)
     news = {key: value for key, value in values.items() if now.get(key) != value}
@@ -56,7 +56,7 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
     below = {key: raw.pop(key) for key in _ADVANCED & raw.keys()}
     section = Section("parameter", spec.name, tree({**raw, ADVANCED: below}))
     try:
-        if spec.part is not Part.NONE:  # no more of it is a parameter
+        if spec.part is not Part.NONE:  # its only parameter
             return replace(spec, timeout_s=section.number("timeout_s", LONGEST_S, "seconds"))
         read: ServiceSpec = Reader(RULES).map(ServiceSpec, section)
     except SpecError as error:
@@ -69,7 +69,7 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
 class Policies:
     """The pool file's services, overridden by parameters.
 
-    A value that was set holds until the pool file has another value for that key.
+    A parameter that was set applies until the pool file changes that key.
     """
 
     def __init__(self, check_field: FieldCheck = lambda kind, field: None) -> None:
@@ -89,12 +89,12 @@ class Policies:
                 del values[key]
             try:
                 changed(new[name], values)
-            except ValueError:  # what was set does not go with what the file says now
+            except ValueError:  # the parameters conflict with the new file
                 values.clear()
         self._file = new
 
     def set(self, values: Mapping[str, Value]) -> None:
-        """Set parameters by their full names: all of them, or none."""
+        """Set parameters by their full names: all of them, or none. Raises ValueError."""
         by_prefix = {prefix(name): name for name in self._file}
         wanted: dict[str, dict[str, Value]] = {}
         for full, value in values.items():

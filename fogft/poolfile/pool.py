@@ -25,16 +25,16 @@ def _nothing(*_: object) -> None:
 
 @dataclass(frozen=True)
 class Checks:
-    """Checks that depend on this machine, made when all else is valid.
+    """Checks that depend on this machine, run when everything else is valid.
 
-    Each returns what is wrong and what to do; None if nothing is.
+    Each returns the problem with a hint, or None if there is none.
     """
 
-    types: Callable[[str], FogftError | None] = _nothing  # why it cannot be loaded
+    types: Callable[[str], FogftError | None] = _nothing  # why a type cannot be loaded
     # Why a type's response has no such boolean.
     fields: Callable[[str, str], FogftError | None] = _nothing
     states: Callable[[StateSpec], FogftError | None] = _nothing
-    # Of a type, by field.
+    # Why tolerances do not fit the fields of a type.
     tolerances: Callable[[str, Mapping[str, float]], FogftError | None] = _nothing
     workdir: Callable[[str], FogftError | None] = _nothing
 
@@ -45,7 +45,7 @@ UNCHECKED = Checks()
 def pool_spec(
     root: Node, file: str, checks: Checks = UNCHECKED, mistakes: Mistakes | None = None
 ) -> PoolSpec:
-    """Return the spec in a pool file; without `mistakes` the first one is raised."""
+    """Return the spec in a pool file; without `mistakes`, the first mistake is raised."""
     mistakes = mistakes or Mistakes()
     top = Section(file, "", root, "write a SkyPilot task with a `fogft` section")
     task = {key: plain(node) for key, node in top.children.items() if key != "fogft"}
@@ -98,7 +98,7 @@ def _judge_types(section: Section, service: ServiceSpec, spec: PoolSpec, checks:
 
 def _whole(ours: Section, made: PoolSpec) -> PoolSpec:
     groups = _groups(ours, made)
-    # A target finds its own number; the file's is then the fewest.
+    # An `availability` target sets the number; the file's is then the minimum.
     if "replicas" not in ours.children:
         usual = sum(g.replicas for g in groups) or (1 if made.availability else made.replicas)
         made = replace(made, replicas=usual)
@@ -223,7 +223,7 @@ def action_services(action: ActionSpec) -> tuple[ServiceSpec, ...]:
             f"{name}/get_result",
             f"{type}_GetResult",
             action.result_timeout_s,
-            # It is answered when its goal ends: many wait there without being at work.
+            # It is answered when its goal ends: many requests wait there without using capacity.
             concurrency=CONCURRENCY_LIMIT,
             part=Part.RESULT,
         ),
@@ -234,7 +234,7 @@ def action_topics(action: ActionSpec) -> tuple[TopicSpec, ...]:
     """Return the two topics of an action."""
     feedback, status = f"{action.name}/_action/feedback", f"{action.name}/_action/status"
     of_feedback, of_status = f"{action.type}_FeedbackMessage", "action_msgs/msg/GoalStatusArray"
-    # What all goals say together between two pulls is kept.
+    # Deep enough for the feedback of all goals between two pulls.
     return (
         TopicSpec(feedback, of_feedback, Origin.REPLICAS, Select.GOAL, depth=DEPTH_LIMIT),
         TopicSpec(status, of_status, Origin.REPLICAS, Select.STATUS, depth=1, latched=True),

@@ -105,7 +105,7 @@ class Reader:
             meant = Section(section.file, key, Node(children, node.line, node.key_line))
             try:
                 return Reader(self._rules).map(form.of, meant)
-            except SpecError as error:  # of the key that was written, not the one it stands for
+            except SpecError as error:  # name the key as written, not the one it stands for
                 raise section.error(key, error.what, error.hint) from None
         return self.map(form.of, section.section(key, form.hint))
 

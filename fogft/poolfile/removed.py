@@ -13,7 +13,7 @@ from fogft.model.state import StateSpec
 from fogft.model.topology import Gateway, RobotRoute, Topology
 
 TASK_PLACES = ("run", "setup", "resources", "workdir", "envs")
-Hint = tuple[str, str]  # what is to be said of a key, and what to do
+Hint = tuple[str, str]  # the problem with a key, and what to do
 
 _AUTOSCALE = {
     "autoscale": (
@@ -69,7 +69,7 @@ VALUE_HINTS: dict[tuple[type, str], str] = {
 
 
 def places(cls: type | None) -> dict[str, str]:
-    """Return where keys belong that are not allowed in a map of this kind."""
+    """Return the right place for each key that is not allowed in a map of this class."""
     here = {entry.name for entry in keys_of(cls) if not entry.key.advanced} if cls else set()
     found: dict[str, str] = {}
     for home, where in (

@@ -1,4 +1,4 @@
-"""Rules for combinations of keys in a pool file: each judges a map once its keys are read. Pure."""
+"""Rules for combinations of keys in a pool file: each checks a map once its keys are read. Pure."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

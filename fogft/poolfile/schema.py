@@ -34,7 +34,7 @@ def pool_schema() -> dict[str, Any]:
 
 def _map(cls: type, definitions: dict[str, Any]) -> dict[str, Any]:
     if cls.__name__ not in definitions:
-        definitions[cls.__name__] = {}  # a name for those that contain themselves
+        definitions[cls.__name__] = {}  # reserved, for classes that contain themselves
         entries = keys_of(cls)
         parts: dict[bool, dict[str, Any]] = {False: {}, True: {}}
         for entry in entries:

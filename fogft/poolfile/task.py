@@ -1,4 +1,4 @@
-"""Check the SkyPilot part of a pool file: names of keys, and what no pool can do."""
+"""Check the SkyPilot part of a pool file: key names, and values that no pool supports."""
 
 import re
 from collections.abc import Mapping
@@ -73,7 +73,7 @@ def _workdir(top: Section) -> None:
 
 
 def check_resources(resources: Section) -> None:
-    """Check what is read before SkyPilot reads it, which would take anything for a truth value."""
+    """Check the keys that fogft reads before SkyPilot, which accepts any value as a boolean."""
     for key in ("any_of", "ordered"):
         if resources.has(key):
             for one in resources.sections(key, "write a list of maps"):

@@ -1,7 +1,7 @@
 """A pool file as a tree that remembers its lines, and typed access to it.
 
-Every complaint is one `SpecError` that begins with ``file:line: key:`` and is one line long,
-whatever the file holds; its hint says what would be right.
+Every error is one `SpecError` that begins with ``file:line: key:`` and is one line long,
+whatever the file contains; its hint says how to correct it.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from typing import Any, TypeVar
 
 from fogft.errors import SpecError
 
-SMALLEST = 1e-12  # of a number above 0: a smaller one is a slip of the pen
+SMALLEST = 1e-12  # of a number above 0: a smaller one is a typing mistake
 Choice = TypeVar("Choice", bound=Enum)
 
 
 @dataclass(frozen=True)
 class Node:
-    """A value with its place, and the place of the key that leads to it."""
+    """A value with its line, and the line of the key that it belongs to."""
 
     value: str | int | float | bool | tuple[Node, ...] | Mapping[str, Node] | None
     line: int
@@ -113,7 +113,7 @@ class Section:
         hints: Mapping[str, tuple[str, str]] | None = None,
         elsewhere: Mapping[str, str] | None = None,
     ) -> Iterator[SpecError]:
-        """Yield an error for each key that is not known; `hints` are for past and future ones."""
+        """Yield an error for each unknown key; `hints` are for those of other versions."""
         allowed = set(known)
         for key in [key for key in self.children if key not in allowed]:
             what, hint = "unknown key", nearest(key, allowed)
@@ -124,7 +124,7 @@ class Section:
             yield self.error(key, what, hint, at_key=True)
 
     def has(self, key: str) -> bool:
-        """Whether the key is there with a value, here or under `advanced`."""
+        """Whether the key has a value, here or under `advanced`."""
         if key in self.children:
             return self.children[key].value is not None
         below = self.children["advanced"].value if "advanced" in self.children else None
@@ -156,7 +156,7 @@ class Section:
         return node.value
 
     def flag(self, key: str, default: bool) -> bool:
-        """Return a truth value."""
+        """Return a boolean."""
         if key not in self.children:
             return default
         node = self.children[key]
@@ -185,7 +185,7 @@ class Section:
         return float(node.value)
 
     def choice(self, key: str, members: Sequence[Choice]) -> Choice:
-        """Return one of some members of an enumeration."""
+        """Return one of the given members of an enumeration."""
         by_value = {str(member.value): member for member in members}
         allowed = " or ".join(f"`{value}`" for value in by_value)
         text = self.text(key, f"write {allowed}")
@@ -197,12 +197,12 @@ class Section:
         return by_value[text]
 
     def section(self, key: str, hint: str = "") -> Section:
-        """Return a map below; an empty one if the key is absent."""
+        """Return the map at a key; an empty one if the key is absent."""
         node = self.children.get(key) or Node({}, self.node.line, self.node.key_line)
         return Section(self.file, f"{self.path}.{key}" if self.path else key, node, hint)
 
     def sections(self, key: str, hint: str) -> Sequence[Section]:
-        """Return a list of maps below, which must be there and not empty."""
+        """Return the list of maps at a key, which must exist and not be empty."""
         if key not in self.children:
             raise self.error(key, "is missing", hint)
         node = self.children[key]
@@ -261,7 +261,7 @@ class Mistakes:
 
     @contextmanager
     def whole(self) -> Iterator[None]:
-        """Check all parts of one value. Raises Incomplete: something was found within."""
+        """Check all parts of one value. Raises Incomplete if a mistake was found in one."""
         before = len(self.found)
         yield
         if len(self.found) > before:

@@ -1,7 +1,7 @@
 """Parse YAML into a tree with the line of every key and value.
 
-PyYAML's own loader forgets lines, keeps the last of two equal keys, and expands aliases without
-end. What comes out can be written as JSON: dates stay the text that was written.
+PyYAML's own loader drops lines, keeps the last of two equal keys, and expands aliases without
+limit. The resulting tree can be written as JSON: dates stay text, as written.
 """
 
 import yaml
@@ -11,7 +11,7 @@ from fogft.poolfile.tree import Node, shown
 
 MAX_NODES = 20_000
 MAX_DEPTH = 40
-MAX_NUMBER = 60  # characters; a longer one is no setting, and costs time to convert
+MAX_NUMBER = 60  # characters; a longer one cannot be a setting, and takes time to convert
 _TAG = "tag:yaml.org,2002:"
 _AS_WRITTEN = {_TAG + "str", _TAG + "timestamp", _TAG + "value"}
 _CONVERTED = {_TAG + "null", _TAG + "bool", _TAG + "int", _TAG + "float"}
@@ -34,7 +34,7 @@ def tree(text: str, file: str) -> Node:
         what = f"character {ascii(chr(error.character))[1:-1]} is not allowed"
         raise SpecError(f"{file}:{line}: not YAML: {what}", "remove it") from None
     # PyYAML lets ValueError, OverflowError and others escape on odd input such as
-    # "\UFFFFFFFF". Whatever it is, the file is what caused it.
+    # "\UFFFFFFFF". Whatever the error is, the file caused it.
     except (ValueError, LookupError, TypeError, AttributeError, ArithmeticError) as error:
         line = loader.line + 1 if loader else 1
         what = shown(error, 120)[1:-1]
@@ -42,7 +42,7 @@ def tree(text: str, file: str) -> Node:
 
 
 class _Loader(yaml.SafeLoader):
-    """Makes our nodes of PyYAML's. Aliases are expanded, and counted."""
+    """Turns PyYAML's nodes into `Node`. Aliases are expanded and counted."""
 
     def __init__(self, text: str, file: str) -> None:
         super().__init__(text)

@@ -1,1 +1,1 @@
-"""The full-screen view, a report, a plan plotted. Not here: tables (`fogft.cli.table`)."""
+"""The full-screen view, the HTML report and the plot of a plan. Not here: `fogft.cli.table`."""

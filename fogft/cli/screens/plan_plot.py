@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def draw(shown: PlanShown, path: Path) -> None:
-    """Plot a plan to a PNG, SVG or PDF file. Offers of unknown distance are drawn apart."""
+    """Plot a plan to a PNG, SVG or PDF file. Offers of unknown distance are drawn separately."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.2, 4.8), layout="constrained")

@@ -68,7 +68,7 @@ def _page(store: Any, now: float) -> str:
     status = seen.status
     events = list(store.recent(sys.maxsize))
     last = max((event.at for event in events), default=0.0)
-    now = min(now, max(last, status.observed_at or now))  # of what came later nobody knows
+    now = min(now, max(last, status.observed_at or now))  # nothing is known of later times
     spans = list(ready_spans(events, now))
     known_s = now - min((at for _, at, _ in spans), default=now)
     costs = [one for one in read_all(home() / "costs") if one.uid == status.uid]
