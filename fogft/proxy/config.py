@@ -1,6 +1,6 @@
 """Read the proxies' configuration files, overridden by command-line options.
 
-Each raises StateError where a file cannot be read, or a key is missing or of the wrong type.
+Each function raises StateError if the file cannot be read or a key is missing or of a wrong type.
 """
 
 from dataclasses import replace

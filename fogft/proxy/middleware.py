@@ -1,7 +1,7 @@
 """A proxy's ROS node and type support, through rclpy or rmw_zenoh.
 
-With rclpy a type is what its installed package says. Over Zenoh it is known by the hash that
-nodes write into their names; where its package is installed too, its fields are known besides.
+With rclpy, a type is defined by its installed package. Over Zenoh, it is identified by the hash
+that nodes write into their names; its fields are known only if its package is installed too.
 """
 
 import contextlib
@@ -27,11 +27,11 @@ Judge = Callable[[Mapping[str, Any]], str]
 class Joined(NamedTuple):
     """A node, its type definitions, and a factory of the node visible to people.
 
-    Over Zenoh there is none to see: `/diagnostics` and parameters need types.
+    Over Zenoh there is no visible node: `/diagnostics` and parameters need types.
 
-    `participant` returns the id in DDS of who offers a service here, and `callers` counts who may
-    call it; nothing where that is not known. `identity` returns what each process that received a
-    request knows it by, of its handle.
+    `participant` returns the DDS participant id of the node offering a service here; `callers`
+    counts the clients that may call it; both are empty if unknown. `identity` returns, for a
+    request's handle, an id of the request that is the same in every process that received it.
     """
 
     node: RosNode
@@ -51,12 +51,12 @@ def prepare(speaks: Speaks) -> None:
 
 
 def join_early(speaks: Speaks, name: str, domain_id: int | None) -> EarlyJoin | None:
-    """Join the ROS domain before anything is offered. Raises RosError."""
+    """Join the ROS domain early, before any service is offered. Raises RosError."""
     return EarlyJoin(f"_{name}_standby", domain_id) if speaks is Speaks.RCLPY else None
 
 
 def load_types(type_names: Sequence[str]) -> None:
-    """Load those of these service types that are available; their users report problems."""
+    """Preload the available ones of these service types; errors are left to those who use them."""
     from fogft.ros import messages, types
     from fogft.ros.serialised import self_test
 
@@ -80,9 +80,9 @@ def join(
     """Create a node. Raises RosError: ROS, or Zenoh, is not usable here.
 
     Args:
-        told: Returns the definitions of types as each replica tells them.
-        noticed: Called, from any thread, when a type may be known that was not.
-        environ: Where the variables of ROS and Zenoh are, for Zenoh.
+        told: Returns the type definitions reported by each replica.
+        noticed: Called, from any thread, when a type may have become known.
+        environ: The environment with the ROS and Zenoh variables; used with Zenoh only.
     """
     from fogft.ros.types import definition
 
@@ -105,7 +105,7 @@ def join(
 
     def define(type_name: str) -> Definition:
         found, hash = definition(type_name), node.graph.hash_of(type_name)
-        if found.trouble:  # its package is not installed, nor need it be
+        if found.trouble:  # its package is not installed, and need not be
             return Definition(service_hash=hash)
         return replace(found, service_hash=hash or found.service_hash)
 
@@ -113,10 +113,10 @@ def join(
 
 
 def fault_of(type_name: str, part: str) -> Callable[[bytes], str]:
-    """Return a check of a type's serialised requests or responses; without the type, of headers."""
+    """Return a check of a type's serialised `part`; if the type is unavailable, of headers only."""
     from fogft.ros.types import load_service_type, shape
 
-    try:  # the shape that is asked again where a message is sent
+    try:  # the same shape is used again when a message is sent
         return shape(getattr(load_service_type(type_name), part.capitalize())).fault
     except RosError:
         return Shape(part, {}).fault

@@ -1,6 +1,6 @@
 """The life of a request: hedging, first success, votes, fallback, admission. Pure.
 
-Moments called `now` are seconds on one monotonic clock, the caller's.
+Each `now` is in seconds on one monotonic clock, the caller's.
 
 Not here: sending (`fogft.proxy.robot`).
 """

@@ -1,21 +1,21 @@
-"""Crash reports of replicas that are broken, or lie, and those that count. Pure."""
+"""Which crash reports to believe: a replica may be broken, or lie. Pure."""
 
 from collections.abc import Iterable
 
-FALSE_ALARMS, LATELY_S = 3, 60.0  # so many false alarms lately, and it is not believed
-ALARM_S = 1.0  # what is said within it, counted from the first time, is about one death
+FALSE_ALARMS, LATELY_S = 3, 60.0  # a replica with this many recent false alarms is not believed
+ALARM_S = 1.0  # reports within this time of the first are about the same crash
 
 
 class Alarms:
     """Which replicas are believed when they report that a request crashed a service.
 
-    What one says in the same moment is one alarm, and false where another replica answered one of
-    those requests. Were it believed, the others would run each of them alone.
+    A replica's reports within `ALARM_S` are one alarm, false if another replica answers one of
+    those requests. If false alarms counted, the other replicas would run each request alone.
     """
 
     def __init__(self) -> None:
         self._said_at: dict[int, float] = {}
-        self._judged: set[int] = set()  # whose last alarm counts as a false one already
+        self._judged: set[int] = set()  # replicas whose last alarm was already counted as false
         self._false: dict[int, list[float]] = {}
 
     def believed(self, replica: int, now: float) -> bool:

@@ -1,10 +1,10 @@
-"""Hedging that follows the load: every replica while they are idle, one when they are full. Pure.
+"""Hedging by load: a request goes to every replica while they are idle, to one when busy. Pure.
 
 First copies, spare copies, late hedges and doubt: docs/design/hedging.md.
 
-Laws: a request always has a copy that is no spare; late hedges <= capacity + share * requests.
+Laws: every request has a copy that is not a spare; late hedges <= capacity + share * requests.
 
-Not here: what is known of one replica (`load`), sending (`proxy.robot.sending`).
+Not here: the load estimate of a replica (`load`), sending (`proxy.robot.sending`).
 """
 
 import math
@@ -15,32 +15,32 @@ from fogft.model.replica import short
 from fogft.requests.choose import Learning
 from fogft.requests.load import ALIKE, NEVER, SLOW, Demand, Load
 
-BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # late hedges that are allowed, of requests
-_TRIAL_EVERY_S = 10.0  # a replica that was not asked for so long gets a spare copy
-_SLOW_TRIAL_EVERY = 20.0  # of its own service times, for one that others are preferred to
+BUDGET_SHARE, BUDGET_CAPACITY = 0.1, 10.0  # token bucket of late hedges: per request, at most
+_TRIAL_EVERY_S = 10.0  # a replica that was not asked for this long gets a spare copy
+_SLOW_TRIAL_EVERY = 20.0  # the same for a slower replica, in its own service times
 _DOUBTED_TRIAL_EVERY_S = 1.0
-# Of spare copies, in service times:
-_REMEMBERED = 1000.0  # for how long it counts what they saved and cost
-_REMEMBERED_MOST = 10.0  # how much more they saved than they cost counts at most
-_MATTERS = 0.5  # a difference that changes how many there are
-_TRIED_AFTER = 3000.0  # so long after a change there is one more again
-_WAIT = 0.6  # what it costs a request to wait for one
-_TRIED_SHARE = 0.02  # of requests, which try one more meanwhile
+# The balance of spare copies, in service times:
+_REMEMBERED = 1000.0  # decay time of what they saved and cost
+_REMEMBERED_MOST = 10.0  # cap on the net saving
+_MATTERS = 0.5  # a balance beyond this changes the number of spare copies
+_TRIED_AFTER = 3000.0  # this long after a change, one more spare copy is tried
+_WAIT = 0.6  # cost of making a request wait for a spare copy
+_TRIED_SHARE = 0.02  # share of requests that try one more spare copy meanwhile
 _RETRY_S = 0.02
-_BUSY = 0.4  # of what the replicas can do: above that spare copies would make requests wait
+_BUSY = 0.4  # utilization above which spare copies would make requests wait
 
 
 class Spares:
-    """How many idle replicas spare copies leave free: more, the more waiting they cause."""
+    """How many idle replicas spare copies leave free: the more waiting they cause, the more."""
 
     def __init__(self) -> None:
         self.left_free = 0
-        self._balance_s = 0.0  # what they saved, less what they cost
+        self._balance_s = 0.0  # time saved by spare copies, less the waiting they caused
         self._at = self._changed_at = 0.0
-        self.open: dict[tuple[bytes, int], float] = {}  # when each was sent that has not ended
+        self.open: dict[tuple[bytes, int], float] = {}  # unfinished spare copies, and when sent
 
     def request(self, service_s: float, replicas: int, now: float) -> None:
-        """Note a request; old data decays."""
+        """Note a request: decay the balance and adjust how many replicas are left free."""
         service_s = max(service_s, 1e-4)
         self._balance_s *= math.exp((self._at - now) / (_REMEMBERED * service_s))
         self._balance_s = min(self._balance_s, _REMEMBERED_MOST * service_s)
@@ -57,12 +57,12 @@ class Spares:
         self.left_free, self._changed_at, self._balance_s = left_free, now, 0.0
 
     def left_free_by(self, request: bytes) -> int:
-        """Return how many one request leaves free, by its random id: some try with one fewer."""
+        """Return how many replicas a request leaves free; some, by random id, try one fewer."""
         tries = int.from_bytes(request[:2], "big") < _TRIED_SHARE * 65536
         return self.left_free - (tries and self.left_free > 0)
 
     def saved(self, seconds: float) -> None:
-        """Note by how much a spare was first; below zero, for how long a request waits for one."""
+        """Note seconds that a spare copy saved; negative for time that a request waits for one."""
         self._balance_s += seconds
 
 
@@ -71,24 +71,24 @@ class Auto(Learning):
 
     def __init__(self) -> None:
         super().__init__()
-        self._tokens = BUDGET_CAPACITY  # for late hedges; each request brings a share of one
+        self._tokens = BUDGET_CAPACITY  # for late hedges; each request adds a fraction of one
         self._spares = Spares()
         self._demand = Demand()
         self._busy = False
-        self._slow_until = -NEVER  # one at least is
-        self._beaten: dict[tuple[bytes, int], float] = {}  # copies, and when a spare was first
+        self._slow_until = -NEVER  # at least one replica is in a slow spell until then
+        self._beaten: dict[tuple[bytes, int], float] = {}  # first copies, and when a spare won
         self._wanting: dict[bytes, None] = {}  # requests that get a spare once a replica is free
         self.hedges = 0
 
     # -- choices --------------------------------------------------------------------------
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return the replica expected to answer first, and other idle ones."""
+        """Return the replica expected to answer first, then idle ones for spare copies."""
         self._tokens = min(BUDGET_CAPACITY, self._tokens + BUDGET_SHARE)
         self._demand.asked(now)
         if not able:
             return ()
-        for replica in able:  # what others answered first it may never end: `more` does not see it
+        for replica in able:  # `more` does not see its attempts at requests answered by others
             known = self._replicas[replica]
             if known.at_work and known.ended_at < known.oldest_begun:
                 self._doubts(replica, known.oldest_begun, now)
@@ -97,7 +97,7 @@ class Auto(Learning):
         known = self._replicas[best]
         if len(able) == 1:
             known.asked(request, now)
-            return able  # there is nobody to hedge it at
+            return able  # there is no other replica to hedge at
         self._busy = known.slots <= 1 and self._demand.rate * known.service_s > _BUSY * len(able)
         self._spares.request(known.service_s, len(able), now)
         if self._spares.open and not known.free(now):
@@ -111,7 +111,7 @@ class Auto(Learning):
             spares = spares[:-left_free]
         elif len(spares) + 1 < len(others):
             self._wanting[request] = None
-        if len(spares) + 1 < len(able):  # else there is nobody to hedge it at
+        if len(spares) + 1 < len(able):  # else there is no other replica to hedge at
             self._look(overdue_at)
         return [best, *self._spared(request, spares, now)] if spares else [best]
 
@@ -126,7 +126,7 @@ class Auto(Learning):
         return known.free(now) or (known.doubted and now - known.asked_at >= _DOUBTED_TRIAL_EVERY_S)
 
     def _quick(self, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return those that are sound, and not slow just now, if one of them is free; else all."""
+        """Return the replicas neither avoided nor slow now, if one of them is free; else all."""
         known = self._replicas
         sound = [r for r in able if not known[r].avoided(now)]
         most_s = SLOW * min((known[r].alone_s for r in sound if known[r].told), default=0.0)
@@ -134,7 +134,7 @@ class Auto(Learning):
         return quick if any(known[r].free(now) for r in quick) else able
 
     def _stale(self, able: Sequence[int], best: int, now: float) -> list[int]:
-        """Return those of which nothing was heard for long: one spare copy shows how they do."""
+        """Return replicas not asked for long, or doubted: a spare copy refreshes their estimate."""
         stale, slower_s = [], NEVER if self.dear else ALIKE * self._replicas[best].usual_s
         for replica in able:
             known = self._replicas[replica]
@@ -147,7 +147,7 @@ class Auto(Learning):
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return the next best replica if those at work are unusually slow, or there are none."""
+        """Return the next best replica if no attempt is open or all are unusually slow."""
         if not candidates:
             return ()
         if open:
@@ -155,7 +155,7 @@ class Auto(Learning):
             if free and request in self._wanting:
                 return self._spared(request, free, now)
             doubted = [self._doubts(replica, begun, now) for replica, begun in open.items()]
-            if not all(doubted):  # somebody works on it: only a free one may help, and few times
+            if not all(doubted):  # a replica is working on it: hedge only at a free one, in budget
                 due = max(self._replicas[r].overdue_at(request, begun) for r, begun in open.items())
                 if now < due:
                     self._look(due)
@@ -170,7 +170,7 @@ class Auto(Learning):
             else:
                 wait_s = min(self._replicas[c].wait_s(now) for c in candidates)
                 longer_s = wait_s - (now - min(open.values()))
-                if longer_s > 0.0:  # than it has waited here: by half the difference they meet
+                if longer_s > 0.0:  # than the wait so far: look again after half the difference
                     self._look(now + max(_RETRY_S, longer_s / 2))
                     return ()
         best = self._best(request, candidates, now)
@@ -178,7 +178,7 @@ class Auto(Learning):
         return (best,)
 
     def _best(self, request: bytes, able: Sequence[int], now: float) -> int:
-        """Return who is expected to answer first; among equals any, by the request's random id."""
+        """Return the replica expected to answer first; ties are broken by the random request id."""
         if len(able) == 1:
             return able[0]
         known = [self._replicas[replica] for replica in able]
@@ -194,16 +194,16 @@ class Auto(Learning):
         return [one for one, rank in zip(able, ranks, strict=True) if rank == least][chance]
 
     def is_spare(self, request: bytes, replica: int) -> bool:
-        """Whether the replica should drop it unless idle."""
+        """Whether the replica should drop the attempt unless idle."""
         return (request, replica) in self._spares.open
 
     def _look(self, at: float) -> None:
         self.look_at = min(self.look_at, at)
 
-    # -- what became of them --------------------------------------------------------------
+    # -- outcomes -------------------------------------------------------------------------
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
-        """Note that it was not asked. With a full window it is avoided: others are tried."""
+        """Note that a replica was not asked. If its window was full, doubt it: try others."""
         self._spares.open.pop((request, replica), None)
         known = self._replicas[replica]
         known.dropped(request)
@@ -216,7 +216,7 @@ class Auto(Learning):
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> None:
-        """Also learn whether a spare copy was first, and which replica is free now."""
+        """Learn from the first response, also whether it was a spare copy's and who is free now."""
         self._wanting.pop(request, None)
         if self._spares.open.pop((request, replica), None) is not None:
             for other in open:
@@ -240,7 +240,7 @@ class Auto(Learning):
             self._replicas[replica].dropped(request)
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """Learn from a late copy."""
+        """Learn from an attempt that ended after its request."""
         self._spares.open.pop((request, replica), None)
         beaten = self._beaten.pop((request, replica), now)
         if answered:
@@ -251,7 +251,7 @@ class Auto(Learning):
         self._released(replica, now)
 
     def _released(self, replica: int, now: float) -> None:
-        """Have a replica that has become free work on what waits for one, if anything does."""
+        """Have a newly free replica get a spare copy of a waiting request, if there is one."""
         known = self._replicas[replica]
         self._slow_until = max(self._slow_until, known.slow_until)
         self.news |= bool(self._wanting) and known.free(now)
@@ -259,7 +259,7 @@ class Auto(Learning):
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
-        """Learn that these attempts would have taken longer than until now."""
+        """Learn that these attempts would have taken longer than they have so far."""
         self._wanting.pop(request, None)
         for replica, begun in open.items():
             known = self._replicas[replica]
@@ -268,7 +268,7 @@ class Auto(Learning):
                 known.doubt(begun, now)
 
     def forget(self, replica: int) -> None:
-        """Forget attempts in flight to it."""
+        """Forget attempts in flight to the replica."""
         super().forget(replica)
         for copies in (self._spares.open, self._beaten):
             for key in [key for key in copies if key[1] == replica]:

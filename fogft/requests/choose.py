@@ -1,7 +1,7 @@
 """Hedging policies: which replicas get a request first, which next, and when. Pure.
 
-A policy never sends anything; the dispatcher does as it says, but for replicas that may not be
-asked, and requests that may have ended a service (`pending`).
+A policy never sends anything. The dispatcher follows it, except for replicas that may not be asked
+and requests that may have crashed a service (`pending`).
 
 Owns: `all` and `failover`; the interface of every policy. Not here: `auto` (`requests.auto`),
 which answer wins (`decide`).
@@ -17,57 +17,57 @@ from fogft.requests.load import NEVER, Load, ReplicaLoad
 class Choose:
     """A hedging policy. Not thread-safe: its owner holds a lock.
 
-    Replicas are numbers, `open` maps each that works on a request to the moment it was asked.
-    What a policy does not say here it does not care for.
+    Replicas are numbers. `open` maps each replica working on a request to when it was asked.
+    A policy overrides only the methods it needs.
     """
 
-    moves_on = True  # another replica is asked at once when nobody works on a request
-    look_at = NEVER  # when `more` wants to be asked next, though nothing else has happened
-    dear = False  # each further copy of the next request costs an uplink much
-    news = False  # it has learned something about requests that were not due yet
+    moves_on = True  # when no replica works on a request, another one is asked at once
+    look_at = NEVER  # when to call `more` next if nothing else happens
+    dear = False  # each further copy of the next request is expensive for an uplink
+    news = False  # the policy has learned something about requests that are not due yet
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return the replicas, of those able, that a new request goes to at once."""
+        """Return the replicas, among those able, that a new request goes to at once."""
         raise NotImplementedError
 
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return the further replicas that an open request goes to now."""
+        """Return the additional replicas to send an open request to now."""
         raise NotImplementedError
 
     def is_spare(self, request: bytes, replica: int) -> bool:
-        """Whether the replica drops an attempt unless idle."""
+        """Whether the attempt is a spare copy, which the replica drops unless idle."""
         return False
 
     def too_busy(self, replica: int, within_s: float, now: float) -> bool:
-        """Whether a request is expected to wait there for longer than that."""
+        """Whether a request is expected to wait at the replica for longer than `within_s`."""
         return False
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
-        """Note that a chosen replica was not asked: its window was full, or there was no need."""
+        """Note that a chosen replica was not asked: its window was full, or it was not needed."""
 
     def heard(self, request: bytes, replica: int, load: Load, now: float) -> None:
-        """Take the load that a replica tells with the end of an attempt, which is noted next.
+        """Take the load that a replica reports with the end of an attempt, which is noted next.
 
-        But for an answer that ends its request: `answered` takes that one's load.
+        If its answer ends the request, `answered` takes the load instead.
         """
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> None:
-        """Note that a replica has answered: the others are to stop working on the request."""
+        """Note that a replica has answered: the others are told to stop working on the request."""
 
     def failed(self, request: bytes, replica: int, now: float, *, fault: bool) -> None:
-        """Note that an attempt ended without a valid answer, by the replica's fault or not."""
+        """Note that an attempt ended without a valid answer; `fault` if the replica is to blame."""
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """Note that an attempt ended after its request, with or without work on it."""
+        """Note that an attempt ended after its request; `answered` if the replica worked on it."""
 
     def stopped(
         self, request: bytes, open: Mapping[int, float], now: float, *, expired: bool = False
     ) -> None:
-        """Note that a request ended without these attempts, by deadline or otherwise."""
+        """Note that a request ended before these attempts did, by deadline or otherwise."""
 
     def hangs(self, replica: int) -> None:
         """Note that a replica reports its service as hanging."""
@@ -76,7 +76,7 @@ class Choose:
         """Note that a replica's link is new or gone: attempts in flight end without a report."""
 
     def keep(self, replicas: Set[int]) -> None:
-        """Note that there are only these replicas: none of the others comes back."""
+        """Note that only these replicas exist: the others never come back."""
 
     def needed(self, able: Collection[int], now: float) -> int:
         """Return how many replicas would be enough if there are too few; else 0."""
@@ -88,18 +88,18 @@ class Choose:
 
 
 class All(Choose):
-    """The policy `all`: every request goes to every replica, later ones included."""
+    """The policy `all`: every request goes to every replica, including those that join later."""
 
     moves_on = False  # all were asked already
 
     def first(self, request: bytes, able: Sequence[int], now: float) -> Sequence[int]:
-        """Return all of them."""
+        """Return every replica."""
         return able
 
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return all of them: a replica at work on the request may be frozen."""
+        """Return every candidate: a replica working on the request may be frozen."""
         return candidates
 
 
@@ -110,32 +110,32 @@ class Learning(Choose):
         self._replicas: defaultdict[int, ReplicaLoad] = defaultdict(ReplicaLoad)
 
     def too_busy(self, replica: int, within_s: float, now: float) -> bool:
-        """Whether what is before a request there takes longer; of one in doubt nobody knows."""
+        """Whether the expected wait exceeds `within_s`; False for a doubted replica (unknown)."""
         known = self._replicas[replica]
         return not known.doubted and known.wait_s(now) > within_s
 
     def answered(
         self, request: bytes, open: Mapping[int, float], replica: int, load: Load | None, now: float
     ) -> None:
-        """Learn from the first response; the others stop, and are learned from when they end."""
+        """Learn from the first response; the other attempts are learned from when they end."""
         self._replicas[replica].answered(request, load, now)
 
     def _doubts(self, replica: int, begun: float, now: float) -> bool:
-        """Whether a replica is doubted, by an attempt that began then."""
+        """Whether a replica is doubted, given an attempt that began at `begun`."""
         known = self._replicas[replica]
-        self.news |= not known.doubted and known.doubt(begun, now)  # what else it has moves, too
+        self.news |= not known.doubted and known.doubt(begun, now)  # its other requests move, too
         return known.doubted
 
     def hangs(self, replica: int) -> None:
-        """Doubt it: its requests go to others at once."""
+        """Doubt the replica: its requests go to others at once."""
         self._replicas[replica].doubted = self.news = True
 
     def forget(self, replica: int) -> None:
-        """Forget attempts in flight to it."""
+        """Forget attempts in flight to the replica."""
         self._replicas[replica].forget()
 
     def keep(self, replicas: Set[int]) -> None:
-        """Forget what was learned of others."""
+        """Forget what was learned about other replicas."""
         for replica in self._replicas.keys() - replicas:
             del self._replicas[replica]
 
@@ -143,13 +143,13 @@ class Learning(Choose):
 class Failover(Learning):
     """The policy `failover`: one replica gets every request until it fails.
 
-    While it answers nothing, requests that are long overdue, and new ones, go to another as well.
+    While that replica answers nothing, long overdue and new requests go to another one as well.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._current: int | None = None
-        self._failed = False  # the present one has: the next choice is another, if there is one
+        self._failed = False  # the current one has failed: next time choose another, if any
         self.switched = 0
         self.hedges = 0
 
@@ -160,7 +160,7 @@ class Failover(Learning):
     def more(
         self, request: bytes, open: Mapping[int, float], candidates: Sequence[int], now: float
     ) -> Sequence[int]:
-        """Return another replica if none works on the request, or seems to."""
+        """Return another replica if none works on the request, or all that do are doubted."""
         if not candidates:
             return ()
         for replica, begun in open.items():
@@ -187,14 +187,14 @@ class Failover(Learning):
         others = [replica for replica in able if replica != old]
         if not others:
             return able  # none, or the one that failed
-        # In turns, so that two that fail do not keep a third from being tried.
+        # Round-robin, so that two failing replicas do not keep a third from being tried.
         self._current = next((o for o in others if old is not None and o > old), others[0])
         self._failed = False
         self.switched += old is not None
         return (self._current,)
 
     def declined(self, request: bytes, replica: int, *, full: bool) -> None:
-        """Switch away from a replica that has no room, or too slow a path."""
+        """Switch away from a replica whose window is full, or whose path is too slow."""
         self._replicas[replica].dropped(request)
         self._failed |= full and replica == self._current
 
@@ -204,7 +204,7 @@ class Failover(Learning):
         self._failed |= replica == self._current
 
     def late(self, request: bytes, replica: int, now: float, *, answered: bool) -> None:
-        """Note that it works again."""
+        """Learn from an attempt that ended late; an answer ends any doubt about the replica."""
         if answered:
             self._replicas[replica].answered(request, None, now)
         else:
@@ -217,10 +217,10 @@ class Failover(Learning):
         self._failed |= expired and self._current in open
 
     def hangs(self, replica: int) -> None:
-        """Switch away from it, with all its requests."""
+        """Switch away from the replica, with all its requests."""
         super().hangs(replica)
         self._failed |= replica == self._current
 
     def report(self) -> dict[str, Any]:
-        """Return how often the replica changed, and how often another was asked as well."""
+        """Return how often the current replica changed, and how many requests were hedged."""
         return {"switched": self.switched, "hedges": self.hedges}

@@ -1,24 +1,24 @@
-"""How many requests a service may have concurrently, given or learned from latency. Pure.
+"""The concurrency limit of a service, configured or learned from latency. Pure.
 
-What waits inside a service nobody can take back or overtake. How many it works on shows in its
-throughput, limit / latency: docs/design/server-proxy.md. Who waits is `fair_queue`'s.
+A request queued inside a service cannot be cancelled or overtaken. How many the service runs at
+once shows in its throughput, limit / latency: docs/design/server-proxy.md. Queue: `fair_queue`.
 """
 
 from bisect import insort
 
-QUICK_S = 0.003  # one that answers as often is not limited: what waits is over before it matters
-IN_HAND_S = 0.1  # below this, one more is in hand
+QUICK_S = 0.003  # a limit below this time per answer is never lowered: waits are negligible
+IN_HAND_S = 0.1  # a service quicker than this holds one extra request, so it never idles
 _NEAR = 0.85
 _SAMPLES = 30
 _TRY_AGAIN_S = 60.0
 _WEIGHT = 0.1  # of a sample in the mean
-# A call of seconds must not stand for all others: it counts as so many usual ones, and of so many
-# first calls, which may load what they need, the median counts.
+# One call of seconds must not dominate the mean: a sample is capped at this multiple of the mean.
+# The median of this many first calls is used, as they may load a model or data.
 _OUTLIER, _FIRST = 10.0, 20
 
 
 class ConcurrencyLimit:
-    """The limit of one service: `given`, or learned, up to the `most` that its own queue holds."""
+    """The limit of one service: `given`, or learned up to `most`, the length of its own queue."""
 
     def __init__(self, most: int, given: int | None = None) -> None:
         self._most = most
@@ -26,16 +26,16 @@ class ConcurrencyLimit:
         self.limit = most if given is None else given
         self.known = given or 0  # the limit, if given or learned; else 0
         self.takes_s = 0.0  # recent service time of a request, in seconds; 0 before the first
-        self.service_s = 0.0  # the same, divided by how many were at work
-        self._first_s: list[float] = []  # what the first ones took, in order
-        # Of the limit in force, while as many as it allows were at work:
+        self.service_s = 0.0  # the same, divided by how many were running
+        self._first_s: list[float] = []  # service times of the first requests, sorted
+        # Service times under the current limit, from requests that started when it was reached:
         self._took_s: list[float] = []
         self._kept: tuple[int, float] | None = None  # during a trial: the limit to compare with
         self._tried: dict[int, float] = {}  # when each limit was last found not to be better
-        self.in_hand = self.limit  # how many the service is given
+        self.in_hand = self.limit  # how many requests the service is given at once
 
     def finished(self, level: int, took_s: float, now: float) -> None:
-        """Learn from an answer; at its start `level` requests were running, itself included."""
+        """Learn from an answer; `level` requests ran when it started, including its own."""
         weight = _WEIGHT if self.takes_s else 1.0
         self.takes_s = self.takes_s * (1 - weight) + weight * took_s
         each_s = took_s / max(1, level)
@@ -56,8 +56,8 @@ class ConcurrencyLimit:
         self.in_hand = min(self.limit + more, max(self.limit, self._most))
 
     def _judge(self, now: float) -> None:
-        """Enough was seen of this limit: end a trial, or begin one."""
-        quicker = sorted(self._took_s)[: len(self._took_s) * 2 // 3]  # what waits behind one stall
+        """End a trial or begin one, once there are enough samples of the current limit."""
+        quicker = sorted(self._took_s)[: len(self._took_s) * 2 // 3]  # without waits behind a stall
         each_s = sum(quicker) / len(quicker) / self.limit  # per answer
         rate = 1.0 / max(each_s, 1e-9)
         tried, kept = self.limit, self._kept
@@ -74,7 +74,7 @@ class ConcurrencyLimit:
             last = self._tried.get(candidate)
             if candidate != tried and (last is None or now - last >= _TRY_AGAIN_S):
                 self._kept = (tried, rate)
-                self._tried[tried] = now  # so that it does not swing between the two
+                self._tried[tried] = now  # so that the limit does not oscillate between the two
                 self._set(candidate)
                 return
 
@@ -84,5 +84,5 @@ class ConcurrencyLimit:
         self._took_s = []
 
     def wait_s(self, ahead: int, at_work: int) -> float:
-        """Return the expected wait behind those `ahead` and `at_work`, if known."""
+        """Return the expected wait behind `ahead` queued and `at_work` running requests; or 0."""
         return max(0, ahead + at_work + 1 - self.limit) * self.takes_s / self.limit

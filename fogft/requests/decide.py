@@ -1,7 +1,7 @@
-"""Decide what an answer means for its request: first success, or what a quorum agrees on. Pure.
+"""Decide what an answer means for its request: by default, the first success wins. Pure.
 
-An answer goes through `read` first, which may be slow: no lock is held. Then `judge` says what it
-means.
+An answer is first parsed by `read`, which may be slow and holds no lock. Then `judge` returns its
+meaning.
 
 Not here: votes (`requests.votes`), actions and stateful services (`proxy.robot`), which requests
 await an answer (`pending`).
@@ -20,44 +20,44 @@ Accepts = Callable[[bytes], bool]
 class Trace(NamedTuple):
     """The replicas asked for a traced request. Moments are monotonic seconds."""
 
-    asked: dict[int, float]  # each replica that took it, and when it was asked first
-    refused: dict[int, Refusal]  # each replica that refused it, and its last reason
+    asked: dict[int, float]  # each replica that took the request, and when it was first asked
+    refused: dict[int, Refusal]  # each replica that refused the request, and its last reason
 
 
 @dataclass(slots=True)
 class Pending:
     """A request that awaits its answer. Moments are monotonic seconds.
 
-    `deaths` counts how often a service died while it worked on this: those that died together over
-    copies of it, and of other requests, count as one.
+    `deaths` counts how often a service died while working on this request. Deaths while other
+    replicas had it too, or other requests ran beside it, count as one altogether.
     """
 
     deadline: float
     payload: bytes
-    handle: Any  # of its caller
+    handle: Any  # the caller's, opaque here
     arrived: float
-    open: dict[int, float] = field(default_factory=dict)  # who works on it, and since when
+    open: dict[int, float] = field(default_factory=dict)  # replicas working on it, and since when
     barred: set[int] = field(default_factory=set)  # replicas that must not be asked again
-    failures: dict[int, int] = field(default_factory=dict)  # those that count, by replica
-    # Until when a replica that failed it is left alone, and that wait.
+    failures: dict[int, int] = field(default_factory=dict)  # failures that count, by replica
+    # Backoff of each replica that failed the request: when it ends, and its length in seconds.
     waits: dict[int, tuple[float, float]] = field(default_factory=dict)
-    rejection: bytes | None = None  # the last response that was real but not ok
+    rejection: bytes | None = None  # the last valid response that was not ok
     deaths: int = 0
-    alone_at: set[int] = field(default_factory=set)  # who got it with nothing beside it since
-    alone_until: float = 0.0  # then another one is asked: half of the time left is over
-    died_at: set[int] = field(default_factory=set)  # replicas where services died over it
+    alone_at: set[int] = field(default_factory=set)  # replicas that got it after a death: run alone
+    alone_until: float = 0.0  # when half of the time left is over: then another one is asked
+    died_at: set[int] = field(default_factory=set)  # replicas whose service died while running it
     trace: Trace | None = None
 
 
 class Means(Enum):
     """The effect of an answer on its request."""
 
-    SUCCESS = "success"  # return it, unless another one was first
-    REJECTION = "rejection"  # the service says no: returned only when nothing better can come
-    WEAKER_REJECTION = "weaker-rejection"  # the one that is kept already says more
-    UNDECIDED = "undecided"  # it depends on what others say
-    LATE = "late"  # a good one, but not to be returned
-    NOTHING = "nothing"  # it is about no request
+    SUCCESS = "success"  # return the answer, unless another one was first
+    REJECTION = "rejection"  # not ok: returned only when nothing better can come
+    WEAKER_REJECTION = "weaker-rejection"  # the rejection already kept is more informative
+    UNDECIDED = "undecided"  # depends on other replicas' answers
+    LATE = "late"  # a good answer, but not to be returned
+    NOTHING = "nothing"  # about no request
 
 
 Judgement = Means | Refusal  # a refusal: as if the replica had refused the request
@@ -70,26 +70,26 @@ class Send(NamedTuple):
     id: bytes
     payload: bytes
     timeout_s: float
-    is_copy: bool = False  # of a caller's request, and counted as one
+    is_copy: bool = False  # a copy of a caller's request, and counted as one
 
 
 class Reachable(NamedTuple):
-    """The reachable replicas: new ones, all, and those that are draining."""
+    """The reachable replicas: those newly reachable, all of them, and those draining."""
 
     come: Collection[int]
-    versions: Mapping[int, str]  # what each runs
+    versions: Mapping[int, str]  # all, with the version that each runs
     draining: Collection[int]
 
 
 class Decide:
     """Judges answers: the first response counts; with `accepts`, the first ok one.
 
-    All but `read` is called under the dispatcher's lock. What differs is overridden.
+    All methods but `read` are called under the dispatcher's lock. Subclasses override the rest.
     """
 
     flagged: Collection[int] = ()  # replicas whose answers do not count any more
-    # Replicas must have more than single requests: `request_of`, `reach`, `take` and `declined` are
-    # asked. With the second, requests leave by `take`, too, and are not chosen for.
+    # `replicates`: replicas get more than single requests, so `request_of`, `reach`, `take` and
+    # `declined` are called. `sends_requests`: requests are sent by `take` too, not by the policy.
     replicates = False
     sends_requests = False
 
@@ -99,14 +99,14 @@ class Decide:
     def accept(self, accepts: Accepts | None) -> None:
         """Set which responses are ok; None for all."""
         self.accepts = accepts
-        # Then any response is a success: `began`, `read`, `judge` and `closed` need not be asked.
+        # If so, any response is a success: `began`, `read`, `judge` and `closed` need no call.
         self.takes_any = accepts is None and type(self) is Decide
 
     def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         """Note a new request, and the replicas that can answer it."""
 
     def read(self, payload: bytes) -> Any:
-        """Read an answer; here, whether it is ok. Raises RosError: it is not of this type."""
+        """Parse an answer; here, whether it is ok. Raises RosError if it is not of this type."""
         return self.accepts is None or self.accepts(payload)
 
     def judge(
@@ -124,7 +124,7 @@ class Decide:
         """Note that a request has ended in any way."""
 
     def hears_out(self, request: bytes) -> bool:
-        """Whether replicas keep working on a request that has ended: they must have it."""
+        """Whether replicas must go on working on a request that has ended."""
         return self.replicates
 
     def report(self) -> dict[str, Any]:
@@ -132,14 +132,14 @@ class Decide:
         return {}
 
     def hold(self) -> None:
-        """Stop ordering: another proxy does."""
+        """Stop ordering requests: another proxy takes over."""
 
     def take_over(self, now: float) -> None:
-        """Start ordering, after another proxy has stopped."""
+        """Start ordering requests, after another proxy has stopped."""
 
     @property
     def held(self) -> Collection[bytes]:
-        """Return the requests held until then."""
+        """Return the requests held until `take_over`."""
         return ()
 
     @property
@@ -148,14 +148,14 @@ class Decide:
         return True
 
     def request_of(self, id: bytes) -> bytes | None:
-        """Return the request of an attempt; None for none. Needs no lock."""
+        """Return the request that an attempt belongs to; None for none. Needs no lock."""
         return id
 
     def reach(self, replicas: Reachable, now: float) -> None:
         """Set the reachable replicas."""
 
     def take(self, now: float, timeout_s: float) -> Sequence[Send]:
-        """Return what to send now, in order; requests have `timeout_s`."""
+        """Return what to send now, in order; requests have a timeout of `timeout_s`."""
         return ()
 
     def declined(self, id: bytes, replica: int, now: float) -> None:

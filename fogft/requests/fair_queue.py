@@ -1,9 +1,9 @@
 """The queue at a replica: by deadline within a robot, fair between robots. Pure.
 
-The robot that was given least is next, and one that comes back after a pause begins where the
-others are (start-time fair queueing): it can neither save up turns nor lose them.
+The robot served least is next. A robot that returns after a pause starts level with the others
+(start-time fair queueing): it can neither save up turns nor lose them.
 
-Laws: what is put in comes out once, or is removed; a robot with something waiting is served
+Laws: each item put in comes out once, or is removed; a robot with items waiting is served
 at least every n-th time, with n robots waiting; of two requests of one robot the earlier
 deadline goes first.
 
@@ -30,12 +30,12 @@ _Ranked = tuple[float, int, _Entry[T]]  # no two have the same number
 
 class _Robot(Generic[T]):
     def __init__(self, given: float) -> None:
-        self.heap: list[_Ranked[T]] = []  # entries that were removed stay until they come up
+        self.heap: list[_Ranked[T]] = []  # removed entries stay until they reach the top
         self.waiting = 0
         self.given = given
 
     def standing(self) -> tuple[float, _Ranked[T]]:
-        """Return its turn: who was given least is next; among equals the earliest deadline."""
+        """Return its sort key: the robot served least is next, then the earliest deadline."""
         while self.heap[0][2].item is None:
             heapq.heappop(self.heap)
         return self.given, self.heap[0]
@@ -44,17 +44,17 @@ class _Robot(Generic[T]):
 class FairQueue(Generic[T]):
     """The queue of one service at a replica, by request id.
 
-    Of the `latest` the newest request of a robot goes first, and the oldest gives way: with one
-    time-out a service, the latest deadline is the newest request's.
+    With `latest`, a robot's newest request is served first and its oldest is evicted first: as a
+    service has one time-out, the latest deadline is the newest request's.
     """
 
     def __init__(self, *, latest: bool = False) -> None:
         self._sign = -1.0 if latest else 1.0
-        self._robots: dict[str, _Robot[T]] = {}  # those that have something waiting
+        self._robots: dict[str, _Robot[T]] = {}  # robots with items waiting
         self._entries: dict[bytes, _Entry[T]] = {}
         self.size = self._entries.__len__
         self._order = count()
-        self._turn = 0.0  # what the robot served last had been given
+        self._turn = 0.0  # virtual time: `given` of the robot served last, before that turn
 
     def put(self, id: bytes, robot: str, deadline: float, item: T) -> None:
         """Queue an item. Its id must not be queued already."""
@@ -75,7 +75,7 @@ class FairQueue(Generic[T]):
         return self._remove(entry)
 
     def not_served(self, robot: str) -> None:
-        """Give a robot its turn back: what was taken came to nothing."""
+        """Give a robot its turn back: the item taken was not served."""
         if robot in self._robots:
             self._robots[robot].given -= 1.0
 
@@ -97,7 +97,7 @@ class FairQueue(Generic[T]):
         return item
 
     def evict(self, robot: str, deadline: float) -> T | None:
-        """Remove the item that must make room for a new one; None if the new one must go."""
+        """Remove and return the item evicted for a new one; None if the new one must go."""
         most = max(self._robots.values(), key=lambda queue: queue.waiting, default=None)
         own = self._robots.get(robot)
         if most is None:
@@ -105,14 +105,14 @@ class FairQueue(Generic[T]):
         if own is not None and own.waiting >= most.waiting:
             most = own
         elif most.waiting <= (own.waiting if own is not None else 0) + 1:
-            return None  # equal shares: nobody has too much
+            return None  # equal shares: no robot has too much
         rank, _, last = max(ranked for ranked in most.heap if ranked[2].item is not None)
         if most is own and rank <= self._sign * deadline:
             return None
         return self._remove(last)
 
     def ahead(self, robot: str, deadline: float) -> int:
-        """Return about how many will be served before a request that arrives now."""
+        """Return roughly how many items will be served before a request that arrives now."""
         own = self._robots.get(robot)
         before, rank = 0, self._sign * deadline
         if own is not None:

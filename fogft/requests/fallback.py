@@ -1,7 +1,7 @@
 """When the fallback service is called, and how long its answer is awaited. Pure.
 
-Law: a request is handed to the fallback, a service on the robot, once, and once more at its
-deadline where what it answered before was no good; it ends once.
+Law: a request goes to the fallback, a service on the robot, at most once, and once more at its
+deadline if the fallback's earlier answer was not good; it ends once.
 """
 
 from fogft.model.choices import FallbackSpec
@@ -14,14 +14,14 @@ class FallbackTimer:
 
     def __init__(self, spec: FallbackSpec) -> None:
         self.spec = spec
-        self._arrived: dict[bytes, float] = {}  # not handed over yet, oldest first
-        self.submitted = self._arrived.__setitem__  # a new request, and when
+        self._arrived: dict[bytes, float] = {}  # requests not handed over yet, oldest first
+        self.submitted = self._arrived.__setitem__  # note a new request, and when it arrived
         self._handed: set[bytes] = set()
-        self.failed = self._handed.discard  # it could not be asked: once more at the deadline
-        self._awaited: dict[bytes, tuple[float, Pending]] = {}  # past the deadline: until when
+        self.failed = self._handed.discard  # the call failed: call again at the deadline
+        self._awaited: dict[bytes, tuple[float, Pending]] = {}  # past their deadline: until when
 
     def not_asked(self) -> None:
-        """Note that the fallback is another one now: it is asked at the deadline."""
+        """Note that the fallback was replaced: call the new one at each request's deadline."""
         self._handed.clear()
 
     def __len__(self) -> int:
@@ -29,7 +29,7 @@ class FallbackTimer:
         return len(self._awaited)
 
     def look_at(self, *, able: bool) -> float:
-        """Return when `due` can next return requests; `able` if a replica is ready."""
+        """Return when `due` can next return requests; `able` says whether a replica is ready."""
         for arrived in self._arrived.values():  # the oldest
             if not able and self.spec.while_none_ready:
                 return arrived
@@ -52,7 +52,7 @@ class FallbackTimer:
         self._handed.discard(request)
 
     def expired(self, request: bytes, item: Pending, now: float) -> bool:
-        """Note the deadline: only the fallback counts now; return whether it is still needed."""
+        """Note a deadline: only the fallback counts now; return whether to call it (again)."""
         must_ask = request not in self._handed
         self._arrived.pop(request, None)
         self._handed.discard(request)
@@ -60,7 +60,7 @@ class FallbackTimer:
         return must_ask
 
     def answered(self, request: bytes) -> Pending | None:
-        """Note the fallback's answer; return the item of a request past its deadline, once."""
+        """Note the fallback's answer; return the item if the deadline had passed, once."""
         self._handed.discard(request)
         found = self._awaited.pop(request, None)
         return None if found is None else found[1]

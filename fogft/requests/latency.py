@@ -1,8 +1,8 @@
 """Recent latencies: quantiles of a decaying histogram. Pure.
 
-Buckets grow by 10 % from 0.1 ms to over a day, so a quantile is right to about 5 %. An attempt that
-was stopped counts as the time until then: leaving it out would make a slow replica look as fast as
-its fast answers.
+Buckets grow by 10 % from 0.1 ms to over a day, so a quantile is accurate to about 5 %. A stopped
+attempt counts with the time until it was stopped: leaving it out would make a slow replica look as
+fast as its fast answers.
 """
 
 import math
@@ -18,24 +18,24 @@ _RESCALE_AT = 1e100
 class Latencies:
     """Recent latencies of one replica's answers to one service."""
 
-    per_sample = 2.0 ** (1.0 / 200.0)  # heavier than the one before: after 200 it weighs half
-    half_life_s = 60.0  # after so much time, too
+    per_sample = 2.0 ** (1.0 / 200.0)  # weight growth per sample: after 200 more, one weighs half
+    half_life_s = 60.0  # weights halve with time, too
 
     def __init__(self) -> None:
-        self._weights: dict[int, float] = {}  # by bucket, of those that have had a sample
-        self._weight = 1.0  # of the next sample: grows, instead of all others shrinking
+        self._weights: dict[int, float] = {}  # by bucket, for buckets that have had a sample
+        self._weight = 1.0  # of the next sample: it grows, instead of all others shrinking
         self._total = 0.0
         self._newest: float | None = None
-        self._new: list[tuple[float, float, float]] = []  # those that are in no bucket yet
+        self._new: list[tuple[float, float, float]] = []  # samples not yet in a bucket
         self.samples = 0
 
     def add(self, took_s: float, now: float, share: float = 1.0) -> None:
-        """Count a latency, in seconds, for that share of one."""
+        """Count a latency, in seconds, as this fraction of a sample."""
         self._new.append((took_s, now, share))
         self.samples += 1
 
     def _sort_new(self) -> None:
-        """Put what is new into buckets: once for many, where quantiles are asked for seldom."""
+        """Put new samples into buckets: in batches, as quantiles are needed less often."""
         for took_s, now, share in self._new:
             if self._newest is not None and now > self._newest:
                 self._weight *= 2.0 ** min((now - self._newest) / self.half_life_s, 60.0)
@@ -43,7 +43,7 @@ class Latencies:
             self._weight *= self.per_sample
             if self._weight > _RESCALE_AT:
                 self._rescale()
-            bucket = 0  # whose upper end is the first that is not below it
+            bucket = 0  # the first bucket whose upper end is not below the sample
             if took_s > _FIRST_S:
                 bucket = min(_BUCKETS - 1, math.ceil(math.log(took_s / _FIRST_S) / _LOG_GROWTH))
             self._weights[bucket] = self._weights.get(bucket, 0.0) + self._weight * share
@@ -57,18 +57,18 @@ class Latencies:
         self._weight = 1.0
 
     def quantile_s(self, share: float) -> float | None:
-        """Return the time within which this share of answers came; None before the first."""
+        """Return the time within which this share of answers arrived; None before the first."""
         self._sort_new()
         above = (1.0 - share) * self._total
-        for bucket in sorted(self._weights, reverse=True):  # interesting ones are high
+        for bucket in sorted(self._weights, reverse=True):  # the usual quantiles are high
             weight = self._weights[bucket]
-            if weight > above:  # as if its samples lay evenly in the bucket
+            if weight > above:  # as if samples were spread evenly over the bucket
                 return _FIRST_S * math.pow(_GROWTH, bucket - above / weight)
             above -= weight
         return _FIRST_S if self.samples else None
 
     def mean_below_s(self, share: float) -> float | None:
-        """Return the mean of this share of answers, the fastest; None before the first."""
+        """Return the mean latency of the fastest `share` of answers; None before the first."""
         self._sort_new()
         left, sum_below = share * self._total, 0.0
         for bucket in sorted(self._weights):

@@ -1,7 +1,7 @@
-"""A replica's load, by its own report and by what one robot has sent. Pure.
+"""A replica's load, estimated from its reports and from what one robot has sent. Pure.
 
-Between two reports the robot counts what it sent itself. Several robots need no coordination: each
-sees the others in the replica's words. Who is asked is decided in `auto` and `choose`.
+Between two reports a robot counts what it has sent itself. Robots need no coordination: each sees
+the others' requests in the replica's reports. Which replica is asked: `auto` and `choose`.
 """
 
 import math
@@ -14,62 +14,62 @@ from fogft.requests.latency import Latencies
 LATE_SHARE = 0.95
 SHORTEST_DELAY_S = 0.001
 UNKNOWN_DELAY_S = 0.1
-_SAMPLES_NEEDED = 5  # with fewer, the 95 % quantile is but the longest one
-_WORD_HOLDS_S = 1.0  # of a replica, about other robots' requests
+_SAMPLES_NEEDED = 5  # with fewer, the 95 % quantile is just the maximum
+_WORD_HOLDS_S = 1.0  # how long a replica's report about other robots' requests is valid
 _RTT_GAIN = 0.1
-NEARLY = 0.8  # of what it usually takes
-# Times as slow or quick as most: by less than the first, by what is known over a long time, no
-# difference counts; by the second even one that is new does.
+NEARLY = 0.8  # a request is nearly done after this share of its usual time
+# Factors from the median service time: up to the first, in the long-term average, no difference
+# counts; beyond the second, in the recent one, a difference counts at once.
 ALIKE, _ALIKE_LATELY = 1.7, 4.0
 _USUAL_GAIN = 0.02
-NEW = 20  # words of a replica: they say little
-_FEW = 10  # answers: they do not show how it compares with others
-# Of what a request is expected to take, and of what is ever at work:
+NEW = 20  # with fewer reports than this, a replica's averages say little
+_FEW = 10  # with fewer answers, a replica cannot be compared with others
+# Multiples of the expected time of an attempt, after which it is overdue, or stalls:
 _LATE, _STALLS = 1.2, 3.0
 _DOUBT_AFTER = 2.0
-_UNKNOWN_DOUBT_S = 2.0  # as long as it takes until a silent link is suspect
-# A replica that fails is left alone: at first so long, then doubling, while another is able.
+_UNKNOWN_DOUBT_S = 2.0  # as long as until a silent link is suspect
+# Backoff from a replica that fails, doubling up to a limit, while another one is able.
 _AVOIDED_S = 0.1
 _AVOIDED_LIMIT_S = 5.0
 NEVER = float("inf")
-_MANY = 16.0  # requests ahead: behind more, a time tells little of what is unusual
+_MANY = 16.0  # behind more requests than this, a latency says little about what is unusual
 _FULL_OVER_S, _ASKED_OVER_S, _DEMAND_STEP_S = 10.0, 30.0, 0.1
-# An answer that takes so many times as long as usual shows a slow spell of so many times that.
+# An answer this many times slower than usual starts a slow spell of this many times its duration.
 SLOW, _SLOW_FOR = 2.5, 5.0
-_OFTEN = 0.5  # of the time something waits: there are too few replicas
-_UNANSWERED = 1.15  # times what full ones answer is asked: no chance
-_SILENT_S = 2.0  # without an answer nobody knows whether they are full
-_TOO_FULL, _ENOUGH = 0.95, 0.8  # shares of what replicas can do: too much, and what they should do
+_OFTEN = 0.5  # if requests queue for more than this share of the time, there are too few replicas
+_UNANSWERED = 1.15  # requests per answer of full replicas above which it is no coincidence
+_SILENT_S = 2.0  # after this long without an answer, whether replicas are full is unknown
+_TOO_FULL, _ENOUGH = 0.95, 0.8  # utilization that is too high, and the target
 
 
 class Handling(IntFlag):
     """How a replica should handle a request, besides running it."""
 
     NORMAL = 0
-    DROP_IF_BUSY = 0x08  # a spare copy: drop it where it would have to wait
-    ALONE = 0x10  # a service died while it worked on this: run nothing beside it
+    DROP_IF_BUSY = 0x08  # a spare copy: drop it if it would have to wait
+    ALONE = 0x10  # a service died while working on this: run nothing beside it
 
 
-class Load(NamedTuple):  # made for each answer: a frozen dataclass costs thrice as much
+class Load(NamedTuple):  # created for each answer: a frozen dataclass costs three times as much
     """The load of one service, reported by a replica with each answer and refusal."""
 
-    waiting: int  # requests that wait for their turn
+    waiting: int  # requests waiting for their turn
     running: int  # requests that the service has now
-    slots: int  # how many it works on at once; 0 where that is not known yet
-    service_s: float  # what it lately took for a request, divided by how many it had at once
+    slots: int  # how many it works on at once; 0 if not known yet
+    service_s: float  # recent time per request, divided by how many ran at once
     spent_s: float  # how long the request of this answer was at the replica
 
 
 class Demand:
-    """What robots ask of a service: this one, and all, as far as full replicas show it."""
+    """The demand for a service: this robot's, and all robots' as far as full replicas show it."""
 
     def __init__(self) -> None:
-        self.full = False  # something waited at the replica that answered last
-        self.rate = 0.0  # requests a second, lately; too few in the first seconds
-        self._full_until = -NEVER  # unless another answer says so
-        self._full_share = 0.0  # of the time, lately
-        self._asked = 0.0  # lately
-        self._asked_full = self._answered_full = 0.0  # while it was full, lately
+        self.full = False  # requests were waiting at the replica that answered last
+        self.rate = 0.0  # recent requests per second; too low in the first seconds
+        self._full_until = -NEVER  # unless another answer confirms it
+        self._full_share = 0.0  # recent share of the time
+        self._asked = 0.0  # recent requests
+        self._asked_full = self._answered_full = 0.0  # recent requests and answers while full
         self._at = 0.0
 
     def asked(self, now: float) -> None:
@@ -87,7 +87,7 @@ class Demand:
         self._asked_full += self.full
 
     def answered(self, load: Load, now: float) -> None:
-        """Count an answer; no need where it was not full, and nothing waits."""
+        """Count an answer; not needed if `full` is not set and nothing waits at the replica."""
         self.full, self._full_until = load.waiting > 0, now + _SILENT_S
         self._answered_full += self.full
 
@@ -101,8 +101,8 @@ class Demand:
     def replicas(self, able: int, service_s: float, now: float) -> int:
         """Return how many replicas would be enough, at `service_s` a request, if too few; else 0.
 
-        Enough for this robot; and for all, where full replicas leave requests unanswered: they
-        serve robots in turns, so those that ask as much see alike by how much they are too few.
+        Enough for this robot's demand; if full replicas leave requests unanswered, for all robots':
+        replicas serve robots in turns, so robots with equal demand see the same shortage.
         """
         able, needed = max(1, able), 0
         work = self._asked * self._kept(now, _FULL_OVER_S) / _FULL_OVER_S * service_s
@@ -119,30 +119,30 @@ class ReplicaLoad:
 
     def __init__(self) -> None:
         self.latencies = Latencies()
-        self.service_s = 0.0  # how long it lately worked on a request, as far as is known
-        self.usual_s = 0.0  # the same, over a long time
-        self.told = 0  # how often it has said so
-        self.doubted = False  # an attempt is overdue, and it has ended none since that one began
-        self.ended_at = -NEVER  # when it last ended an attempt, with an answer or too late for one
+        self.service_s = 0.0  # recent time per request, as far as known
+        self.usual_s = 0.0  # the same, averaged over a long time
+        self.told = 0  # how many reports it has sent
+        self.doubted = False  # an attempt is long overdue and none has ended since it began
+        self.ended_at = -NEVER  # when it last ended an attempt, answered in time or late
         self.asked_at = -NEVER
-        self.slow_until = -NEVER  # its last answer took unusually long: another is preferred
-        # Our attempts that it has not ended, oldest first: when each began, when it is overdue, and
-        # for how much its time counts.
+        self.slow_until = -NEVER  # its last answer took unusually long: others are preferred
+        # Our open attempts there, oldest first: when each began, when it is overdue, and the
+        # weight of its latency.
         self.at_work: dict[bytes, tuple[float, float, float]] = {}
         self.slots = 0
         self._rtt_s: float | None = None
-        self._others = 0  # requests of other robots
+        self._others = 0  # other robots' requests there
         self._others_until = -NEVER
         self._avoided_s = 0.0
         self._avoided_until = -NEVER
-        self.delay_s = UNKNOWN_DELAY_S  # after it an attempt takes unusually long
+        self.delay_s = UNKNOWN_DELAY_S  # an attempt that takes longer is unusually slow
         self._delay_holds_until = _SAMPLES_NEEDED
 
-    # -- what is believed -----------------------------------------------------------------
+    # -- estimates ------------------------------------------------------------------------
 
     @property
     def alone_s(self) -> float:
-        """What an answer usually takes where nothing is ahead."""
+        """Return how long an answer usually takes if nothing is ahead."""
         return (self._rtt_s or 0.0) + self.usual_s
 
     def ahead(self, now: float) -> int:
@@ -156,12 +156,12 @@ class ReplicaLoad:
         ahead = self.ahead(now)
         if ahead < max(1, self.slots):
             return True
-        # One of ours that is nearly over: callers ask again as soon as the first has answered.
+        # Only one request, ours, and nearly done: callers ask again once the first has answered.
         one, takes_s = ahead == len(self.at_work) == 1, (self._rtt_s or 0.0) + self.service_s
         return one and NEARLY * takes_s <= self._spent_s(now) <= _LATE * takes_s
 
     def wait_s(self, now: float) -> float:
-        """Return how long a request that arrives now is expected to wait: endless if in doubt."""
+        """Return the expected wait of a request that arrives now; infinity if doubted."""
         if self.doubted:
             return NEVER
         if self.free(now):
@@ -170,30 +170,30 @@ class ReplicaLoad:
 
     @property
     def oldest_begun(self) -> float:
-        """When the oldest of our open requests there began; infinity for none."""
+        """Return when the oldest of our open requests there began; infinity for none."""
         for begun, _, _ in self.at_work.values():
             return begun
         return NEVER
 
     def _spent_s(self, now: float) -> float:
-        """Return for how long it has been at the oldest of ours; 0 for none."""
+        """Return how long it has been working on our oldest request; 0 for none."""
         return now - max(self.oldest_begun, self.ended_at) if self.at_work else 0.0
 
     def avoided(self, now: float) -> bool:
-        """Whether to prefer others: it is in doubt, or has failed."""
+        """Whether to prefer others: the replica is doubted, or has failed recently."""
         return self.doubted or now < self._avoided_until
 
     def expected_s(self, now: float, typical_s: float, usual_s: float) -> float:
         """Return the expected latency of a request sent now.
 
-        Round trip, and one service time for it and for each request before it, less what the one at
-        work has had; one that takes far too long is taken to go on for as long again. A replica
-        that is about as quick as most, or has hardly answered, is taken for equal: those take
-        `typical_s` a request lately, `usual_s` over a long time.
+        The round trip, plus one service time for it and for each request ahead, less the time
+        already spent on the running one; a stalled one is expected to take as long again. A
+        replica about as quick as the median, or with few answers, counts as equal to it: the median
+        takes `typical_s` per request recently, `usual_s` over a long time.
         """
         service_s = self.service_s
         if self.latencies.samples < _FEW:
-            service_s = typical_s or SHORTEST_DELAY_S  # of none known the fewest ahead count
+            service_s = typical_s or SHORTEST_DELAY_S  # if no median: the fewest ahead decides
         elif typical_s / _ALIKE_LATELY < service_s < typical_s * _ALIKE_LATELY:
             service_s = self.usual_s
             if usual_s / ALIKE < service_s < usual_s * ALIKE:
@@ -204,26 +204,26 @@ class ReplicaLoad:
             return rtt_s + left_s
         spent_s = self._spent_s(now)
         if spent_s <= _LATE * (rtt_s + service_s):
-            left_s -= min(spent_s, NEARLY * service_s)  # not as good as one that is idle
+            left_s -= min(spent_s, NEARLY * service_s)  # never as good as an idle replica
         elif spent_s > _STALLS * (rtt_s + service_s):
             left_s += spent_s
         return rtt_s + left_s
 
     def overdue_at(self, request: bytes, begun: float) -> float:
-        """Return when an attempt is slower than nearly all others and than its expected wait."""
+        """Return when an attempt becomes slower than nearly all others and than expected."""
         return self.at_work.get(request, (0.0, begun + self.delay_s, 1.0))[1]
 
     def doubtful_at(self, begun: float) -> float:
-        """Return when an attempt that began then is long overdue.
+        """Return when an attempt that began at `begun` is long overdue.
 
-        Not as soon as it takes unusually long: one in twenty does. Of one that has answered little
-        nothing is unusual for seconds.
+        That is later than when it is unusually slow, as one attempt in twenty is. For a replica
+        with few answers it is some seconds.
         """
         if self.latencies.samples < _SAMPLES_NEEDED:
             return begun + _UNKNOWN_DOUBT_S
         return begun + _DOUBT_AFTER * self.delay_s
 
-    # -- what happens ---------------------------------------------------------------------
+    # -- events ---------------------------------------------------------------------------
 
     def asked(self, request: bytes, now: float, *, spare: bool = False) -> float:
         """Note an attempt about to be sent; return when it will be overdue."""
@@ -236,10 +236,10 @@ class ReplicaLoad:
         return now + overdue_s
 
     def heard(self, request: bytes, load: Load, now: float) -> None:
-        """Take its reported load, plus what was sent within the last round trip."""
+        """Take its reported load, plus our requests sent within the last round trip."""
         since = now - (self._rtt_s or 0.0)
         seen = len(self.at_work) - (request in self.at_work)
-        for id, (begun, _, _) in reversed(self.at_work.items()):  # the newest first: few
+        for id, (begun, _, _) in reversed(self.at_work.items()):  # newest first: only a few
             if begun <= since:
                 break
             seen -= id != request
@@ -250,12 +250,12 @@ class ReplicaLoad:
         self.told += 1
         gain = max(_USUAL_GAIN, 1.0 / max(1, self.told - NEW))
         self.usual_s += gain * (load.service_s - self.usual_s)
-        if seen > there:  # the ends of some were lost
+        if seen > there:  # we were not told of the end of some
             for lost in [*islice((id for id in self.at_work if id != request), seen - there)]:
                 del self.at_work[lost]
 
     def answered(self, request: bytes, load: Load | None, now: float) -> None:
-        """Note that it has ended an attempt."""
+        """Note that the replica has ended an attempt."""
         sent = self.at_work.pop(request, None)
         before, self.ended_at = self.ended_at, now
         self.doubted = False
@@ -280,7 +280,7 @@ class ReplicaLoad:
         self.at_work.pop(request, None)
 
     def failed(self, request: bytes, now: float) -> None:
-        """Note that an attempt failed by its fault: failing at once is not being quick."""
+        """Note a failed attempt that is its fault: failing fast does not count as quick."""
         self.at_work.pop(request, None)
         self._avoided_s = min(_AVOIDED_LIMIT_S, max(_AVOIDED_S, 2 * self._avoided_s))
         self._avoided_until = now + self._avoided_s
@@ -293,14 +293,14 @@ class ReplicaLoad:
     def _took(self, seconds: float, now: float, share: float) -> None:
         self.latencies.add(seconds, now, share)
         samples = self.latencies.samples
-        if samples >= self._delay_holds_until:  # of many, one more makes little difference
+        if samples >= self._delay_holds_until:  # with many, one more makes little difference
             self._delay_holds_until = samples + 1 + min(samples // 16, 15)
             self.delay_s = max(SHORTEST_DELAY_S, self.latencies.quantile_s(LATE_SHARE) or 0.0)
-        if self._rtt_s is None:  # it never told its load
+        if self._rtt_s is None:  # it has never reported its load
             self.service_s = self.usual_s = self.latencies.mean_below_s(LATE_SHARE) or 0.0
 
     def doubt(self, begun: float, now: float) -> bool:
-        """Doubt it if an attempt is long overdue and none has ended since; return whether it is."""
+        """Doubt it if an attempt is long overdue and none has ended since; return if doubted."""
         if self.ended_at < begun and now >= self.doubtful_at(begun):
             self.doubted = True
         return self.doubted

@@ -1,12 +1,12 @@
 """One service's unanswered requests, with its hedging and decision policies. Pure.
 
-Each step of a request's life keeps the table, the policy and the decision in step, and returns what
-is to be done. Called under its owner's lock. The first success takes the request out of the table,
-so that whatever comes later is LATE by construction. A replica that declined a request, failed it
-or came after it may be asked even while others work on it: they may be frozen.
+Each step of a request's life keeps the table, the policy and the decision in sync, and returns what
+to do next. Called under its owner's lock. The first success removes the request from the table,
+so any later answer is LATE by construction. A replica that declined or failed a request, or joined
+after it, may be asked even while others work on it: they may be frozen.
 
-Owns: who may be asked (`_next_for`). Not here: whom of those (`choose`), what an answer means
-(`decide`), when the fallback is (`fallback`), sending and counting (`proxy.robot.dispatcher`).
+Owns: which replicas may be asked (`_next_for`). Not here: which are (`choose`), what an answer
+means (`decide`), when to call the fallback (`fallback`), sending (`proxy.robot.dispatcher`).
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -26,28 +26,28 @@ class Verdict(Enum):
 
     WON = "won"  # return this answer; the request is closed
     WAIT = "wait"  # another attempt is still open
-    IDLE = "idle"  # nobody works on it any more: try again, or return the rejection
+    IDLE = "idle"  # no attempt is open any more: try again, or return the rejection
     LATE = "late"  # already answered, expired or never known: drop it
-    POISON = "poison"  # services died over it: it is not to be sent again
+    POISON = "poison"  # it crashed services: never send it again
 
 
 Judged = tuple[Judgement, Pending | None, Iterable[int], Verdict]
 
-ATTEMPTS = 3  # that one replica may fail of one request, before it is barred from it
+ATTEMPTS = 3  # a replica that failed a request this often is barred from it
 RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.32
-POISON_DEATHS = 2  # once beside others, and then alone: that is no chance
-# So long after a death no request is at all replicas at once: another that kills would end them.
+POISON_DEATHS = 2  # once beside other requests, then alone: no coincidence
+# For this long after a death no request is at all replicas at once: it could crash all of them.
 CAUTIOUS_S = 60.0
 _SPREADS_AFTER_S = 1.0
-LOOK_AGAIN_S = 0.02  # at a request for which nobody says when
+LOOK_AGAIN_S = 0.02  # at a request for which the policy names no time
 _NO_WAIT = (0.0, RETRY_FIRST_S / 2)
 
 
 class PendingRequests:
     """The unanswered requests of one service.
 
-    With `counts_deaths` a request may be blamed for the death of a service that has it.
+    With `counts_deaths`, a request may be blamed for the death of a service running it.
     """
 
     def __init__(self, choose: Choose, decide: Decide, *, counts_deaths: bool = False) -> None:
@@ -55,14 +55,14 @@ class PendingRequests:
         self.choose = choose
         self.decide = decide
         self.fallback: FallbackTimer | None = None
-        self.soonest_deadline = NEVER  # of the requests, or sooner
+        self.soonest_deadline = NEVER  # a lower bound of all deadlines
         self._pending: dict[bytes, Pending] = {}
         self.size = self._pending.__len__
-        # Those that some replica may have to be asked for, as far as is known, and from when on.
+        # Requests that may need another attempt, and when to look at each next.
         self._short: dict[bytes, float] = {}
-        self._rejected: dict[bytes, None] = {}  # those that have a rejected answer
+        self._rejected: dict[bytes, None] = {}  # requests that have a rejected answer
         self._counts_deaths = counts_deaths
-        self._able: Sequence[int] = ()  # who could be asked when this was last asked
+        self._able: Sequence[int] = ()  # the able replicas at the last `begin` or `more`
         self._cautious_until = -NEVER
         self._alarms = Alarms()
 
@@ -77,7 +77,7 @@ class PendingRequests:
         return None if request is None else self._pending.get(request)
 
     def use(self, choose: Choose) -> None:
-        """Switch to another hedging policy, which is asked about each request."""
+        """Switch to another hedging policy, which reconsiders each request."""
         self.choose = choose
         self._short = dict.fromkeys(self._pending, 0.0)
 
@@ -93,11 +93,11 @@ class PendingRequests:
         now: float,
         handle: Any = None,
     ) -> Sequence[int]:
-        """Add a request; return the replicas it goes to at once. Raises ValueError: it is there."""
+        """Add a request; return the replicas it goes to now. Raises ValueError for a known id."""
         if request in self._pending:
             raise ValueError("a request with this id is under way already")
         if not self._pending:
-            self.choose.look_at = NEVER  # that was for those that have ended
+            self.choose.look_at = NEVER  # it was for requests that have ended
         self._able, chosen = able, self.choose.first(request, able, now)
         if now < self._cautious_until and len(chosen) > (most := self._most_at_once(able)):
             for spared in chosen[most:]:
@@ -116,13 +116,13 @@ class PendingRequests:
     def more(
         self, able: Sequence[int], now: float, *, newest_first: bool
     ) -> list[tuple[bytes, int]]:
-        """Return the requests to send to further replicas now."""
+        """Return the requests to send to additional replicas now, with those replicas."""
         self._able, choose, steps = able, self.choose, []
         if choose.news:
             choose.news = False
             self.use(choose)
         due, soonest = [], NEVER
-        for request, at in self._short.items():  # under overload many, a hundred times a second
+        for request, at in self._short.items():  # many under overload, a hundred times a second
             if at <= now:
                 due.append(request)
             elif at < soonest:
@@ -132,7 +132,7 @@ class PendingRequests:
             chosen, again_at = self._next_for(request, able, now)
             steps += [(request, replica) for replica in chosen]
             if again_at > now:
-                self._short[request] = again_at  # unless something happens to it
+                self._short[request] = again_at  # or sooner, if something happens to it
                 soonest = min(soonest, again_at)
             else:
                 soonest = min(soonest, now + LOOK_AGAIN_S)
@@ -142,21 +142,21 @@ class PendingRequests:
     def _next_for(
         self, request: bytes, able: Sequence[int], now: float
     ) -> tuple[Sequence[int], float]:
-        """Return whom a request goes to now, and when to look at it again if nothing happens."""
+        """Return the replicas to ask now, and when to look again if nothing happens."""
         pending = self._pending[request]
         rests_until = {
             replica: pending.waits.get(replica, _NO_WAIT)[0]
             for replica in able
             if replica not in pending.open and replica not in pending.barred
         }
-        for replica in pending.waits:  # it has refused, and would again
+        for replica in pending.waits:  # it has refused, and would refuse again
             if rests_until.get(replica, NEVER) <= now and self.choose.too_busy(
                 replica, pending.deadline - now, now
             ):
                 rests_until[replica] = now + RETRY_LIMIT_S
         candidates = [replica for replica, at in rests_until.items() if at <= now]
         room = len(able)
-        if pending.deaths:  # alone
+        if pending.deaths:  # at one replica at a time
             if pending.open and now < pending.alone_until:
                 return (), pending.alone_until
             room = 1
@@ -173,11 +173,11 @@ class PendingRequests:
 
     @staticmethod
     def _most_at_once(able: Sequence[int]) -> int:
-        """Return how many may have what could kill: one more has it alone then; one lives on."""
+        """Return how many may get a request that may crash them: leave one to retry, one alive."""
         return max(1, len(able) - POISON_DEATHS)
 
     def attempt(self, request: bytes, replica: int, now: float) -> Pending | None:
-        """Add a further attempt; None if it is no longer wanted."""
+        """Add another attempt; return None if it is no longer needed."""
         pending = self._pending.get(request)
         if pending is None or replica in pending.open or replica in pending.barred:
             self.choose.declined(request, replica, full=False)
@@ -205,12 +205,12 @@ class PendingRequests:
             self.choose.forget(replica)
 
     def left(self, replicas: Iterable[int]) -> None:
-        """Note that these replicas cannot be asked for now."""
+        """Note that these replicas cannot be asked at present."""
         for replica in replicas:
             self.choose.forget(replica)
 
     def welcome(self, replica: int, about: Callable[[bytes], bool]) -> None:
-        """Note that a replica restarted the subject of some requests: its answers are void."""
+        """Forget a replica's failures at requests matching `about`: it can be asked again."""
         for request, pending in self._pending.items():
             if about(pending.payload):
                 pending.barred.discard(replica)
@@ -231,10 +231,10 @@ class PendingRequests:
         load: Load | None,
         now: float,
     ) -> Judged:
-        """Take an answer about `request`; None for no request.
+        """Take an answer to `request`, or to no request if None.
 
-        Returns what it means; the request that it answers, None where it comes too late or is no
-        success; who else is to stop working on that; what is to be done where it goes on.
+        Returns its meaning; the item it completes, or None if it is late or no success; the other
+        replicas, which should stop working on it; and the verdict.
         """
         pending = None if request is None else self._pending.get(request)
         means: Judgement = Means.SUCCESS
@@ -280,15 +280,15 @@ class PendingRequests:
         if crashed and self._alarms.believed(replica, now):
             self._cautious_until = now + CAUTIOUS_S
             if pending is not None and replica in pending.open:
-                # Beside others it is but suspected: any of them may have been the cause. So may be
-                # the replica, if it alone has died over this, and another works on it, or may.
+                # If other requests ran beside it, it is only a suspect: any may be the cause. So
+                # may the replica, if only it died over this request and another can be asked.
                 others = {*pending.open, *self._able} - pending.died_at - pending.barred
                 again = pending.died_at == {replica} and bool(others)
                 alone = replica in pending.alone_at and not again
                 pending.deaths = pending.deaths + 1 if alone else max(1, pending.deaths)
                 pending.alone_until = (now + pending.deadline) / 2
                 pending.died_at.add(replica)
-        effect = refusal.effect  # of a lost link: the replica may never have seen the request
+        effect = refusal.effect  # for a lost link: the replica may never have seen the request
         counts, bar = Effect.BLAMELESS not in effect, Effect.FINAL in effect
         verdict = self._failed(request, pending, replica, now, counts=counts, bar=bar)
         if verdict is Verdict.LATE:
@@ -308,7 +308,7 @@ class PendingRequests:
         counts: bool,
         bar: bool,
     ) -> Verdict:
-        """Note a failed attempt: the replica is avoided for a moment, longer each time."""
+        """Note a failed attempt: back off from the replica, doubling each time."""
         if pending is None or replica not in pending.open:
             return Verdict.LATE
         failures = pending.failures[replica] = pending.failures.get(replica, 0) + counts
@@ -326,11 +326,11 @@ class PendingRequests:
     # -- a request ends -------------------------------------------------------------------
 
     def idle(self) -> list[bytes]:
-        """Return the requests that no replica works on and that have a rejected answer."""
+        """Return the requests that have a rejected answer and no open attempt."""
         return [request for request in self._rejected if not self._pending[request].open]
 
     def settle(self, request: bytes, able: Iterable[int]) -> Pending | None:
-        """Remove a request that is answered by its rejection, as no other replica can be asked."""
+        """Remove a request whose rejection is final: no other replica can be asked. Else None."""
         pending = self._pending.get(request)
         if pending is None or pending.open or pending.rejection is None:
             return None
@@ -348,7 +348,7 @@ class PendingRequests:
         return pending
 
     def expire(self, now: float, *, every: bool = False) -> list[tuple[bytes, Pending]]:
-        """Remove and return every request past its deadline, or all there are, oldest first."""
+        """Remove and return every request past its deadline, or all requests, oldest first."""
         if now < self.soonest_deadline and not every:
             return []
         expired = [e for e in self._pending.items() if every or e[1].deadline <= now]
@@ -360,7 +360,7 @@ class PendingRequests:
         return expired
 
     def give_up(self, request: bytes, now: float) -> Pending | None:
-        """Remove a request that no replica may get any more; the fallback still may."""
+        """Remove a request that no replica may get any more; the fallback may still answer it."""
         pending = self._pending.get(request)
         if pending is not None:
             self._alarms.were_right(pending.died_at)
@@ -371,7 +371,7 @@ class PendingRequests:
     def fallback_answered(
         self, request: bytes, now: float, *, ok: bool
     ) -> tuple[Pending | None, bool]:
-        """Take the fallback's answer; return the request it ends, and whether that was overdue."""
+        """Take the fallback's answer; return the request it ends, if any, and whether overdue."""
         assert self.fallback is not None
         overdue = self.fallback.answered(request)
         if overdue is not None or not ok:

@@ -1,6 +1,6 @@
-"""Quorum: the answer that k replicas agree on, and replicas that keep disagreeing. Pure.
+"""Quorum: find the answer that k replicas agree on, and flag replicas that keep disagreeing. Pure.
 
-Not here: what agreeing means (`fogft.ros.messages`), requests and deadlines (`pending`).
+Not here: what counts as agreement (`fogft.ros.messages`), requests and deadlines (`pending`).
 """
 
 from collections import OrderedDict, deque
@@ -10,15 +10,15 @@ from typing import Any
 from fogft.model.replica import short
 from fogft.requests.decide import Decide, Judgement, Means, Pending
 
-WINDOW = 20  # judged answers of a replica that count
-LIMIT = 3  # disagreements among them that make it flagged
+WINDOW = 20  # a replica's last answers that count
+LIMIT = 3  # a replica with this many disagreements among them is flagged
 
 
 class Quorum(Decide):
-    """``quorum: k``: an answer with which k replicas agree; see `decide.Decide`.
+    """``quorum: k``: return an answer that k replicas agree on; see `decide.Decide`.
 
-    Replicas go on working on a request that has its answer: what they say tells a wrong one.
-    `newly_flagged` is told who has disagreed once too often, and how often.
+    Replicas keep working on a decided request: later answers show which replicas are wrong.
+    `newly_flagged` is called with a replica that is now flagged and its count of disagreements.
     """
 
     kept, kept_bytes = 256, 16 << 20  # final answers, to judge late ballots by
@@ -48,19 +48,19 @@ class Quorum(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
-        """Take a vote; it is a success if it completes a quorum. Flagged replicas do not count."""
+        """Take a vote: SUCCESS if it completes a quorum. Flagged replicas do not count."""
         if id in self._final:
             self._judge(replica, agrees=self._agree(reading, self._final[id]))
             return Means.UNDECIDED
         if pending is None:
-            return Means.UNDECIDED  # it has expired
+            return Means.UNDECIDED  # the request has expired
         ballots = self._open.setdefault(id, {})
         if replica in ballots:
-            return Means.UNDECIDED  # a copy: one replica has one vote
+            return Means.UNDECIDED  # a duplicate: each replica has one vote
         ballots[replica] = reading
         if replica in self.flagged:
             return Means.UNDECIDED
-        # Once: of a large answer each comparison holds the receiving thread up.
+        # Compare only once: comparing large answers blocks the receiving thread.
         agreeing = {r for r, it in ballots.items() if it is reading or self._agree(it, reading)}
         if len(agreeing - self.flagged) < self._quorum:
             return Means.UNDECIDED
@@ -87,9 +87,9 @@ class Quorum(Decide):
         self._open.pop(request, None)
 
     def hears_out(self, request: bytes) -> bool:
-        """Whether it was decided recently, so that later answers are compared with it."""
+        """Whether the request was decided recently: later answers are compared with the result."""
         return request in self._final
 
     def report(self) -> dict[str, Any]:
-        """Return how often replicas disagreed, by ``slot.generation``."""
+        """Return how often each replica disagreed, by ``slot.generation``."""
         return {"disagreed": {short(key): n for key, n in self.disagreed.items()}}

@@ -1,6 +1,6 @@
-"""A gateway: a replica to its robots, backed by a dispatcher over its own links.
+"""A gateway: acts as a replica to its robots, and forwards their requests over its own links.
 
-Owns: which requests of robots are under way, and whom each answer goes to.
+Owns: which robots' requests are in flight, and who receives each answer.
 Design: docs/design/gateways.md.
 """
 
@@ -21,18 +21,18 @@ from fogft.proxy.robot.dispatcher import Dispatcher
 
 log = logging.getLogger(__name__)
 
-# As long as a link takes to come back by itself, and no longer.
+# Just as long as a link takes to recover by itself.
 UNREADY_S = 0.5
 _POISON_KEPT = 256  # ids of requests that must not be sent again
 
 
 class Forwarder:
-    """Forwards requests, and each answer to all that await it."""
+    """Forwards each request to replicas, and its answer to every robot that awaits it."""
 
-    held_limit = 2048  # requests under way at once; more are refused as overloaded
-    of_one_limit = 512  # the same for one robot: nobody takes all the room
-    held_bytes = 256 << 20  # of the large ones together
-    kept_bytes = 16 << 20  # answers kept for copies that come later, together
+    held_limit = 2048  # requests in flight at once; more are refused as overloaded
+    of_one_limit = 512  # the same for one robot, so that none takes all the room
+    held_bytes = 256 << 20  # total size of large requests
+    kept_bytes = 16 << 20  # total size of answers kept for later copies
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -45,7 +45,7 @@ class Forwarder:
         self._poison: deque[bytes] = deque(maxlen=_POISON_KEPT)
         self.queue: SimpleQueue[Job | None] = SimpleQueue()
         self.passed = 0
-        self.joined = 0  # copies of requests that were known
+        self.joined = 0  # copies of requests already known
         self.refused = Counters()
 
     def start(self) -> None:
@@ -54,10 +54,10 @@ class Forwarder:
 
     @property
     def in_flight(self) -> int:
-        """Requests under way."""
+        """Return the number of requests in flight."""
         return self._known.held
 
-    # -- from robots (the wire's threads) -------------------------------------------------
+    # -- from robots (the link's threads) -------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
         """Take a request from the link. Never blocks."""
@@ -65,7 +65,7 @@ class Forwarder:
         with self._lock:
             known = self._known.get(incoming.request_id)
             if known is not None and known.waiting is None and known.answer is None:
-                self._known.forget(known)  # its replica knows the answer
+                self._known.forget(known)  # the replica still has the answer
                 known = None
             if known is None:
                 reason = self._reason_to_refuse(incoming)
@@ -80,7 +80,7 @@ class Forwarder:
                 answer = known.answer
                 if known.waiting is not None:
                     known.waiting.append(incoming)
-                    del known.waiting[:-COPIES_LIMIT]  # refused as lost: its link is long gone
+                    del known.waiting[:-COPIES_LIMIT]  # refused as lost: their links are long gone
         if answer is not None:
             incoming.reply(answer)
         elif reason is not None:
@@ -108,9 +108,9 @@ class Forwarder:
             self._stop(id, Refusal.CANCELLED)
 
     def poisoned(self, id: bytes) -> None:
-        """Refuse a request over which services died, now and whenever it comes again.
+        """Refuse a request that crashed services, now and whenever it comes again.
 
-        As one death: a robot that has another gateway asks that too, and believes nobody alone.
+        To a robot this is one crash: it does not trust a single gateway, and tries another.
         """
         with self._lock:
             self._poison.append(id)
@@ -128,7 +128,7 @@ class Forwarder:
             self._refuse(incoming, reason)
 
     def _end(self, job: Job, answer: bytes | None = None) -> list[Incoming]:
-        """End a request; return who waits for it. Under the lock."""
+        """End a request; return the copies waiting for its answer. Call under the lock."""
         waiting, job.waiting = job.waiting or [], None
         self._known.end(job, answer)
         self._by_robot[job.robot] -= 1
@@ -143,7 +143,7 @@ class Forwarder:
         while (job := self.queue.get()) is not None:
             try:
                 self._forward(job)
-            except Exception:  # in this thread nobody else would tell of it
+            except Exception:  # nothing else would report it in this thread
                 log.exception("request_not_passed_on request=%s", job.id.hex())
                 self._stop(job.id, Refusal.LOST)
 
@@ -161,12 +161,12 @@ class Forwarder:
             return
         self.passed += 1
         if job.waiting is None:
-            dispatcher.cancel(job.id)  # stopped in between; answered is fine, too
+            dispatcher.cancel(job.id)  # stopped meanwhile; if answered, this does nothing
 
     # -- from replicas (their links' threads) ---------------------------------------------
 
     def respond(self, handle: Any, payload: bytes) -> None:
-        """Send an answer to all that await it, and keep it for later copies."""
+        """Send an answer to every waiting copy, and keep it for later copies."""
         job: Job = handle
         with self._lock:
             if job.waiting is None:
@@ -177,7 +177,7 @@ class Forwarder:
             incoming.reply(payload, more=more)
 
     def tick(self, ready: frozenset[str]) -> None:
-        """Drop requests past their deadline or without a `ready` replica. Call at 50 Hz."""
+        """Refuse requests past their deadline or long without a ready replica. Call at 50 Hz."""
         now = self._clock()
         unready, before = self.dispatchers.keys() - ready, self._unready_since
         self._ready, self._unready_since = ready, {n: before.get(n, now) for n in unready}
@@ -205,7 +205,7 @@ class Forwarder:
         return {"held": self.in_flight, "ran": self.passed, "joined": self.joined, **refused}
 
     def close(self) -> None:
-        """Refuse requests under way, and stop."""
+        """Refuse requests in flight, and stop."""
         with self._lock:
             left = self._known.unanswered(None)
         for job in left:

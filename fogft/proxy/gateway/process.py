@@ -41,9 +41,9 @@ _REPORT_EVERY_S = 0.5
 
 
 def run(config_path: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
-    """Run until a signal ends it; each option replaces a key of the file.
+    """Run until a signal stops it; each option overrides a key of the file.
 
-    Raises PoolBusy: This gateway runs already.
+    Raises PoolBusy: This gateway is already running.
     """
     start_log()
     stop = stop_on_signal()
@@ -72,7 +72,7 @@ class _Gateway:
         self._forwarder = Forwarder()
         dialer = make_dialer(config)
         self._proxy = ClientProxy(config.pool_uid, None, dialer, self._make_dispatcher)
-        # What its caller gets is the robot's to say.
+        # What a caller gets after a time-out is decided on the robot.
         self._services = tuple(
             replace(service, on_timeout=OnTimeout.SILENT, fallback=None)
             for service in config.services
@@ -165,7 +165,7 @@ class _Gateway:
                 self._listener.revoke(self._revoked)
 
     def _renew(self) -> None:
-        """Go on under a new certificate: links one by one, the listener at once."""
+        """Switch to a new certificate: the listener at once, links one by one."""
         self._holder = self._own_holder()
         if self._listener is not None:
             self._listener.close()
@@ -201,7 +201,7 @@ class _Gateway:
 
 
 def _ok_of(type_name: str, field: str) -> Callable[[bytes], bool]:
-    """Return what finds whether a response is ok; all are where the type is not known here."""
+    """Return a check whether a response is ok; if the type is unknown here, every one is."""
     try:
         from fogft.ros import messages
 

@@ -1,4 +1,4 @@
-"""The server proxy: runs beside each replica of the service and passes requests to it.
+"""The server proxy: runs on each replica and passes robots' requests to its local services.
 
 Not here: the robot's side (`fogft.proxy.robot`).
 """

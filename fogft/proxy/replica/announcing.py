@@ -1,4 +1,4 @@
-"""A replica's exchange with the rendezvous: its own record, and the members it learns."""
+"""A replica's exchange with the rendezvous: publishes its own record, and learns others'."""
 
 import logging
 
@@ -38,7 +38,7 @@ class Presence:
             self._dial_out.follow(config.dial_out)
 
     def look(self, ready: frozenset[str], *, draining: bool) -> Known:
-        """Publish changes, dial new dial-in ports; return the known records."""
+        """Publish changes, connect to new dial-in ports; return the known records."""
         if self._client is None:
             return Known()
         known, id = self._client.known, self._config.id
@@ -68,7 +68,7 @@ class Presence:
 
 
 def doors(known: Known) -> list[str]:
-    """Return where robots and gateways let replicas dial in."""
+    """Return the addresses at which robots and gateways let replicas dial in."""
     found = []
     for record in (*known.of(RecordKind.GATEWAY), *known.of(RecordKind.ROBOT)):
         try:

@@ -1,9 +1,9 @@
 """Ensure that a replica's action server gets each goal once, however often it is sent.
 
-To be asked twice for one goal harms some action servers: rclcpp's ends its process. So copies of a
-goal wait for the answer to the first, and who comes after it was accepted gets the same answer.
+Receiving a goal twice harms some action servers: rclcpp's ends its process. So copies of a goal
+wait for the answer to the first, and copies of an accepted goal get the same answer.
 
-Owns: `send_goal` requests, from the wire to the answer, and which goals the present action server
+Owns: `send_goal` requests, from the link to the answer, and which goals the current action server
 has. Not here: the action's other services (`responder`).
 """
 
@@ -28,10 +28,10 @@ log = logging.getLogger(__name__)
 
 _QUEUE_LIMIT = 512
 _COPIES_LIMIT = 64
-_BYTES_LIMIT = 64 << 20  # of all goals that have no answer
-# An action server that has not answered for so long is given others beside it.
+_BYTES_LIMIT = 64 << 20  # total size of unanswered goals
+# A goal not answered for this long no longer counts against the limit of outstanding goals.
 _PATIENCE_S = 60.0
-# The parts of an action server that dies are seen to be gone one after the other.
+# When an action server dies, its services disappear one after the other, within this time.
 _ONE_DEATH_S = 1.0
 
 
@@ -41,22 +41,22 @@ class _Open:
     def __init__(self, goal: bytes, robot: str, payload: bytes) -> None:
         self.goal, self.robot, self.payload = goal, robot, payload
         self.size = len(payload)
-        self.begun_at: float | None = None  # when the action server was given it
-        self.unheard = False  # we would not hear its answer
+        self.begun_at: float | None = None  # when it was passed to the action server
+        self.unheard = False  # its answer can no longer reach us
         self.ticket: int | None = None
         self.waiting: list[tuple[float, Incoming]] = []  # copies, each with its deadline
 
     def holds(self, now: float) -> bool:
-        """Whether it counts among those that the action server has to look at."""
+        """Whether it counts against the limit of outstanding goals."""
         begun_at = self.begun_at
         return begun_at is not None and not self.unheard and now - begun_at <= _PATIENCE_S
 
 
 class _ActionServer:
-    """What is known of one `send_goal` service, in its present life."""
+    """What is known about one `send_goal` service since its last start."""
 
     def __init__(self) -> None:
-        self.death = "", -math.inf  # what part was seen to be gone, and when
+        self.death = "", -math.inf  # the service whose loss was noted last, and when
         self.open: dict[bytes, _Open] = {}  # oldest first
         self.served: dict[str, float] = {}  # when each robot's latest goal was passed on
         self.accepted: OrderedDict[bytes, bytes] = OrderedDict()
@@ -66,7 +66,7 @@ class _ActionServer:
         return [known for known in self.open.values() if known.begun_at is None]
 
     def next(self) -> _Open | None:
-        """Return the oldest of the robot that was served least recently."""
+        """Return the oldest queued goal of the robot that was served least recently."""
         return min(
             self.queue, key=lambda known: self.served.get(known.robot, -math.inf), default=None
         )
@@ -79,8 +79,8 @@ class _ActionServer:
 class GoalsOnce:
     """Forwards new goals; remembers the last `accepted_kept` of each action."""
 
-    outstanding = OUTSTANDING  # goals that an action server is given at once
-    accepted_kept = 16_384  # of each action, 200 bytes each; the oldest go first
+    outstanding = OUTSTANDING  # limit on unanswered goals at an action server
+    accepted_kept = 16_384  # per action, 200 bytes each; the oldest are forgotten first
 
     services: Collection[str]
     is_ready: Callable[[str], bool]
@@ -107,7 +107,7 @@ class GoalsOnce:
         """Set the clients of the local services."""
         self._clients = clients
 
-    # -- from the wire --------------------------------------------------------------------
+    # -- from the link --------------------------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
         """Take a goal from the link. Never blocks."""
@@ -150,7 +150,7 @@ class GoalsOnce:
     # -- to the action server -------------------------------------------------------------
 
     def _pass_on(self, service: str) -> None:
-        """Give an action server as much of what waits as it may have."""
+        """Pass queued goals to an action server, up to its limit."""
         server = self._servers[service]
         while True:
             with self._lock:
@@ -159,7 +159,7 @@ class GoalsOnce:
                     return
                 known.begun_at = server.served[known.robot] = now
                 payload, known.payload = known.payload, b""
-                client = self._clients.get(service)  # of this life: after a crash it is sent anew
+                client = self._clients.get(service)  # the current one; a crash replaces it
             if client is None:
                 self._drop(service, known, Refusal.NOT_READY)
                 continue
@@ -172,7 +172,7 @@ class GoalsOnce:
                 self._drop(service, known, reason)
 
     def _drop(self, service: str, known: _Open, reason: Refusal) -> None:
-        """Forget a goal that the action server was not given after all."""
+        """Refuse a goal that could not be passed to the action server."""
         with self._lock:
             if self._servers[service].open.get(known.goal) is known:
                 del self._servers[service].open[known.goal]
@@ -197,10 +197,10 @@ class GoalsOnce:
             self._pass_on(service)
 
     def _overtaken(self, server: _ActionServer, by: _Open) -> list[_Open]:
-        """Take out what an action server will not answer any more. Under the lock.
+        """Remove goals that an action server will never answer. Call under the lock.
 
-        One that was silent for long was given more than its queue holds, which then loses the
-        oldest. It answers in order: what it was given before that, it has lost.
+        After a long silence it may have got more goals than its queue holds, which drops the
+        oldest. It answers in order, so it has lost unanswered goals older than `by`.
         """
         now, by_at = self.clock(), by.begun_at or 0.0
         lost = [
@@ -223,7 +223,7 @@ class GoalsOnce:
                     late += [one for deadline, one in known.waiting if deadline <= now]
                     known.waiting = [entry for entry in known.waiting if entry[0] > now]
                     if known.begun_at is None and not known.waiting:
-                        del server.open[goal]  # never begun: nobody wants it any more
+                        del server.open[goal]  # never begun, and no caller waits for it
         for incoming in late:
             incoming.refuse(Refusal.EXPIRED)
         for service in self._servers:
@@ -244,7 +244,7 @@ class GoalsOnce:
                 self._refuse(name, ended.values(), Refusal.CRASHED)
 
     def left_ros(self) -> None:
-        """Note that our own node was lost: pending answers never come, and are not asked again."""
+        """Note that our own node is gone: queued goals are refused, others get no answer."""
         for name, server in self._servers.items():
             with self._lock:
                 unbegun = [server.open.pop(known.goal) for known in server.queue]

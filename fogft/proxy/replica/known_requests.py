@@ -1,6 +1,6 @@
 """Requests known to a replica or gateway: each id once, its answer kept for a while. Pure.
 
-A robot that lost its link sends what was in flight again, under the same id. So an id is known
+A robot that lost its link resends the requests in flight, under the same ids. So an id is kept
 until its deadline, and its answer is kept for copies as long as there is room. Called under the
 owner's lock.
 """
@@ -11,24 +11,24 @@ from collections import OrderedDict
 from fogft.byte_limit import SMALL_BYTES, SharedByteLimit
 from fogft.proxy.replica.service_queue import Job
 
-COPIES_LIMIT = 8  # of one request that wait for its answer: links that were opened anew
-_DEADLINES_KEPT = 1024  # of jobs that were forgotten
+COPIES_LIMIT = 8  # copies of one request waiting for its answer, one per reopened link
+_DEADLINES_KEPT = 1024  # deadlines of forgotten jobs that are not worth cleaning up
 
 
 class KnownRequests:
     """The open jobs, and at most `kept_ids` recently answered ones.
 
     Args:
-        kept_bytes: Answers kept for copies, in bytes together; the oldest go first.
-        kept_ids: Ids known at once; beyond it the oldest finished ones are forgotten.
-        held_bytes: Of the requests of open jobs.
+        kept_bytes: Total size of answers kept for copies; the oldest are dropped first.
+        kept_ids: Limit on known ids; beyond it, the oldest finished ones are forgotten.
+        held_bytes: Limit on the total size of large requests of open jobs.
     """
 
     def __init__(self, kept_bytes: int, kept_ids: int, held_bytes: int) -> None:
         self._kept_bytes_limit = kept_bytes
         self._kept_ids = kept_ids
         self._jobs: OrderedDict[bytes, Job] = OrderedDict()
-        self.get = self._jobs.get  # a job that is known, by its id
+        self.get = self._jobs.get  # return a known job by its id
         self._deadlines: list[tuple[float, bytes]] = []  # a heap
         self._kept: OrderedDict[bytes, Job] = OrderedDict()
         self._kept_bytes = 0
@@ -36,7 +36,7 @@ class KnownRequests:
         self.large = SharedByteLimit(held_bytes)
 
     def __len__(self) -> int:
-        """Return how much is remembered: requests, answered ones included, and deadlines."""
+        """Return the number of entries: requests, including answered ones, and deadlines."""
         return len(self._jobs) + len(self._deadlines)
 
     def unanswered(self, service: str | None) -> list[Job]:
@@ -56,7 +56,7 @@ class KnownRequests:
         self._jobs[job.id] = job
         heapq.heappush(self._deadlines, (job.deadline, job.id))
         if len(self._deadlines) > 2 * len(self._jobs) + _DEADLINES_KEPT:
-            # Without those of jobs that were forgotten, or run anew.
+            # Drop the deadlines of jobs that were forgotten or run again.
             live = ((due, self._jobs.get(due[1])) for due in self._deadlines)
             self._deadlines = [due for due, job in live if job and job.deadline == due[0]]
             heapq.heapify(self._deadlines)

@@ -1,7 +1,7 @@
 """The services that a replica offers: those in its configuration, or those of `run`.
 
-Where the configuration lists none, every service that an application offers in the replica's ROS
-graph is taken up, under the name that ROS gives it.
+If the configuration lists none, every service that an application offers in the replica's ROS
+graph is offered, under its ROS name.
 Not here: which of them the robot proxies (`fogft.pool.folder.discovered`).
 """
 
@@ -14,13 +14,13 @@ from fogft.model.type_definition import Definition
 from fogft.ros.port import RosNode
 
 LOOK_EVERY_S = 0.25
-SETTLED_S = 1.0  # unchanged for so long: what starts is not told piece by piece
-_TOLD = 8  # names in a sentence
+SETTLED_S = 1.0  # unchanged for this long: services that are starting are reported together
+_TOLD = 8  # limit on names in a message
 
 
 @dataclass(eq=False)
 class Offering:
-    """The services of one replica: those of the configuration, or what is found out."""
+    """The services of one replica: those in the configuration, or those discovered."""
 
     services: tuple[ServiceSpec, ...]
     define: Callable[[str], Definition]
@@ -34,7 +34,7 @@ class Offering:
         self._seen_since = self._looked_at = float("-inf")
 
     def look(self, node: RosNode, *, complete: bool) -> tuple[ServiceSpec, ...]:
-        """Return services that are new in the graph. `complete`: all listed ones answer."""
+        """Return newly discovered services. `complete`: all known services are ready."""
         now = self.clock()
         if complete and not self._finds_out:
             self._seen = {}
@@ -59,9 +59,9 @@ class Offering:
         self._seen, self._seen_since = {}, self.clock()
 
     def told(self, ready: frozenset[str]) -> dict[str, str]:
-        """Return name -> type of the services to tell, once stable; else nothing.
+        """Return name -> type of the services to report to robots, once stable; else nothing.
 
-        All that were discovered, or those listed that `run` offers as another type.
+        That is all discovered ones, or the listed ones that `run` offers as another type.
         """
         if self.clock() < self._seen_since + SETTLED_S:
             return {}
@@ -73,7 +73,7 @@ class Offering:
         return {one.name: found for one, found in offered if found != one.type}
 
     def types(self) -> dict[str, Definition]:
-        """Return the definitions of all types here; nothing until each is known."""
+        """Return the definitions of all service types here; empty until each is known."""
         for service in self.services:
             found = self._definitions.get(service.type)
             if found is None or not found.known:
@@ -82,7 +82,7 @@ class Offering:
         return told if all(definition.known for definition in told.values()) else {}
 
     def missing(self, ready: frozenset[str]) -> str:
-        """Return in words the missing services and what `run` offers instead; empty if complete."""
+        """Say which services are missing and what `run` offers instead; empty if complete."""
         if self._finds_out and not self.services:
             return "`run` offers no service yet"
         missing = sorted({service.name for service in self.services} - ready)
@@ -101,7 +101,7 @@ class Offering:
 
 
 def _that_fit(offered: Mapping[str, str]) -> dict[str, str]:
-    """Return as many services, by name, as a probe's answer has room for."""
+    """Return as many services, in order of name, as fit into a probe's answer."""
     room, found = NAMES_BYTES_LIMIT, dict[str, str]()
     for name, kind in sorted(offered.items()):
         room -= len(name) + len(kind)

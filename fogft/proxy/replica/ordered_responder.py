@@ -1,7 +1,7 @@
 """The replica's side of one stateful service: carries out what `OrderedReplica` decides.
 
-Orders come from the wire's threads, responses from the ROS thread. The lock is held while a
-decision is made, never while something is sent.
+Orders come from the link's threads, responses from the ROS thread. The lock is held while a
+decision is made, never while sending.
 """
 
 import logging
@@ -36,7 +36,7 @@ class Clients(NamedTuple):
 
 @dataclass(eq=False)
 class OrderedResponder:
-    """Applies the requests of one stateful service, in their order."""
+    """Applies the requests of one stateful service in order."""
 
     name: str
     state: StateBytes
@@ -48,7 +48,7 @@ class OrderedResponder:
         self._clients: Clients | None = None
         self._begun: Begin | None = None
         self._begun_at = self._longest_s = self._given_s = 0.0
-        self._again: Begin | None = None  # ROS did not take it: it is tried again
+        self._again: Begin | None = None  # to retry, since ROS did not take it
         self.detail = ""
 
     @property
@@ -58,7 +58,7 @@ class OrderedResponder:
 
     @property
     def complete(self) -> bool:
-        """Whether the services for its state are there too."""
+        """Whether the service and those for its state are all available."""
         return all(client.available() for client in self._clients or ())
 
     @property
@@ -67,13 +67,13 @@ class OrderedResponder:
         return self._machine.in_flight
 
     def quiet_s(self, *, stuck: bool = False) -> float:
-        """Return for how long its service has worked on one request, if it hangs; else 0.
+        """Return for how many seconds its service has worked on one request, if it hangs; else 0.
 
-        `stuck`: only if it is to be started anew for it. As of plain services: `ServiceQueue`.
+        `stuck`: only if it must be restarted. For plain services: `ServiceQueue`.
         """
         begun, longest_s = self._begun, self._longest_s
         if begun is None or begun.op is not Op.APPLY or not longest_s:
-            return 0.0  # one that never answered may still be loading
+            return 0.0  # a service that has never answered may still be loading
         most_s = max(most_quiet_s(longest_s, stuck=stuck), self._given_s if stuck else 0.0)
         quiet_s = self.clock() - self._begun_at
         return quiet_s if quiet_s > most_s else 0.0
@@ -99,7 +99,7 @@ class OrderedResponder:
                 )
             except OrderError:
                 effects = [Refuse(incoming, Refusal.MALFORMED)]
-        incoming.payload = b""  # whoever repeats an order waits without it
+        incoming.payload = b""  # a repeated order waits without its payload
         self._perform(effects)
 
     def _perform(self, effects: list[Any]) -> None:
@@ -114,7 +114,7 @@ class OrderedResponder:
     def _begin(self, begin: Begin) -> None:
         with self._lock:
             if not self._machine.works_on(begin.serial):
-                return  # its service has died since, and another one is not to be given it
+                return  # its service has died since, and a new one must not get it
             self._begun, self._begun_at = begin, self.clock()
             clients = self._clients
         try:
@@ -171,17 +171,17 @@ class OrderedResponder:
         self._perform(effects)
 
     def crashed(self) -> None:
-        """Note that the service has died, with its state."""
+        """Note that the service has died and lost its state."""
         with self._lock:
             self._again = self._begun = None
-            self._longest_s = self._given_s = 0.0  # of a new process nothing is known
+            self._longest_s = self._given_s = 0.0  # nothing is known about a new process
             effects = self._machine.lost()
         self._perform(effects)
 
     def tick(self, alive: bool) -> None:
         """Look for the services, and retry calls that ROS rejected. Call at about 10 Hz."""
         clients = self._clients
-        known = [client.is_known() for client in clients or ()]  # all are asked at once
+        known = [client.is_known() for client in clients or ()]  # a list, to probe all at once
         there = clients is not None and all(known) and all(c.available() for c in clients)
         with self._lock:
             self._machine.serving = alive and there

@@ -1,7 +1,7 @@
 """``fogft serve --config FILE``: the server proxy process, one per replica.
 
-It ends with status 0 when it was told to or when its lease is over; whoever started it (a VM's
-job, the local cloud's machine) then ends the machine.
+It exits with status 0 when told to or when its lease expires. Then its parent (a VM's job, the
+local cloud's machine) shuts down the machine.
 """
 
 import logging
@@ -39,7 +39,7 @@ from fogft.ros.reservations import Reservation, own_domain, reserve_domain
 log = logging.getLogger(__name__)
 
 _TICK_S = 0.05
-_IDLE_TICK_S = 0.25  # while all is ready, and no order, goal or topic waits
+_IDLE_TICK_S = 0.25  # while all is ready, without topics, actions or stateful services
 _LEAVE_S = 4.0
 """From a SIGTERM to the end: robots probe each second, and some clouds kill after five."""
 
@@ -51,10 +51,10 @@ def run(
     notice_file: Path | None = None,
     **override: Any,
 ) -> None:
-    """Run until a signal ends it, or until the manager's lease is over.
+    """Run until a signal stops it, or until the manager's lease expires.
 
-    Each option replaces a key of the file, if it is not None; `notice_file` appears when the
-    machine is about to be preempted.
+    Each option that is not None overrides a key of the file. The file `notice_file` appears when
+    the machine is about to be preempted.
 
     Raises FogftError: The configuration, the credentials or ROS cannot be used.
     """
@@ -101,7 +101,7 @@ def run(
         if proxy.lease_is_over:
             log.error("lease_over replica=%s reason='no manager was heard of'", config.id)
         if machine_ends.is_set() and watching is not None and watching.silent:
-            # No other notice exists on RunPod, Vast and others: this is theirs, and it is short.
+            # On RunPod, Vast and others, SIGTERM is the only preemption notice, and a short one.
             proxy.noticed(Notice(NoticeKind.PREEMPTION, None, "signal", "SIGTERM"))
             log.warning("notice_received kind=preemption source=signal ends_in_s=%.0f", _LEAVE_S)
             stop.clear()
@@ -117,7 +117,7 @@ def run(
 
 
 def _second_domain(config: ServerProxyConfig) -> Reservation | None:
-    """Reserve a ROS domain for the spare process; it is ours while this is kept."""
+    """Reserve a ROS domain for the spare process, for as long as the reservation is kept."""
     own = config.domain_id
     reserved = reserve_domain({own_domain(run_environment(config)) if own is None else own})
     if reserved is None:
@@ -134,7 +134,7 @@ def _make(
     from fogft.link.zenoh.replica.listener import ZenohListener
 
     environ = run_environment(config)
-    joined: list[middleware.Joined] = []  # the newest last: the node is made anew after a crash
+    joined: list[middleware.Joined] = []  # the current node: it is recreated after a crash
 
     def define(type_name: str) -> Definition:
         return joined[0].define(type_name)
@@ -170,7 +170,7 @@ def _make(
 def run_environment(config: ServerProxyConfig) -> dict[str, str]:
     """Return the environment of the user's command.
 
-    In a virtual environment its own `python3` comes first, as if it were activated, so that
+    If the proxy runs in a virtual environment, that comes first in PATH, as if activated, so
     ``run: python3 node.py`` finds the same ROS as the proxy.
     """
     environ = environment.child_environment(os.environ)
@@ -192,7 +192,7 @@ def _loop(
 ) -> None:
     memory = memory_tuning.Trimmer()
     while time.monotonic() < until and not stop.is_set():
-        # A death is told before robots hedge what has caused it at the next replica.
+        # Report a crash before robots hedge the request that caused it at another replica.
         died.wait(_IDLE_TICK_S if proxy.idle else _TICK_S)
         proxy.run_once()
         memory.look()

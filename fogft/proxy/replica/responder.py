@@ -1,11 +1,11 @@
 """The replica's side of its services: run each request once, answer every copy of it.
 
-A cancel service says "stop what you are doing" and names no request, because a ROS service does not
-know our ids. So a service that has one is given one request at a time, and nothing more until the
-cancel service has answered: else what stops might be the next request.
+A cancel service means "stop the running request" and names none, because a ROS service does not
+know our ids. So a service with a cancel service gets one request at a time, and no more until the
+cancel service has answered: otherwise it might stop the next request.
 
-Owns: what becomes of the requests that this replica holds. Not here: which ids are known
-(`known_requests`), in what order they run and how many (`service_queue`).
+Owns: the outcome of each request that this replica holds. Not here: known ids (`known_requests`),
+the order and number of running requests (`service_queue`).
 """
 
 import logging
@@ -30,10 +30,10 @@ log = logging.getLogger(__name__)
 # tests/proxy/test_processes.py, which sends a burst to an ordinary service.
 OUTSTANDING = 10
 
-_TOGETHER_S = 0.005  # answers that follow each other so closely leave in one message
+_TOGETHER_S = 0.005  # answers that follow each other this closely are sent in one message
 
 CANCEL_TYPE = "std_srvs/srv/Trigger"
-# A serialised message without fields: the header, the byte that stands for no fields, padding.
+# A serialised message without fields: the header, a dummy byte for the empty struct, padding.
 # Kept true by tests/ros/test_types.py.
 EMPTY_REQUEST = bytes((0, 1, 0, 0, 0, 0, 0, 0))
 
@@ -42,16 +42,16 @@ class Responder:
     """Passes requests to the local services, and answers each copy.
 
     Args:
-        limits: How many may be at work, by service; 0 where it is to be learned.
-        latest: Services of which the newest request goes first.
-        results: Services that answer when a goal ends. That it is unknown holds for the moment
-            only: a copy is run anew.
-        answered: Told of each request that the service has answered, and when.
+        limits: Concurrency limits by service; 0 to learn it.
+        latest: Services whose newest request goes first.
+        results: Services that answer when a goal ends. An answer that the goal is unknown is not
+            kept: a copy is run again.
+        answered: Called with each request that the service has answered, and when.
     """
 
-    held_limit = 512  # requests held at once; more are refused, from whom has most waiting
-    held_bytes = 64 << 20  # of the large ones together; more are refused as overloaded
-    outstanding = OUTSTANDING  # passed on to one service at once, where no limit is given
+    held_limit = 512  # requests held per service; beyond it, the robot with most waiting loses one
+    held_bytes = 64 << 20  # total size of large requests; more are refused as overloaded
+    outstanding = OUTSTANDING  # requests passed on to one service at once, if no limit is given
     kept_bytes, kept_ids = 16 << 20, 32768  # as for `KnownRequests`
 
     def __init__(
@@ -74,14 +74,14 @@ class Responder:
         self._cancel_clients: Mapping[str, RosClient] = {}
         self.known = KnownRequests(self.kept_bytes, self.kept_ids, self.held_bytes)
         self._queues: dict[str, ServiceQueue] = {}
-        # Requests passed on, and the time they took together; dropped unbegun, or told to stop:
-        # nobody wanted them; run for nobody: too late, or unwanted.
+        # Requests passed on, and their total time; unwanted ones dropped before they began, or
+        # told to stop; run in vain, as they were late or unwanted, and their total time.
         counts = ("ran", "ran_s", "saved", "interrupted", "wasted", "wasted_s")
         self.work: dict[str, float] = dict.fromkeys(counts, 0)
 
     @property
     def at_work(self) -> int:
-        """The number of requests in the services."""
+        """The number of requests running in the services."""
         return sum(queue.at_work for queue in list(self._queues.values()))
 
     @property
@@ -95,9 +95,9 @@ class Responder:
         return {"held": self.known.held, **work}
 
     def hanging(self, *, stuck: bool = False) -> dict[str, float]:
-        """Return for how many seconds services have finished nothing, where that is unusual.
+        """Return, for each hanging service, for how many seconds it has finished nothing.
 
-        `stuck`: only those that are to be started anew for it.
+        `stuck`: only those that must be restarted.
         """
         now = self._clock()
         with self._lock:
@@ -109,7 +109,7 @@ class Responder:
 
     @property
     def limits(self) -> dict[str, int]:
-        """How many requests each service may have concurrently."""
+        """The concurrency limit of each service."""
         return {name: self._queues[name].limit.limit for name in list(self._queues)}
 
     def use(
@@ -121,7 +121,7 @@ class Responder:
         self._clients = clients
         self._cancel_clients = cancel_clients or {}
 
-    # -- from the wire --------------------------------------------------------------------
+    # -- from the link --------------------------------------------------------------------
 
     def request(self, incoming: Incoming) -> None:
         """Take a request from the link. Never blocks."""
@@ -132,7 +132,7 @@ class Responder:
             if known is not None:
                 if known.waiting is not None and not known.unwanted:
                     known.waiting.append(incoming)
-                    del known.waiting[:-COPIES_LIMIT]  # refused as lost: its link is long gone
+                    del known.waiting[:-COPIES_LIMIT]  # refused as lost: their links are long gone
                     return
                 answer = known.answer
                 reason: Refusal | None = Refusal.CANCELLED if known.unwanted else Refusal.FORGOTTEN
@@ -173,7 +173,7 @@ class Responder:
     def _reason_to_refuse(
         self, incoming: Incoming, now: float
     ) -> tuple[Refusal | None, Job | None]:
-        """Return why a request is not taken, None if it is, and what gives way to it."""
+        """Return why a request is refused (None if it is not), and the job it displaces."""
         service, remaining_s = incoming.service, incoming.remaining_s
         if remaining_s <= 0:
             return Refusal.EXPIRED, None
@@ -220,7 +220,7 @@ class Responder:
                     )
 
     def _await(self, service: str, client: RosClient, request: bytes, held: float) -> bool:
-        """End a hold once this is answered; return whether it was sent."""
+        """Call a service, and end a hold once it answers; return whether the call was sent."""
         try:
             client.call(request, lambda _: self._release(service, held))
         except RosError as error:
@@ -231,7 +231,7 @@ class Responder:
 
     def _release(self, service: str, held: float) -> None:
         with self._lock:
-            self._queues[service].release(held)  # and no later one: it may answer late
+            self._queues[service].release(held)  # only this hold: the answer may come late
         self._pass_on(service)
 
     # -- to the service -------------------------------------------------------------------
@@ -249,7 +249,7 @@ class Responder:
                 self._end(job.id, Refusal.EXPIRED)
 
     def _call(self, job: Job) -> bool:
-        """Give the service a request; return whether it was taken. If not, it has ended."""
+        """Pass a request to the service; return whether ROS took it. If not, it has ended."""
         try:
             payload, job.payload = job.payload, b""
             client = self._clients[job.service]
@@ -276,7 +276,7 @@ class Responder:
         with self._lock:
             waiting, job.waiting = job.waiting or [], None
             if waiting:
-                # A replica that comes later is asked for a result as soon as it is given the goal.
+                # A new replica is asked for a result as soon as it is given the goal.
                 passing = job.service in self._results and goals.is_unknown(payload)
                 self.known.end(job, None if passing or job.unwanted else payload)
                 if passing:
@@ -285,12 +285,12 @@ class Responder:
             load = queue.load(now - job.arrived, ended=1)
         try:
             for incoming in waiting:
-                if job.unwanted:  # its bytes would be dropped at the other end
+                if job.unwanted:  # the robot would drop the answer
                     incoming.refuse(Refusal.LATE, load=load)
                 else:
                     incoming.reply(payload, load=load, more=more)
         finally:
-            with self._lock:  # after the replies: these cannot wait
+            with self._lock:  # after the replies, which are urgent
                 queue.finished(job, now)
                 self.work["ran_s"] += now - job.begun
                 if not waiting or job.unwanted:
@@ -302,13 +302,13 @@ class Responder:
                 self._answered(job, now)
 
     def _end(self, id: bytes, reason: Refusal) -> None:
-        """End a job without an answer: a copy that comes later may be run anew."""
+        """End a job without an answer: a later copy may be run again."""
         with self._lock:
             job = self.known.get(id)
             if job is None or job.waiting is None:
                 return
             self.known.end(job)
-            if reason is not Refusal.EXPIRED or not job.passed_on:  # else it is still at work
+            if reason is not Refusal.EXPIRED or not job.passed_on:  # else it is still running
                 self.known.forget(job)
             waiting, job.waiting = job.waiting, None
             queue = self._queues[job.service]
@@ -328,7 +328,7 @@ class Responder:
         with self._lock:
             dead = self.known.unanswered(service)
             blamed = [job for job in dead if job.passed_on]
-            spared = [job for job in dead if not job.passed_on]  # it was not ready for these
+            spared = [job for job in dead if not job.passed_on]  # it did not have these yet
             lost = []
             for name, queue in self._queues.items():
                 if service in (None, name):
@@ -336,13 +336,13 @@ class Responder:
                     queue.died()
         for job in (*blamed, *lost):
             self._forget_ticket(job)
-        for job in spared:  # first: room that the blamed leave is not for them
+        for job in spared:  # first, so that they do not get the slots of the blamed
             self._end(job.id, Refusal.NOT_READY)
         for job in blamed:
             self._end(job.id, Refusal.CRASHED)
 
     def tick(self) -> None:
-        """Drop requests past their deadline. Call at about 10 Hz."""
+        """Refuse requests past their deadline. Call at about 10 Hz."""
         now = self._clock()
         with self._lock:
             late = self.known.expired(now)

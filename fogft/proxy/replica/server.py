@@ -1,9 +1,9 @@
 """The server proxy: passes requests from the link to the replica's local services.
 
-When the command dies, it leaves ROS and joins it anew: discovery would go on listing the dead
-service. When a service goes and the command lives, what was passed on to it is refused.
+When the command dies, the proxy leaves ROS and rejoins: discovery would still list the dead
+service. When a service disappears but the command lives, the requests it had are refused.
 
-Owns: the replica's state as probes tell it. Design: docs/design/server-proxy.md.
+Owns: the replica's state as reported to probes. Design: docs/design/server-proxy.md.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 _STRANGERS = ("handshakes_refused", "unauthenticated", "kept_out")
-_LOOK_EVERY_S = 0.15  # at services, while all are ready
+_LOOK_EVERY_S = 0.15  # interval of checking services while all are ready
 
 
 class ServerProxy:
     """The server proxy of one replica.
 
     Args:
-        services: What it answers; none for whatever the command offers.
+        services: The services to offer; if empty, whatever the command offers.
         make_node: Joins ROS; called again after each death of the command.
-        spare: A second process of the command, to take over when the first dies.
-        define: Returns the definition of a service type here, for the robot to compare.
-        topics: What passes besides services; needs nodes that publish and subscribe.
+        spare: A second process of the command, which takes over when the first dies.
+        define: Returns the local definition of a service type, for the robot to compare.
+        topics: The topics to forward; these need nodes that publish and subscribe.
         answered: As for `Responder`.
     """
 
@@ -78,11 +78,11 @@ class ServerProxy:
         self._id = id
         self._keys = partial(names.service_keys, id.pool_uid, id.slot)
         self._offering = Offering(services, define, clock)
-        self._not_usable: dict[str, str] = {}  # service -> why it cannot be called; maybe empty
+        self._not_usable: dict[str, str] = {}  # service -> why it cannot be called; "" if it can
         self._listener, self._make_node = listener, make_node
         self.endpoint = listener.endpoint  # ``host:port`` at which it listens
-        self.revoke = listener.revoke  # the access of these certificate holders
-        self.command, self._spare = command, spare  # the process at work, and the one that waits
+        self.revoke = listener.revoke  # deny access to these certificates
+        self.command, self._spare = command, spare  # the active process, and the spare one
         self._clock, self._look_at = clock, 0.0
         self._pauses = Pauses()
         self._lease = HeldLease(clock)
@@ -97,10 +97,10 @@ class ServerProxy:
             if service.state is not None:
                 state = StateBytes(service.state)
                 self._ordered[service.name] = OrderedResponder(service.name, state, clock)
-        self.draining = self._at_risk = False  # as the machine was told by its cloud
+        self.draining = self._at_risk = False  # set by notices from the cloud
         self.responder = Responder(
             lambda name: name in self.ready,
-            # A cancel service names no request, so it must be clear which one is meant.
+            # A cancel service names no request, so only one may be running.
             limits={s.name: 1 if s.cancel else s.concurrency for s in services},
             latest=[s.name for s in services if s.freshness is Freshness.LATEST],
             results=[s.name for s in services if s.part is Part.RESULT],
@@ -118,7 +118,7 @@ class ServerProxy:
         types = {service.name: service.type for service in self._offering.services}
         keys = self._keys(types | self._topics.types)
         self._join_ros()
-        # Where no service is stateful there is nothing to choose, and nothing to pay.
+        # With only plain services, requests go straight to the responder: no dispatch cost.
         chosen = self._ordered or self._topics or self._goals
         request = self._request if chosen else self.responder.request
         self._listener.serve(keys, request, self._probe, self.responder.cancel)
@@ -152,10 +152,10 @@ class ServerProxy:
             ordered.tick(self.command.alive)
 
     def _poll(self) -> bool:
-        """See whether the command died; start it again, or have the spare process take over."""
+        """Return whether the command died; restart it, or have the spare process take over."""
         died = self.command.poll(at_work=self.responder.at_work > 0)
         spare = self._spare
-        # Not before this replica is ready: two that start at once both take twice as long.
+        # Start it only once this replica is ready: starting two at once takes both twice as long.
         if spare is not None and (spare.alive or self.complete):
             spare.poll()
         if died and spare is not None and spare.alive:
@@ -190,38 +190,38 @@ class ServerProxy:
             log.info("services_ready replica=%s ready=%s", self._id, sorted(ready))
             self.ready = ready
         before, self._servers = self._servers, {n: c.servers() for n, c in self._clients.items()}
-        # One more server than before has replaced one that died: that stays listed for long.
+        # One more server than before means that one died and was replaced: it stays listed long.
         replaced = {n for n, count in self._servers.items() if 0 < before.get(n, 0) < count}
         for name in gone | replaced:
             log.warning("service_lost replica=%s service=%s", self._id, name)
             if name in self._ordered and self.command.alive:
-                self.command.restart()  # what state it is in, nobody knows
+                self.command.restart()  # its state is unknown
             else:
                 self._goals.crashed(name)
                 self.responder.crashed(name)
 
     def _can_call(self, name: str, client: RosClient) -> bool:
-        known = client.is_known()  # asked of each server, so before they are there
+        known = client.is_known()  # always call it: it probes the servers, which takes time
         if not client.available():
             return False
         self._note(name, client.mismatch())
         return known and not self._not_usable.get(name)
 
     def _note(self, name: str, trouble: str) -> None:
-        """Keep, and log once, why a service cannot be called here; empty for nothing."""
+        """Record, and log once, why a service cannot be called here; empty if it can."""
         if trouble not in ("", self._not_usable.get(name)):
             log.error("service_not_usable replica=%s service=%s reason=%r", self._id, name, trouble)
         self._not_usable[name] = trouble
 
     def _end_stuck(self) -> None:
-        """Start the command anew where a service of it answers nothing any more."""
+        """Restart the command if one of its services is stuck."""
         for name, seconds in self._hanging(stuck=True).items():
             log.error("service_stuck replica=%s service=%s quiet_s=%.0f", self._id, name, seconds)
             self.command.restart()
             return
 
     def _hanging(self, *, stuck: bool = False) -> dict[str, float]:
-        """Return the services that hang. Parts of actions take what their goals take."""
+        """Return the hanging services; not parts of actions, which take as long as their goals."""
         hanging = self.responder.hanging(stuck=stuck)
         quiet = {name: one.quiet_s(stuck=stuck) for name, one in self._ordered.items()}
         hanging |= {name: seconds for name, seconds in quiet.items() if seconds}
@@ -237,29 +237,29 @@ class ServerProxy:
 
     @property
     def idle(self) -> bool:
-        """Whether all services can answer, and none of them needs frequent looks."""
+        """Whether all services can answer, and nothing needs frequent checks."""
         return self.complete and not (self._topics or self._goals or self._ordered)
 
     def renew(self, records: Iterable[Record]) -> None:
-        """Take signed manager leases; only a newer one has an effect."""
+        """Take the manager's signed leases; only a newer one has an effect."""
         for record in records:
             self._lease.renew(record)
 
     @property
     def lease_is_over(self) -> bool:
-        """Whether the lease has expired, because no manager was heard of."""
+        """Whether the lease has expired, because no manager renewed it."""
         left_s = self._lease.left_s
         return left_s is not None and left_s <= 0
 
     def noticed(self, notice: Notice) -> None:
-        """Take a preemption notice of this machine. Any thread; never withdrawn."""
+        """Take a preemption or rebalance notice for this machine. Any thread; never withdrawn."""
         if notice.kind is NoticeKind.PREEMPTION:
             self.draining = True
         else:
             self._at_risk = True
 
     def report(self) -> dict[str, Any]:
-        """Return the counters of requests, for metrics."""
+        """Return counters and state, for metrics."""
         answering = self._answering()
         return {
             "work": self._work(),
@@ -293,7 +293,7 @@ class ServerProxy:
                 self._ordered[service.name].use(clients)
 
     def _make_client(self, node: RosNode, service: ServiceSpec) -> None:
-        """Make a service's client. Without its type the replica goes on, and says why."""
+        """Create a service's client. Without its type the replica goes on, and reports why."""
         try:
             self._clients[service.name] = node.client(service.name, service.type)
         except RosError as error:
@@ -322,7 +322,7 @@ class ServerProxy:
             (self._ordered.get(name) or self.responder).request(incoming)
 
     def _answering(self) -> frozenset[str]:
-        """Return the services that can answer: found, and in the present state."""
+        """Return the services that can answer: found and, if stateful, with the current state."""
         if not self._ordered:
             return self.ready
         return self.ready - {name for name, one in self._ordered.items() if not one.ready}

@@ -1,7 +1,7 @@
-"""The jobs of one service at a replica: waiting ones, running ones, and the limit of those.
+"""The jobs of one service at a replica: waiting ones, running ones, and the concurrency limit.
 
-In what order requests run is decided here and nowhere else (`take`). Called under the
-responder's lock. Not here: the order itself (`requests.fair_queue`).
+Only this module decides which request runs next, and when (`take`). Called under the
+responder's lock. Not here: the queue's order (`requests.fair_queue`).
 """
 
 from collections import deque
@@ -12,30 +12,30 @@ from fogft.requests.concurrency import ConcurrencyLimit
 from fogft.requests.fair_queue import FairQueue
 from fogft.requests.load import NEARLY, NEVER, Handling, Load
 
-# Job whose deadline has passed is still in the service's hands and takes its room. After so
-# long its response is taken for lost.
+# A running job past its deadline is still in the service and keeps its slot. After this long its
+# response counts as lost.
 _ABANDONED_AFTER_S = 60.0
-# A service with work that has ended none for so long, and for so many times the longest that it
-# lately took, hangs. One that has never ended any may still be loading what it needs.
+# A service hangs if it has work but has finished none for this long, and for this many times its
+# recent longest. One that has never finished any may still be loading.
 _HANGS_AFTER_S = 1.0
 _HANGS_AFTER_TIMES = 5.0
-# After so much it is started anew, if all that it has is past its deadline. One alone may be lost.
+# After this long it is restarted, if all its work is past the deadline; one alone may be lost.
 _STUCK_AFTER_S = 60.0
 _STUCK_AFTER_TIMES = 20.0
 _STUCK_ON = 2
 LONGEST_FADES = 0.999  # with each answer
-# While others wait, a request needs so many times what one usually takes, but no more than that
-# share of the longest time that one was given here: what takes longer than most comes too late.
+# While others wait, a job begins only with this many usual service times left, or, if less, this
+# share of the longest time-out given here: otherwise it would often end too late.
 _TAKES_TIMES, _TAKES_SHARE = 3.0, 0.25
 HOLD_LIMIT_S = 2.0  # a cancel service that has not answered by then is given up
-# An action server answers for a result when its goal ends, and of such requests that it has not
-# taken its queue keeps the last ten. It is given so many, and then one that it answers at once.
+# An action server answers a result request when its goal ends, and its queue keeps only the last
+# ten that it has not taken. So it gets a batch of this many, then one that it answers at once.
 _BATCH = 8
-_BATCH_LIMIT_S = 60.0  # it may be at work on a goal, and takes nothing meanwhile
+_BATCH_LIMIT_S = 60.0  # it may be busy with a goal, and take nothing meanwhile
 
 
 def most_quiet_s(longest_s: float, *, stuck: bool = False) -> float:
-    """Return for how long a service may end nothing, by the longest that it lately took."""
+    """Return how long a service may finish nothing, given its recent longest service time."""
     if stuck:
         return max(_STUCK_AFTER_S, _STUCK_AFTER_TIMES * longest_s)
     return max(_HANGS_AFTER_S, _HANGS_AFTER_TIMES * longest_s)
@@ -60,10 +60,10 @@ class Job:
         self.alone = first.handling is Handling.ALONE
         self.spare = first.handling is Handling.DROP_IF_BUSY
         self.passed_on = False
-        self.begun = 0.0  # when it was passed on, and
-        self.level = 0  # how many were at work then, itself included
-        self.unwanted = False  # its robot has its answer from elsewhere
-        self.waiting: list[Incoming] | None = [first]  # None once it is done
+        self.begun = 0.0  # when it was passed on
+        self.level = 0  # how many were running then, itself included
+        self.unwanted = False  # its robot has cancelled it
+        self.waiting: list[Incoming] | None = [first]  # copies to answer; None once it is done
         self.answer: bytes | None = None
         self.ticket: int | None = None
 
@@ -72,9 +72,9 @@ class ServiceQueue:
     """The jobs of one service.
 
     Args:
-        most: What the service's own queue holds: never is more passed on, unless `given`.
-        given: How many may be at work; None to learn it.
-        results: Whether it is an action's `get_result`.
+        most: The size of the service's own queue: the most that is passed on, unless `given`.
+        given: The concurrency limit; None to learn it.
+        results: Whether the service is an action's `get_result`.
     """
 
     def __init__(
@@ -87,25 +87,25 @@ class ServiceQueue:
     ) -> None:
         self._waiting: FairQueue[Job] = FairQueue(latest=latest)
         self.waiting = self._waiting.size  # how many
-        self.evict = self._waiting.evict  # what must go so that a newcomer fits in
+        self.evict = self._waiting.evict  # remove a job to make room for a new one
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
         self._begun_last = 0.0
-        self._alone = False  # the job at work is to have no other beside it
-        self._next: Job | None = None  # passed on though the service is at work on all that it can
-        self._longest_s = 0.0  # that it lately took; 0 before its first answer
-        self._longest_given_s = 0.0  # to a request, lately
-        self._quiet_since: float | None = None  # it has work, and has ended none since
-        self._unanswered = 0  # of what was passed on, whether room is kept for it or not
+        self._alone = False  # the running job must have no other beside it
+        self._next: Job | None = None  # passed on above the limit: the service has not begun it
+        self._longest_s = 0.0  # recent longest service time; 0 before the first answer
+        self._longest_given_s = 0.0  # recent longest time-out of a request
+        self._quiet_since: float | None = None  # since when it has work but has finished none
+        self._unanswered = 0  # jobs passed on and not answered, whether or not they have a slot
         self._last_deadline = 0.0
-        self.held_until = NEVER  # nothing is begun before, or before `release`
-        self._batch = 0  # passed on since it was seen to have taken all
+        self.held_until = NEVER  # during a `hold`: when it ends at the latest
+        self._batch = 0  # jobs passed on since the service was known to have taken all
         self._batch_limit = _BATCH if results else NEVER
-        self._overdue: deque[tuple[float, Job]] = deque()  # passed on, and past their deadline
+        self._overdue: deque[tuple[float, Job]] = deque()  # running jobs past their deadline
 
     def put(self, job: Job) -> None:
         """Queue a job."""
-        # A spare copy that waits for what is nearly over goes after all that is none.
+        # A spare copy, which waits for a job that is nearly done, goes after all first copies.
         deadline = job.deadline + (LONGEST_S if job.spare else 0.0)
         self._waiting.put(job.id, job.robot, deadline, job)
         given_s = job.deadline - job.arrived
@@ -117,7 +117,7 @@ class ServiceQueue:
         return self.at_work < (self.limit.limit if job.spare else self.limit.in_hand)
 
     def has_free_slot(self, now: float) -> bool:
-        """Whether nothing waits, and the service can start one more (almost) at once."""
+        """Whether nothing waits, and the service can start one more job (almost) at once."""
         if self.waiting() or self._alone:
             return False
         nearly_over = now - self._begun_last >= NEARLY * self.limit.takes_s > 0.0
@@ -128,19 +128,19 @@ class ServiceQueue:
         return not self.waiting() and (not self.at_work or self._has_room(job))
 
     def load(self, spent_s: float, *, ended: int = 0) -> Load | None:
-        """Return the load when `ended` have just ended; None until the pace is known.
+        """Return the load after `ended` jobs ended just now; None until service time is known.
 
-        `spent_s`: how long the request was here that is answered with it.
+        `spent_s`: how long the request that is being answered was here.
         """
         if not self.limit.service_s:
             return None
         waiting, running = self.waiting(), self.at_work - ended
         limit = self.limit
-        # `Load(...)` would be one more call of Python.
+        # `Load(...)` would cost one more Python call.
         return tuple.__new__(Load, (waiting, running, limit.known, limit.service_s, spent_s))
 
     def hopeless(self, robot: str, deadline: float, remaining_s: float) -> bool:
-        """Whether a request is expected to wait past its deadline, where others wait."""
+        """Whether a request is expected to wait past its deadline, given those that wait."""
         if self.limit.wait_s(self.waiting(), self.at_work) <= remaining_s:
             return False
         return self.limit.wait_s(self._waiting.ahead(robot, deadline), self.at_work) > remaining_s
@@ -148,15 +148,15 @@ class ServiceQueue:
     def take(self, now: float) -> Job | None:
         """Return the next job to pass on; None if none waits or the limit is reached.
 
-        What it returns may be past its deadline, or about to be while others wait that are not:
-        then it was not begun and takes no room.
+        The job may be past its deadline, or too close to it to finish in time: then it has not
+        begun and takes no slot.
         """
         if not self.waiting() or self.at_work >= self.limit.in_hand or self._alone:
             return None
         job = self._waiting.take()
         if job is not None and not self._has_room(job):
             self._waiting.not_served(job.robot)
-            self.put(job)  # when the service has nothing else
+            self.put(job)  # until the service has nothing else to do
             return None
         takes_s = self.limit.takes_s
         needs_s = takes_s if self.at_work >= self.limit.limit else 0.0
@@ -195,14 +195,14 @@ class ServiceQueue:
             self.limit.finished(job.level, took_s, now)
             self._longest_s = max(took_s, self._longest_s * LONGEST_FADES)
         self.free(job)
-        if self._next is not None:  # only now does the service begin with it
+        if self._next is not None:  # the service begins it only now
             self._next.begun, self._next.level = now, self.at_work
             self._begun_last, self._next = now, None
         self._unanswered = self.at_work - (self.held_until < NEVER)  # a hold is no request
         self._quiet_since = now if self._unanswered else None
 
     def free(self, job: Job, *, taken: bool = True) -> None:
-        """Note that the service is done with a job, or was not given it (`taken`)."""
+        """Free a job's slot: the service is done with it, or never got it (`taken` is False)."""
         if job is self._next:
             self._next = None
         if job.passed_on:
@@ -215,7 +215,7 @@ class ServiceQueue:
                 self._quiet_since = None
 
     def hold(self, now: float, limit_s: float = HOLD_LIMIT_S) -> float | None:
-        """Begin nothing more until `release`; return until when at most, None if one is held."""
+        """Begin no job until `release`; return the time limit, or None if already on hold."""
         if self.held_until < NEVER:
             return None
         self.at_work += 1
@@ -223,11 +223,11 @@ class ServiceQueue:
         return self.held_until
 
     def hold_batch(self, now: float) -> float | None:
-        """Do the same if a batch is full, until the action server is seen to have taken it."""
+        """If a batch is full, `hold` until the action server is known to have taken it."""
         return self.hold(now, _BATCH_LIMIT_S) if self._batch >= self._batch_limit else None
 
     def release(self, until: float | None = None) -> None:
-        """End a `hold`, if there is one; with `until` that one only."""
+        """End a `hold`, if there is one; with `until`, only that hold."""
         if self.held_until < NEVER and until in (None, self.held_until):
             self.held_until = NEVER
             self.at_work -= 1
@@ -238,19 +238,19 @@ class ServiceQueue:
         return self.quiet_s(now) > most_quiet_s(self._longest_s)
 
     def stuck(self, now: float) -> bool:
-        """Whether it hangs, and no caller waits for its work."""
+        """Whether it hangs for long, and no caller waits for its work any more."""
         if self._unanswered < _STUCK_ON or now < self._last_deadline:
             return False
         return self.quiet_s(now) > most_quiet_s(self._longest_s, stuck=True)
 
     def quiet_s(self, now: float) -> float:
-        """Return for how long a service that has answered before has finished none of its work."""
+        """Return how long it has had work and finished none; 0 if it has never answered."""
         if self._quiet_since is None or not self._longest_s:
             return 0.0
         return now - self._quiet_since
 
     def died(self) -> None:
-        """Note that the service is a new process, of which nothing is known."""
+        """Forget what was learned about the service's process, because it died."""
         self.release()
         self._quiet_since, self._unanswered, self._next, self._batch = None, 0, None, 0
         self._longest_s = self._last_deadline = 0.0
@@ -266,6 +266,6 @@ class ServiceQueue:
             job = self._overdue.popleft()[1]
             if job.passed_on:
                 found.append(job)
-                self._unanswered += 1  # as it still is
+                self._unanswered += 1  # it still is: undo what `free` subtracts
                 self.free(job)
         return found

@@ -1,8 +1,8 @@
 """How long a replica keeps serving without hearing from the manager. Pure.
 
-The manager signs leases, and signs a new one every minute or sooner: each says when it was signed
-and how long it lasts. Robots and rendezvous pass them on, and nothing else that they say or do
-keeps a machine alive.
+The manager signs a new lease every minute or sooner; each states when it was signed and how long it
+lasts. Robots and rendezvous forward leases, and nothing else that they say or do keeps a machine
+alive.
 """
 
 from collections.abc import Callable
@@ -12,21 +12,21 @@ from fogft.records.record import Order, Record
 
 
 class HeldLease:
-    """The lease of one replica; without one it never ends.
+    """The lease of one replica; before the first one, it never expires.
 
-    It ends no later than it would if every lease had come at the moment it was signed, so nobody
-    gains by holding leases back to show them one after another. A manager's clock may be set: none
-    was signed before the one before it.
+    It expires no later than if every lease had arrived when it was signed, so holding leases back
+    to present them one after another gains nothing. The manager's clock may be set back: a lease
+    never counts as signed before the previous one.
     """
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._order: Order = (-1, -1)
-        self._ahead: float | None = None  # our clock less the manager's, at the first lease
+        self._ahead: float | None = None  # our clock minus the manager's, since the first lease
         self._heard_at = self._ends_at = self._signed_at = 0.0
 
     def renew(self, record: Record) -> None:
-        """Take a verified lease; an older one changes nothing."""
+        """Take a verified lease; an older one has no effect."""
         if record.order <= self._order:
             return
         lease, now = roster.lease(record), self._clock()
@@ -36,7 +36,7 @@ class HeldLease:
         ends_at = self._signed_at + lease.lasts_s
         self._order, self._heard_at = record.order, now
         self._ends_at = max(ends_at, self._ends_at)
-        self._ahead = ahead  # last: by it other threads see that there is a lease
+        self._ahead = ahead  # last: it tells other threads that there is a lease
 
     @property
     def age_s(self) -> float | None:
@@ -45,5 +45,5 @@ class HeldLease:
 
     @property
     def left_s(self) -> float | None:
-        """Seconds until it expires; None without a lease."""
+        """Seconds until the lease expires; None without a lease."""
         return None if self._ahead is None else max(0.0, self._ends_at - self._clock())

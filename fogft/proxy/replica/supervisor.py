@@ -1,6 +1,6 @@
 """Run the user's command as a child process, and restart it when it exits.
 
-The command gets a session of its own and dies with this process, whatever ends it
+The command runs in its own session and dies with this process, however that ends
 (`fogft.child`). It is started through ``bash -c``, as SkyPilot does.
 """
 
@@ -23,18 +23,18 @@ log = logging.getLogger(__name__)
 class Supervisor:
     """One command, kept running. All methods are called from the main thread only.
 
-    The kernel ties the child's life to the *thread* that started it, hence that rule.
+    The reason is that the kernel ties the child's life to the *thread* that started it.
 
     Args:
         command: A shell command; ``exec`` in it saves a process.
-        environ: All that it inherits.
-        domain_id: The ROS domain that it gets; None for what `environ` says.
-        stdout: Descriptor for its standard output; None for our own.
+        environ: Its whole environment.
+        domain_id: Its ROS domain; None to leave it to `environ`.
+        stdout: File descriptor for its standard output; None for our own.
     """
 
-    # Second and longest wait between a death and the next start; the first start after a death is
-    # at once. A run longer than the longest wait resets it, and so does a death while requests were
-    # at work.
+    # Backoff between a death and the next start: second and longest wait; the first restart is
+    # immediate. A run longer than the longest wait resets it, and so does a death while requests
+    # were running.
     backoff_s = 0.5, 15.0
 
     command: str
@@ -48,22 +48,22 @@ class Supervisor:
     def __post_init__(self) -> None:
         if self.domain_id is not None:
             self.environ = {**self.environ, "ROS_DOMAIN_ID": str(self.domain_id)}
-        self._wait_s = 0.0  # the first restart is at once
+        self._wait_s = 0.0  # the first restart is immediate
         self.start_at = 0.0
         self._started_at = 0.0
         self._child: subprocess.Popen[bytes] | None = None
-        self.restarts = -1  # the first start is no restart
+        self.restarts = -1  # since the first start is not a restart
         self.last_exit = ""
 
     @property
     def alive(self) -> bool:
-        """Whether the command runs."""
+        """Whether the command is running."""
         return self._child is not None
 
     def poll(self, *, at_work: bool = False) -> bool:
         """Restart the command when due; return whether it has died since the last call.
 
-        `at_work`: whether it had requests. One of these has ended it then: that is no fault of its.
+        `at_work`: whether it was running requests. If so, one of them is blamed: no backoff.
         """
         died = False
         if self._child is not None:
@@ -71,7 +71,7 @@ class Supervisor:
             if status is None:
                 return False
             died = True
-            self._kill_group(self._child.pid)  # what it left behind in its group
+            self._kill_group(self._child.pid)  # other processes left in its group
             ran_s = self.clock() - self._started_at
             if ran_s > self.backoff_s[1] or at_work:
                 self._wait_s = 0.0
@@ -114,7 +114,7 @@ class Supervisor:
             self._kill_group(self._child.pid)
 
     def stop(self, grace_s: float = 3.0) -> None:
-        """End the command: SIGINT as ROS nodes expect, then SIGKILL. Repeatable."""
+        """Stop the command: SIGINT as ROS nodes expect, then SIGKILL. Idempotent."""
         child, self._child = self._child, None
         self.start_at = float("inf")
         if child is None:

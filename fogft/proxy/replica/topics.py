@@ -1,6 +1,6 @@
-"""Topics at a replica: publishes robots' messages, and holds its nodes' messages for them.
+"""Topics at a replica: publishes robots' messages, and keeps its nodes' messages for robots.
 
-Owns: this replica's publishers and subscriptions, its rings, and the pulls that are held.
+Owns: this replica's publishers and subscriptions, its ring buffers, and held pulls (long polls).
 Design: docs/design/topics.md.
 """
 
@@ -33,11 +33,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HOLD_S = 2.0
-LOOK_EVERY_S = 2.0  # whether publishers are heard
-_HELD_LIMIT = 64  # pulls of one topic; beyond it one of whom has most is answered with nothing
+LOOK_EVERY_S = 2.0  # check whether publishers are heard
+_HELD_LIMIT = 64  # held pulls of a topic; beyond it, the robot with most gets an empty answer
 _BATCH_BYTES = 8 << 20
-_AGAIN_S = 0.2  # a robot rests for so long after a refusal
-_WAITING_LIMIT = 1024  # messages that wait to be published, or pulls to be answered
+_AGAIN_S = 0.2  # a robot pauses for this long after a refusal
+_WAITING_LIMIT = 1024  # messages waiting to be published, or pulls to be answered
 _WAITING_BYTES = 64 << 20
 
 
@@ -48,7 +48,7 @@ class _Pull(NamedTuple):
 
 
 class _Outgoing:
-    """A topic that nodes here publish."""
+    """A topic published by nodes on this replica."""
 
     def __init__(self, topic: TopicSpec, session: bytes, clock: Callable[[], float]) -> None:
         self._ring = Ring(topic.depth, latched=topic.latched)
@@ -56,7 +56,7 @@ class _Outgoing:
         self._clock = clock
         self._lock = threading.Lock()
         self._held: list[_Pull] = []
-        # By robot: the last message it was sent, and until when it gets none of them again.
+        # By robot: the last message sent to it, and until when none is sent again.
         self._got: dict[str, tuple[int, float]] = {}
 
     def heard(self, message: bytes) -> None:
@@ -83,7 +83,7 @@ class _Outgoing:
             self._answer(due)
 
     def _excess(self) -> _Pull | None:
-        """Return a pull that is held no longer: the oldest of the robot that has most."""
+        """Stop holding one pull if there are too many: the oldest of the robot with most."""
         if len(self._held) <= _HELD_LIMIT:
             return None
         [(most, _)] = Counter(pull.incoming.robot for pull in self._held).most_common(1)
@@ -92,7 +92,7 @@ class _Outgoing:
         return excess
 
     def tick(self, now: float) -> None:
-        """Answer those with nothing that have waited long enough."""
+        """Answer pulls that were held for long enough."""
         with self._lock:
             over = [pull for pull in self._held if pull.until <= now]
             self._held = [pull for pull in self._held if pull.until > now]
@@ -116,7 +116,7 @@ class _Outgoing:
 
 
 class _Inbox:
-    """What robots have sent, for a thread of its own: robots in turns, each in its order."""
+    """Messages or pulls from robots, taken by one thread: robots in turn, each in order."""
 
     def __init__(
         self, take: Callable[[Incoming], None], refuse: Callable[[Incoming], None]
@@ -126,10 +126,10 @@ class _Inbox:
         self._waiting: FairQueue[Incoming] = FairQueue()
         self._large = SharedByteLimit(_WAITING_BYTES)
         self._count = count()
-        self._due: SimpleQueue[bool] = SimpleQueue()  # an entry for each that was put in
+        self._due: SimpleQueue[bool] = SimpleQueue()  # one True per item put in; False to end
 
     def put(self, incoming: Incoming) -> None:
-        """Take in a message or a pull; refuse it, or another one, where there is no room."""
+        """Queue a message or a pull; refuse it, or another one, if there is no room."""
         robot, size = incoming.robot, len(incoming.payload)
         excess: Incoming | None = None
         with self._lock:
@@ -147,7 +147,7 @@ class _Inbox:
             self._refuse(excess)
 
     def run(self) -> None:
-        """Take what comes until closed."""
+        """Process incoming messages or pulls until closed."""
         while self._due.get():
             with self._lock:
                 incoming = self._waiting.take()
@@ -156,11 +156,11 @@ class _Inbox:
             try:
                 if incoming is not None:
                     self._take(incoming)
-            except Exception:  # the others go on
+            except Exception:  # must not affect the others
                 log.exception("message_not_taken")
 
     def close(self) -> None:
-        """End `run`, once what waits now has been taken."""
+        """End `run`, once everything queued so far has been processed."""
         self._due.put(False)
 
 
@@ -184,16 +184,16 @@ class TopicsOnReplica:
         self._looked_at = clock()
         self._seen = {name: Seen() for name in self._topics}
         self._trouble: dict[str, str] = {}
-        # For the command's next life: what robots latched.
+        # Robots' latched messages, to publish again when the command restarts.
         self._latched = {
             name: Ring(topic.depth if topic.latched else 0, latched=True)
             for name, topic in self._topics.items()
         }
-        # Publishing may block for a moment, and answers are copied: the wire's threads must not.
+        # Publishing may block briefly, and answers are copied: the link's threads must not do so.
         messages, pulls = (_Inbox(take, self._turn_away) for take in (self._publish, self._answer))
         self._messages, self._pulls, self.inboxes = messages, pulls, (messages, pulls)
         self._running = False
-        # Until when a robot sends nothing on a topic but what was on its way before.
+        # Until when a robot pauses on a topic: what comes meanwhile was in flight before.
         self._rests: dict[tuple[str, str], float] = {}
 
     def __bool__(self) -> bool:
@@ -208,7 +208,7 @@ class TopicsOnReplica:
         return next(iter(list(self._trouble.values())), "")  # `use` may add to them meanwhile
 
     def use(self, node: SerialisedNode | None) -> None:
-        """Publish and subscribe with this node from now on."""
+        """Publish and subscribe with this node from now on; None for no node."""
         self._publishers, self._subscriptions = {}, {}
         if node is None:
             return
@@ -241,7 +241,7 @@ class TopicsOnReplica:
 
     def ready(self) -> frozenset[str]:
         """Return the names of the topics that have an endpoint here."""
-        publishers = self._publishers.copy()  # while `use` adds to them
+        publishers = self._publishers.copy()  # since `use` may add to them meanwhile
         heard = {name for name, one in publishers.items() if one.subscribers()}
         return frozenset(self._subscriptions) | heard
 
@@ -298,7 +298,7 @@ class TopicsOnReplica:
             incoming.refuse(Refusal.NOT_READY)
 
     def _turn_away(self, incoming: Incoming, reason: Refusal = Refusal.OVERLOADED) -> None:
-        """Refuse a pull, or a message and those on their way behind it, which would overtake it."""
+        """Refuse a pull, or a message and those in flight behind it, which would overtake it."""
         self._rests[incoming.service, incoming.robot] = self._clock() + _AGAIN_S
         incoming.refuse(reason)
 

@@ -1,4 +1,4 @@
-"""The client proxy: offers the service on the robot and asks the replicas.
+"""The client proxy: offers the service on the robot and forwards requests to the replicas.
 
 Not here: the replica's side (`fogft.proxy.replica`).
 """

@@ -1,7 +1,7 @@
 """An action on the robot: three services whose requests go to all replicas.
 
-Owns: what decides for the three services, and what replicas must have of them. Not here: what a
-goal is (`fogft.topics.goals`), feedback and status (`topics`). Design: docs/design/topics.md.
+Owns: judging the three services' answers; what replicas must still be sent. Not here: the table
+of goals (`fogft.topics.goals`), feedback and status (`topics`). Design: docs/design/topics.md.
 """
 
 import logging
@@ -27,15 +27,15 @@ from fogft.topics.goals import Goals
 log = logging.getLogger(__name__)
 
 _CANCELS_KEPT = 4096
-_CANCEL_FOR_S = 60.0  # a replica may be away for a moment
+_CANCEL_FOR_S = 60.0  # a replica may be briefly unreachable
 _CANCEL_TIMEOUT_S = 10.0
 _CANCEL_AGAIN_S = 0.25
-_SEVERAL = b""  # in place of the goal to cancel
+_SEVERAL = b""  # instead of a goal: the request cancels several
 
 
 @dataclass(frozen=True)
 class _ToCancel:
-    """That a replica is to be told to cancel a goal: from when, and until when it is tried."""
+    """A cancellation of a goal to send to a replica: not before `at`, retried until `until`."""
 
     goal: bytes
     replica: int
@@ -44,7 +44,7 @@ class _ToCancel:
 
 
 class _Action:
-    """What the three services of one action share, under a lock that is taken last."""
+    """State shared by the three services of one action, under a lock that is taken last."""
 
     def __init__(self, clock: Callable[[], float], wake: Callable[[], None]) -> None:
         self.lock = threading.Lock()
@@ -53,18 +53,18 @@ class _Action:
         self.goals = Goals()
         self.to_cancel: deque[_ToCancel] = deque(maxlen=_CANCELS_KEPT)
         self.replicas: Collection[int] = ()
-        # Called, without the lock, with a goal and a replica that has taken it.
+        # Called, without the lock, with a goal and a replica that has accepted it.
         self.began: Callable[[bytes, int], None] = lambda goal, replica: None
 
     def cancel(self, goal: bytes, replicas: Iterable[int], now: float) -> None:
-        """Have replicas told to cancel a goal. Under the lock."""
+        """Queue cancellations of a goal for replicas. Call under the lock."""
         until = now + _CANCEL_FOR_S
         self.to_cancel += [_ToCancel(goal, replica, now, until) for replica in replicas]
         self.wake()
 
 
 class _CancelPart(Decide):
-    """`cancel_goal`: every replica is told until it has heard, also one that is away meanwhile."""
+    """`cancel_goal`: sent to every replica, and retried where it is unreachable for a while."""
 
     replicates = True
 
@@ -78,7 +78,7 @@ class _CancelPart(Decide):
         if goals.names_one(pending.payload):
             goal, until = goals.goal_of(pending.payload), self._action.clock() + _CANCEL_FOR_S
             self._note(request, goal, until)
-        else:  # it means all goals made by now, and must not come later again
+        else:  # it cancels all goals made so far, so it must not be sent again later
             self._note(request, _SEVERAL, -math.inf)
 
     def _note(self, id: bytes, goal: bytes, until: float) -> None:
@@ -89,7 +89,7 @@ class _CancelPart(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
-        """Note what a replica has cancelled, of what it was told to: it may name others' goals."""
+        """Note the goals that a replica has cancelled as told: it may also name other goals."""
         if reading:
             asked, _ = self._sent.get(id, (None, 0.0))
             with self._action.lock:
@@ -110,7 +110,7 @@ class _CancelPart(Decide):
         self._replicas = frozenset(replicas.versions)
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
-        """Return what is to be told to those who work in vain, or were not there."""
+        """Return due cancellations, for replicas working in vain or unreachable earlier."""
         found, later = [], []
         with self._action.lock:
             for one in self._action.to_cancel:
@@ -125,7 +125,7 @@ class _CancelPart(Decide):
         return found
 
     def declined(self, id: bytes, replica: int, now: float) -> None:
-        """A replica has not heard it: it is told again."""
+        """Retry a cancellation that a replica did not receive."""
         with self._action.lock:
             goal, until = self._sent.get(id, (b"", 0.0))
             if now < until:
@@ -135,7 +135,7 @@ class _CancelPart(Decide):
 
 
 class _GoalPart(Decide):
-    """`send_goal`: until a goal has its result, each replica is given it that does not have it."""
+    """`send_goal`: until a goal has its result, every replica that lacks the goal gets it."""
 
     replicates = True
 
@@ -151,7 +151,7 @@ class _GoalPart(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
-        """Remember who has the goal: before its client can know, and ask for the result."""
+        """Record which replica has the goal, before the client can ask for the result."""
         self._took(id, replica, accepts=reading)
         return super().judge(id, replica, payload, reading, pending)
 
@@ -173,7 +173,7 @@ class _GoalPart(Decide):
             self.declined(id, replica, self._action.clock())
 
     def closed(self, request: bytes, pending: Pending) -> None:
-        """Nobody was asked, or has answered: unless it was accepted, the goal is over, too."""
+        """Drop a goal whose request has ended, unless a replica has accepted it."""
         goal = goals.goal_of(pending.payload)
         with self._action.lock:
             if goal not in self._action.goals:
@@ -183,7 +183,7 @@ class _GoalPart(Decide):
         return {"goals": self._action.goals.kept}
 
     def reach(self, replicas: Reachable, now: float) -> None:
-        """Note who can be given goals; who comes may have missed that some were ended."""
+        """Set the replicas to give goals to; new ones may have missed cancellations."""
         action = self._action
         with action.lock:
             for replica in set(action.replicas) - replicas.versions.keys():
@@ -209,13 +209,13 @@ class _GoalPart(Decide):
             self._action.goals.failed(id, replica, now)
 
     def close(self) -> None:
-        """End the action's goals: what comes in its place may be another action."""
+        """Drop the action's goals: a different action may take its place."""
         with self._action.lock:
             self._action.goals.clear()
 
 
 class _ResultPart(Decide):
-    """`get_result`: the first replica that succeeds; the others are told to cancel the goal."""
+    """`get_result`: the first replica that succeeds wins; the others must cancel the goal."""
 
     def __init__(self, action: _Action) -> None:
         super().__init__(partial(goals.is_success, Part.RESULT))
@@ -258,7 +258,7 @@ class _ResultPart(Decide):
 
 
 class Actions:
-    """Creates the dispatchers of actions, which share state within one action."""
+    """Creates the dispatchers of actions; those of one action share state."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

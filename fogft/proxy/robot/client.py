@@ -1,7 +1,7 @@
 """The client proxy: the robot's side of every proxied service.
 
-Owns: the services, and telling each its links.
-Not here: which links there are (`links`), files and signals (`process`), requests (`dispatcher`).
+Owns: the services, and routing each to its links.
+Not here: the links themselves (`links`), files and signals (`process`), requests (`dispatcher`).
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_TICK_S = 0.02  # where topics pass
+_TICK_S = 0.02  # if there are topics
 _IDLE_TICK_S = 0.1
 
-# Makes the dispatcher of a service, given how to respond and how to have `tick` called soon.
+# Creates the dispatcher of a service, given how to respond and how to have `tick` called soon.
 MakeDispatcher = Callable[[ServiceSpec, Callable[[Any, bytes], None], Wake], Dispatcher]
 
 
@@ -46,9 +46,9 @@ class ClientProxy:
     """Sends each request to the replicas that its policy chooses; returns the first success.
 
     Args:
-        node: The robot's side of ROS; none in a gateway, where requests come from the wire.
-        define: Returns the definition of a service type here; unknown ones are not compared.
-        merge: Makes one status of an action of what its replicas say.
+        node: The ROS node on the robot; None in a gateway, which gets requests over links.
+        define: Returns the local definition of a service type; unknown ones are not compared.
+        merge: Merges the statuses that replicas report for an action into one.
     """
 
     pool_uid: str
@@ -65,21 +65,21 @@ class ClientProxy:
         self.tell = self.dialer.tell  # signed records, for every replica
         self._lock = threading.RLock()
         self._services: dict[str, ProxiedService] = {}
-        self.links = Links(self.dialer, self, self._keys)  # to whom it talks
+        self.links = Links(self.dialer, self, self._keys)
         self._version = (0, 0)
         self._membership: Membership | None = None
         self._through_gateways = False
         self._topics = TopicsOnRobot(self._wake, self.merge, self.clock)
-        # Until when the thread of `run_once` sleeps; it is woken by who wants a look sooner.
+        # When the thread of `run_once` next wakes by itself; `_wake` makes it sooner.
         self._sleeps_until = NEVER
         self._sooner = Wakeup()
         self._look_now = self._changed = False
         self._advertise_at = -NEVER
 
     def serve(self, specs: Iterable[ServiceSpec]) -> None:
-        """Proxy exactly these services. Requests under way continue.
+        """Proxy exactly these services. Requests in flight continue.
 
-        Raises RosError: One cannot be proxied (a stateful one has ended); all others change.
+        Raises RosError: One cannot be proxied (a stateful one has ended); all others are updated.
         """
         failure: RosError | None = None
         with self._lock:
@@ -99,13 +99,13 @@ class ClientProxy:
             raise failure
 
     def _serve_one(self, spec: ServiceSpec) -> bool:
-        """Proxy a service by a policy; return whether replicas know it by another key now."""
+        """Proxy a service, or update its policy; return whether its keys at replicas may change."""
         old = self._services.get(spec.name)
         if old is not None and _kind(old.spec) == _kind(spec):
             old.spec = spec
             self._adopt(old)
             return False
-        if old is not None and old.spec.state is not None:  # two of them would write one mark
+        if old is not None and old.spec.state is not None:  # two would write the same mark
             old.end()
             del self._services[spec.name]
             old = None
@@ -115,7 +115,7 @@ class ClientProxy:
         return True
 
     def pass_topics(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> None:
-        """Pass exactly these topics; `node` publishes and subscribes on the robot."""
+        """Forward exactly these topics; `node` publishes and subscribes on the robot."""
         with self._lock:
             if self._topics.serve(topics, node):
                 self.links.redial()
@@ -138,7 +138,7 @@ class ClientProxy:
         service.adopt(self._here(service.spec), self.node)
 
     def _here(self, spec: ServiceSpec) -> ServiceSpec:
-        """Return a service's policy as it is here: a request goes to one gateway, not to all."""
+        """Return the policy to apply here: through gateways, a request goes to one, not to all."""
         if self._through_gateways:
             return replace(spec, hedging=HedgingMode.FAILOVER)
         return spec
@@ -146,7 +146,7 @@ class ClientProxy:
     # -- membership -----------------------------------------------------------------------
 
     def follow(self, membership: Membership) -> bool:
-        """Hold one link to each member. An older membership, or another pool's, is refused."""
+        """Keep one link to each member. Refuse an older membership, or another pool's."""
         version = (membership.epoch, membership.version)
         with self._lock:
             if membership.pool_uid != self.pool_uid or version < self._version:
@@ -157,7 +157,7 @@ class ClientProxy:
             good = (m for m in membership.members if m.certificate_name not in membership.revoked)
             members = {m.id: m for m in good}
             own = self.dialer.certificate()
-            if own in membership.revoked:  # then nobody is to be talked to
+            if own in membership.revoked:  # then no replica may be contacted
                 log.error("robot_revoked certificate=%s", own)
                 members = {}
             through = any(member.gateway for member in members.values())
@@ -177,7 +177,7 @@ class ClientProxy:
         """Switch to new credentials, link by link; no request is lost."""
         self.dialer.renew()
         if self._membership is not None:
-            self.follow(self._membership)  # who was shut out under the old ones may be in again
+            self.follow(self._membership)  # the old credentials may have been revoked
         log.info("credentials_renewed")
 
     def redial(self) -> None:
@@ -193,7 +193,7 @@ class ClientProxy:
     def _drop(self, id: ReplicaId) -> None:
         link = self.links.remove(id)
         self._type_check.forget(id)
-        self._route()  # first out of every route, then closed: what was open there is LOST
+        self._route()  # before closing it: requests open there end as LOST
         link.close()
 
     # -- events of links (their threads) --------------------------------------------------
@@ -211,30 +211,30 @@ class ClientProxy:
         self.look_again()
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Pass on the end of a forgotten attempt."""
+        """Pass the end of a cancelled attempt to the service of its request."""
         found = self._services.get(answer.service)
         if found is not None:
             found.dispatcher.late(link, answer)
 
     def look_again(self) -> None:
-        """Have routes recomputed, for instance after a type became known. Any thread."""
+        """Have routes recomputed, e.g. after a type became known. Any thread."""
         self._changed = True
         self._wake()
 
     def _wake(self, at: float = -NEVER, /) -> None:
-        """Have services looked at now, or at their `look_at` if that is later. Any thread."""
+        """Have `run_once` tick the services now, or at `at` if that is later. Any thread."""
         if at == -NEVER:
             self._look_now = True
         if at < self._sleeps_until:
-            self._sleeps_until = at  # once is enough
+            self._sleeps_until = at  # so that it is woken only once
             self._sooner.wake()
 
     # -- the proxy's own thread -----------------------------------------------------------
 
     def run_once(self, timeout_s: float = _IDLE_TICK_S) -> bool:
-        """Wait briefly for a change, then route, advertise and tick; return whether it changed.
+        """Wait briefly for a change, then route, advertise and tick; return whether one occurred.
 
-        Raises RosError: The node's thread has ended: nothing would be taken any more.
+        Raises RosError: The node's thread has ended: no request would be taken any more.
         """
         if self.node is not None and not self.node.alive:
             raise RosError("ROS has stopped; see the log for the reason", "start the proxy again")
@@ -256,14 +256,14 @@ class ClientProxy:
         return changed
 
     def _await_look(self, timeout_s: float) -> None:
-        """Wait until it is time to look, at most so long. What comes after that is for the next.
+        """Wait until a service is due, for at most `timeout_s`; later events wake the next call.
 
-        While requests come, it sleeps no longer than the next one could, so none has to wake it.
+        While requests keep coming, wake when the next could be due, so that none must wake us.
         """
         now = self.clock()
         until = now + (min(timeout_s, _TICK_S) if len(self._topics) else timeout_s)
         while not self._look_now:
-            self._sleeps_until = NEVER  # before looking: what comes after that wakes us
+            self._sleeps_until = NEVER  # before checking: any event after this wakes us
             look_at = sleeps_until = until
             for service in list(self._services.values()):
                 due_at, next_due_at = service.dispatcher.wants_tick(now)
@@ -291,7 +291,7 @@ class ClientProxy:
             hang = {id for id, names in hanging.items() if name in names}
             service.dispatcher.route(service.may_ask(fit, draining), versions, draining, hang)
 
-    # -- what people see ------------------------------------------------------------------
+    # -- reports --------------------------------------------------------------------------
 
     def report(self) -> dict[str, Any]:
         """Return the report of links and services for `proxy-status.json`."""
@@ -316,7 +316,7 @@ class ClientProxy:
         }
 
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-        """Return the links to replicas, those behind gateways included, and those to gateways."""
+        """Return reports of replicas, including those behind gateways, and of gateways."""
         dispatchers = [service.dispatcher for service in self._services.values()]
         replicas, gateways, behind = [], [], []
         for link in sorted(self.links, key=lambda link: link.peer.id):
@@ -341,18 +341,18 @@ class ClientProxy:
 
     @property
     def offered(self) -> list[str]:
-        """The services currently offered in ROS."""
+        """The names of the services currently offered in ROS."""
         return [name for name, service in self._services.items() if service.server is not None]
 
     def begin_hand_over(self) -> None:
-        """Begin a hand-over: leave topics to the other proxy, record requests taken meanwhile."""
+        """Begin a hand-over: leave topics to the other proxy, record requests taken from now on."""
         with self._lock:
             for service in self._services.values():
                 service.dispatcher.taken = []
             self._topics.close()
 
     def take_no_more(self) -> None:
-        """Stop taking requests; another proxy does."""
+        """Stop taking requests: another proxy takes them."""
         with self._lock:
             for service in self._services.values():
                 service.dispatcher.takes_no_more = True
@@ -377,7 +377,7 @@ class ClientProxy:
         self.look_again()
 
     def trace(self) -> list[dict[str, Any]]:
-        """Return the outcomes since the last call, of traced services."""
+        """Return the request outcomes of traced services since the last call."""
         past_s = time.time() - time.monotonic()
         with self._lock:
             return [
@@ -395,5 +395,5 @@ class ClientProxy:
 
 
 def _kind(spec: ServiceSpec) -> object:
-    """Return what two policies have in common that one dispatcher can follow without loss."""
+    """Return what must stay equal for a dispatcher to switch policies without losing requests."""
     return spec.type, spec.state, spec.quorum, spec.tolerance

@@ -1,4 +1,4 @@
-"""Delivers a request's outcome to its caller: a response, the fallback's, an empty one or none.
+"""Delivers a request's outcome to its caller: a replica's response, the fallback's, empty or none.
 
 Owns: calls of the fallback service. Not here: when it is asked (`requests.fallback`).
 """
@@ -29,7 +29,7 @@ Respond = Callable[[Any, bytes], None]
 class Delivery:
     """The delivery of one service's outcomes; arguments as for `Dispatcher`.
 
-    `forget` tells these replicas that a request is no longer wanted.
+    `forget` tells the given replicas that a request is no longer needed.
     """
 
     ledger: Ledger
@@ -42,7 +42,7 @@ class Delivery:
         self.adopt(self.ledger.spec, None)
 
     def adopt(self, spec: ServiceSpec, client: RosClient | None) -> None:
-        """Apply a spec's fallback, with its client; without one, ask no more. Under the lock."""
+        """Apply a spec's fallback and its client, or stop calling one. Call under the lock."""
         was, self._client, requests = self._client, client, self.ledger.requests
         if requests.fallback is None and spec.fallback is not None:
             requests.fallback = FallbackTimer(spec.fallback)
@@ -87,7 +87,7 @@ class Delivery:
 
     @property
     def _falls_back(self) -> bool:
-        """Whether the fallback has the last word."""
+        """Whether the fallback answers requests past their deadline."""
         falls_back = self.ledger.spec.on_timeout is OnTimeout.FALLBACK
         return falls_back and self.ledger.requests.fallback is not None
 
@@ -100,13 +100,13 @@ class Delivery:
             return
         with self.ledger.lock:
             self.ledger.end(request, pending, outcome)
-            if self.ledger.requests.fallback is not None:  # it was meant for that one
+            if self.ledger.requests.fallback is not None:  # which may still expect the request
                 self.ledger.requests.fallback.ended(request)
         if response is not None:
             self.give(pending, response)
 
     def tick(self, now: float, *, able: bool) -> float:
-        """Call the fallback for due requests, and give up the rest; return when to call again."""
+        """Call the fallback for due requests, end overdue ones; return when to call again."""
         timer, requests = self.ledger.requests.fallback, self.ledger.requests
         if timer is None:
             return NEVER
@@ -123,7 +123,7 @@ class Delivery:
         return look_at
 
     def _await_fallback(self, request: bytes, pending: Pending) -> None:
-        """The fallback has the rest of the say; it may have been asked before."""
+        """Leave a request to the fallback, and call it unless its call is open already."""
         timer = self.ledger.requests.fallback
         assert timer is not None
         with self.ledger.lock:
@@ -135,7 +135,7 @@ class Delivery:
                 self._without_fallback(request, pending)
 
     def _ask(self, request: bytes, pending: Pending) -> bool:
-        """Call the fallback; return whether it could be called."""
+        """Call the fallback service; return whether it could be called."""
         client = self._client
         try:
             if client is not None and client.available():
@@ -149,7 +149,7 @@ class Delivery:
         return False
 
     def _fallback_answered(self, request: bytes, payload: bytes) -> None:
-        """Take the fallback's response, on the thread that takes from ROS."""
+        """Take the fallback's response, on the thread that receives from ROS."""
         ledger = self.ledger
         accepts = ledger.requests.decide.accepts
         try:
@@ -172,7 +172,7 @@ class Delivery:
             self.forget(request, tuple(pending.open))
 
     def _without_fallback(self, request: bytes, pending: Pending) -> None:
-        """The fallback had nothing either: return the rejection if there is one."""
+        """End a request without the fallback's answer: return the rejection if there is one."""
         response = pending.rejection
         unanswered = Outcome.POISON if pending.deaths >= POISON_DEATHS else Outcome.SILENT
         outcome = unanswered if response is None else Outcome.ANSWERED

@@ -1,6 +1,6 @@
 """A client proxy's `/diagnostics` and parameters in ROS.
 
-Owns: levels, sentences, and the values below them; when they are told. Not here: publishing
+Owns: diagnostic levels, messages and values, and when to publish them. Not here: publishing
 (`fogft.ros.visible`), the policies that parameters set (`fogft.poolfile.policy_parameters`).
 """
 
@@ -20,7 +20,7 @@ from fogft.ros.visible import VisibleNode
 WINDOW_S = 30.0
 CREDENTIALS_SOON_S = 3600.0
 UNMANAGED_AFTER_S = 90.0  # a manager signs a lease for its replicas every minute
-# Ends of requests that somebody should hear of, and how they are called.
+# Outcomes of requests to warn about, and their wording.
 _TROUBLES = {
     "silent": "got no answer",
     "empty": "got an empty answer",
@@ -35,7 +35,7 @@ _COUNTS = (
 
 
 class Diagnosis:
-    """Turns reports into statuses; those of the pool and its services name the robot."""
+    """Turns reports into diagnostic statuses; those of the pool and its services name the robot."""
 
     def __init__(self, pool: str, robot: str) -> None:
         self._pool = pool
@@ -55,7 +55,7 @@ class Diagnosis:
     def _lately(
         self, services: Mapping[str, Mapping[str, Any]], now: float
     ) -> dict[str, Counter[str]]:
-        """Return how often each trouble befell each service in the last `WINDOW_S`."""
+        """Return how often each service had each trouble in the last `WINDOW_S`."""
         counts = {n: Counter({k: s.get(k, 0) for k in _TROUBLES}) for n, s in services.items()}
         self._before.append((now, counts))
         while len(self._before) > 1 and self._before[1][0] <= now - WINDOW_S:
@@ -188,8 +188,8 @@ _DIAGNOSE_EVERY_S = 1.0
 class SeenFromRos:
     """The diagnostics and parameters of a pool and its services in ROS.
 
-    `make_visible` makes the visible node, given who judges parameters; without one nothing is shown
-    or set.
+    `make_visible` creates the visible node, given a validator of parameters. If it returns None,
+    nothing is shown or set.
     """
 
     def __init__(
@@ -207,13 +207,13 @@ class SeenFromRos:
         self._visible = make_visible(self._set)
 
     def follow(self, specs: Iterable[ServiceSpec]) -> tuple[ServiceSpec, ...]:
-        """Set the pool file's services; return them with parameters applied."""
+        """Take the services of the pool file; return them with parameters applied."""
         with self._lock:
             self._policies.follow(specs)
             return self._take()
 
     def changed(self) -> tuple[ServiceSpec, ...] | None:
-        """Return the services with parameters applied if one was set since; else None."""
+        """Return the services with parameters applied if one was set since; None if not."""
         if not self._was_set:
             return None
         with self._lock:
@@ -226,7 +226,7 @@ class SeenFromRos:
         return self._policies.services()
 
     def _set(self, values: Mapping[str, Any]) -> str:
-        """Judge what somebody sets (the visible node's thread)."""
+        """Validate and set parameters; return an error, or "" (on the visible node's thread)."""
         with self._lock:
             try:
                 self._policies.set(values)
@@ -237,7 +237,7 @@ class SeenFromRos:
         return ""
 
     def diagnose(self, report: Callable[[], Mapping[str, Any]], now: float) -> None:
-        """Publish the statuses of a report, once a second."""
+        """Publish the statuses of a report, at most once a second."""
         if self._visible is not None and now >= self._diagnosed + _DIAGNOSE_EVERY_S:
             self._diagnosed = now
             self._visible.diagnose(self._diagnosis.of(report(), now))

@@ -1,9 +1,9 @@
 """One proxied service on the robot: send a request to replicas, return the answer.
 
-`submit` is called by the thread that takes ROS requests and never blocks. Answers come from the
-links' threads, which may not send: that is left to the next `tick`, which `wake` brings about.
+`submit` is called by the thread that takes ROS requests and never blocks. Answers arrive on the
+links' threads, which must not send: they call `wake`, and the next `tick` sends.
 
-Owns: a request's life, and which policy a service has. Design: docs/design/dispatcher.md.
+Owns: the life cycle of a request, and a service's policy. Design: docs/design/dispatcher.md.
 """
 
 import logging
@@ -34,16 +34,16 @@ from fogft.ros.port import RosClient
 
 log = logging.getLogger(__name__)
 
-MALFORMED_LIMIT = 3  # responses, until a replica is to be replaced
+MALFORMED_LIMIT = 3  # malformed responses after which a replica should be replaced
 _SHORTEST_S = 0.002
 _TICK_S = 0.02
-# Until losers are told that are not told at once: they were asked a moment ago, or another one was
-# told (`link.window`).
+# Delay of cancellations not sent to losers at once, as they were asked, or another cancellation was
+# sent, a moment ago (`link.window`).
 _TELL_S = 0.1
-_PAUSE_S = 1.0  # without requests: the next one need not be expected
+_PAUSE_S = 1.0  # after this long without requests, no next one is expected
 
 
-# Has `Dispatcher.tick` called at a moment, if not sooner; without one, at once. Any thread.
+# Schedules a call of `Dispatcher.tick` at the given time or sooner; by default now. Any thread.
 Wake = Callable[..., None]
 
 
@@ -51,18 +51,18 @@ class Dispatcher:
     """The requests of one service, from the caller's request to the caller's response.
 
     Args:
-        decide: What answers mean; the first success unless given.
-        fault_of: Returns what is wrong with the bytes of a response; empty for nothing. One that
-            is malformed is a failure of its replica, and another answer is awaited.
-        ok_of: Returns, for a name of a boolean response field, whether a response is a success;
-            asked where the spec names an `ok_field`.
+        decide: Judges answers; by default, the first success wins.
+        fault_of: Returns what is wrong with the bytes of a response; empty for nothing. A
+            malformed response is a failure of its replica, and another answer is awaited.
+        ok_of: Returns, for the name of a boolean response field, a check whether a response is a
+            success; used if the spec names an `ok_field`.
         empty_response: The serialised default response, for ``on_timeout: empty``.
-        max_pending_bytes: Of requests kept at once; more are turned away and counted.
-        id_of: Gives a caller's request its id, by service and handle.
-        poisoned: Takes the id of each request over which services died, as it is given up.
+        max_pending_bytes: Limit on the bytes of open requests; more are turned away and counted.
+        id_of: Returns the id of a caller's request, by service and handle.
+        poisoned: Called with the id of each request given up because it crashed services.
     """
 
-    max_pending = 1 << 16  # requests kept at once; more are turned away, too
+    max_pending = 1 << 16  # limit on open requests; more are turned away, too
 
     def __init__(
         self,
@@ -80,14 +80,14 @@ class Dispatcher:
         poisoned: Callable[[bytes], None] = lambda request: None,
     ) -> None:
         self._id_of, self._poisoned = id_of, poisoned
-        self.takes_no_more = False  # another proxy gets callers' requests, too
-        self.taken: list[bytes] | None = None  # those taken, once another proxy may get them too
+        self.takes_no_more = False  # another proxy takes callers' requests now
+        self.taken: list[bytes] | None = None  # requests taken while another proxy gets them too
         self._fault_of = fault_of
         self._malformed: Counter[int] = Counter()
         self._ok_of = ok_of
         self._wake = wake
         self._asked_at = self._tell_at = self._next_look = NEVER
-        self._usual_s = NEVER  # how soon after it began a request wants a look
+        self._usual_s = NEVER  # how long after its start a request usually needs a `tick`
         self._clock = clock
         self.max_pending_bytes = max_pending_bytes
         self._decide = Decide() if decide is None else decide
@@ -96,7 +96,7 @@ class Dispatcher:
         self._requests = PendingRequests(
             policy(spec),
             self._decide,
-            # What waits for a goal to end, or has its order, is no work of its own.
+            # Requests that wait for a goal to end, or are ordered, are no work of their own.
             counts_deaths=spec.part is Part.NONE and spec.state is None,
         )
         self._ledger = Ledger(spec, self._requests, clock)
@@ -121,7 +121,7 @@ class Dispatcher:
         """Whether a request that arrives now can be answered."""
         if not self._decide.sends_requests:
             return bool(self._sender.able)
-        with self._lock:  # a thread that takes a request may begin a term, and claim replicas
+        with self._lock:  # a thread taking a request may start a term and claim replicas
             return self._decide.ready
 
     def submit(self, payload: bytes, handle: Any) -> None:
@@ -130,15 +130,15 @@ class Dispatcher:
         self.forward(self._id_of(spec.name, handle), payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
-        """Do the same for a request with an id; return whether taken.
+        """Like `submit`, for a request with an id and a time-out; return whether it was taken.
 
-        Raises ValueError: A request with this id is under way.
+        Raises ValueError: A request with this id is in flight.
         """
         now, requests, outcomes = self._clock(), self._requests, self.outcomes
         with self._lock:
             if self.takes_no_more:
                 return False
-            if self.taken is not None:  # it begins by the same lock: `hold` tells of no other
+            if self.taken is not None:  # under the same lock as `begin`: `hold` returns no other
                 self.taken.append(request)
             count = outcomes.count
             count["received"] += 1
@@ -166,13 +166,13 @@ class Dispatcher:
         taken = self._sender.first(request, payload, links, chosen, timeout_s)
         if self._decide.replicates:
             self._sender.replicate()
-        if chosen and not taken:  # all of these declined, and another may take it
+        if chosen and not taken:  # all declined, but another replica may take it
             soon = self._next_look = min(self._next_look, now + LOOK_AGAIN_S)
         self._wake(soon)
         return True
 
     def _turn_away(self, request: bytes, size: int) -> None:
-        """Count a request that is not taken. Under the lock."""
+        """Count a request that is not taken. Call under the lock."""
         now, count = self._clock(), self.outcomes.count
         count["turned_away"] += 1
         self._ledger.trace(request, Pending(now, b"", None, now), Outcome.TURNED_AWAY, now)
@@ -183,7 +183,7 @@ class Dispatcher:
                         self.spec.name, f"{held}: {limit}", count["turned_away"])  # fmt: skip
 
     def hold(self) -> list[bytes]:
-        """Stop ordering; return the requests taken during the hand-over."""
+        """Stop ordering requests; return those taken during the hand-over."""
         with self._lock:
             self._decide.hold()
             return list(self.taken or ())
@@ -233,7 +233,7 @@ class Dispatcher:
         if self._requests.choose.news:
             self._wake()
         if pending is not None and request is not None:
-            self._delivery.give(pending, payload)  # first: what is counted can wait
+            self._delivery.give(pending, payload)  # first: counting can wait
             if losers:
                 self._sender.forget(request, losers)
                 self._tell_at = min(self._tell_at, now + _TELL_S)
@@ -258,7 +258,7 @@ class Dispatcher:
             self._failed(replica, request, means)
 
     def _misread(self, replica: int, id: ReplicaId, fault: str) -> None:
-        """Hold it against a replica that it sent what is no response."""
+        """Count a malformed response against its replica."""
         with self._lock:
             self._malformed[replica] += 1
             count = self._malformed[replica]
@@ -267,7 +267,7 @@ class Dispatcher:
                       self.spec.name, id.short, count, fault)  # fmt: skip
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Learn from the end of a forgotten attempt; its bytes are not read."""
+        """Learn from the end of a cancelled attempt; its payload is not read."""
         worked = answer.payload is not None or answer.refusal is Refusal.LATE
         now, replica, choose = self._clock(), key_of(link), self._requests.choose
         with self._lock:
@@ -305,7 +305,7 @@ class Dispatcher:
             self._after(request, verdict)
 
     def _end_poison(self, request: bytes, now: float) -> None:
-        """End a request over which services died: only the fallback may still answer it."""
+        """Give up a request that crashed services: only the fallback may still answer it."""
         with self._lock:
             pending = self._requests.give_up(request, now)
         if pending is None:
@@ -319,12 +319,12 @@ class Dispatcher:
         self._sender.forget(request, tuple(pending.open))
 
     def _after(self, request: bytes, verdict: Verdict) -> None:
-        """If nobody works on a request: end it, or have another replica asked at once."""
+        """If no attempt is open: end the request, or have another replica asked at once."""
         if verdict is Verdict.IDLE and not self._settle(request) and self._requests.choose.moves_on:
             self._wake()
 
     def _settle(self, request: bytes) -> bool:
-        """Return the rejection of a request if nobody works on it, and no other can be asked."""
+        """Return the kept rejection to the caller if no attempt is open and none can be made."""
         with self._lock:
             pending = self._requests.settle(request, self._sender.able)
             if pending is None or pending.rejection is None:
@@ -336,9 +336,9 @@ class Dispatcher:
     # -- policy, links and time -----------------------------------------------------------
 
     def adopt(self, spec: ServiceSpec, fallback: RosClient | None = None) -> None:
-        """Switch to another policy, with the client of its fallback service if it has one.
+        """Switch to another policy, with a client of its fallback service if it has one.
 
-        Raises RosError: The response has no such `ok_field`; nothing was changed.
+        Raises RosError: The response has no such `ok_field`; nothing has changed.
         """
         accepts = self._decide.accepts
         if spec.ok_field != self.spec.ok_field and self._ok_of is not None:
@@ -354,13 +354,13 @@ class Dispatcher:
         self._wake()
 
     def began_anew(self, replica: int, about: Callable[[bytes], bool]) -> None:
-        """Ask a replica again, because it restarted what some requests are `about`."""
+        """Ask a replica again for requests matching `about`, as it restarted what they await."""
         with self._lock:
             self._requests.welcome(replica, about)
         self._wake()
 
     def expire(self, *, every: bool = False) -> None:
-        """End the requests whose deadline is past, or all there are."""
+        """End the requests past their deadline, or `every` request."""
         with self._lock:
             expired = self._requests.expire(self._clock(), every=every)
         for request, pending in expired:
@@ -368,13 +368,13 @@ class Dispatcher:
             self._sender.forget(request, tuple(self._sender.links))
 
     def tick(self) -> float:
-        """Expire requests, offer others to more replicas; return when to call again, at latest."""
+        """Expire requests, offer others to more replicas; return when to call again at latest."""
         now, self._next_look = self._clock(), NEVER
-        if now >= self._tell_at:  # its owner has told the links
+        if now >= self._tell_at:  # the caller has sent the links' cancellations
             self._tell_at = NEVER
         with self._lock:
             if not self._waits:
-                self._requests.choose.news = False  # it concerns nobody
+                self._requests.choose.news = False  # it concerns no request
                 return NEVER
         self.expire()
         look_at = self._sender.offer_more(now)
@@ -398,7 +398,7 @@ class Dispatcher:
         return bool(requests.size() or requests.fallback or self._decide.replicates)
 
     def wants_tick(self, now: float) -> tuple[float, float]:
-        """Return when `tick` is wanted, and when it may be for a request that comes next."""
+        """Return when `tick` is needed, and when it may be if another request arrives."""
         at = min(self._tell_at, self._next_look) if self._waits else self._tell_at
         return at, min(at, now + self._usual_s) if now < self._asked_at + _PAUSE_S else at
 
@@ -408,11 +408,11 @@ class Dispatcher:
             self._decide.close()
 
     def disagrees(self, replica: int) -> bool:
-        """Whether a replica's answers have differed from those of others, repeatedly."""
+        """Whether a replica's answers have repeatedly differed from those of others."""
         return replica in self._decide.flagged
 
     def misreads(self, replica: int) -> bool:
-        """Whether a replica's answers were malformed, repeatedly."""
+        """Whether a replica's answers were repeatedly malformed."""
         return self._malformed[replica] >= MALFORMED_LIMIT
 
     def trace(self) -> list[dict[str, Any]]:
@@ -438,9 +438,9 @@ class Dispatcher:
 
 
 def policy(spec: ServiceSpec) -> Choose:
-    """Return the policy for a service's `hedging`."""
+    """Return the policy for a service's `hedging` mode."""
     if spec.hedging is HedgingMode.FAILOVER:
         return Failover()
-    # Where every answer counts, or every replica applies every request, all are asked.
+    # If every answer counts, or every replica applies every request, all are asked.
     counts_all = spec.quorum > 1 or spec.state is not None or spec.part is not Part.NONE
     return All() if counts_all or spec.hedging is HedgingMode.ALL else Auto()

@@ -1,7 +1,7 @@
 """The membership a client proxy follows: from the manager's file, from records, or both.
 
-The later one counts. Where replicas are is corrected by what they say of themselves, and those that
-dial in are reached through the door.
+The newer one counts. Replicas' own records update their endpoints, and replicas that dial in are
+reached through the dial-in port ("door").
 """
 
 import threading
@@ -24,8 +24,8 @@ from fogft.records.record import RecordKind, SignedRecord
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import Signer, Verifier
 
-# Changed records are looked at once a second, but for so many times in a row: a replica whose
-# record says each moment that it has moved would be dialled each moment.
+# Changed records are read at most once a second, in bursts of up to this many: otherwise a replica
+# whose record keeps changing its endpoint would be redialled all the time.
 _LOOKS = 5.0
 
 
@@ -50,7 +50,7 @@ class Following:
     def apply(self, config: ClientProxyConfig) -> None:
         """Apply a changed configuration.
 
-        Raises WireError: The new door's port cannot be had; there is none then.
+        Raises WireError: The new dial-in port cannot be opened; then there is none.
         """
         old, self._config = self._config, config
         before, doors = ((c.dial_in, c.dial_in_listen) for c in (old, config))
@@ -98,14 +98,14 @@ class Following:
         client.publish(kind, holder.name, holder.generation, content)
 
     def renew(self) -> None:
-        """Switch to the certificate now in its file."""
+        """Switch to the certificate that is now in its file."""
         if self._client is not None:
             self._announce(self._client)
 
     def look(self) -> Membership | None:
         """Return the membership if it may have changed.
 
-        Raises FogftError or OSError: A file cannot be read, and records say nothing new.
+        Raises FogftError or OSError: A file cannot be read, and no record has changed.
         """
         now = self._clock()
         self._looks = min(_LOOKS, self._looks + now - self._looked_at)
@@ -146,7 +146,7 @@ class Following:
         return replace(located, members=members, revoked=located.revoked | known.revoked)
 
     def holder(self) -> Holder:
-        """Return who holds the certificate now in its file. Raises CredentialError."""
+        """Return the holder of the certificate now in its file. Raises CredentialError."""
         ours = self._config.credentials
         return holder_of(Signer(ours.certificate, ours.key).common_name)
 
@@ -176,7 +176,7 @@ class Following:
     def report(self, newer: Iterable[SignedRecord] = ()) -> Mapping[str, Any]:
         """Return the newest known manager epoch, each rendezvous' state, and the dial-in port's.
 
-        Nobody counts here but who signed: a replica that lies is refused.
+        Only leases with a valid signature count, so a lying replica has no effect.
         """
         for one in newer:
             self._signed.offer(one)

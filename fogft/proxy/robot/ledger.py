@@ -1,4 +1,4 @@
-"""The ledger of one service on the robot: its requests and counters, and the lock over them."""
+"""The ledger of one service on the robot: its requests and counters, and the lock on them."""
 
 import threading
 from collections import deque
@@ -11,11 +11,11 @@ from fogft.model.spec import ServiceSpec
 from fogft.requests.decide import Pending, Trace
 from fogft.requests.pending import PendingRequests
 
-_TRACE_KEPT = 20_000  # lines until they are written, once a second
+_TRACE_KEPT = 20_000  # lines kept until they are written, once a second
 
 
 class Ledger:
-    """One service's requests and counters. Used under `lock`, which is held for moments only."""
+    """One service's requests and counters. Used under `lock`, which is held only briefly."""
 
     def __init__(
         self, spec: ServiceSpec, requests: PendingRequests, clock: Callable[[], float]
@@ -34,14 +34,14 @@ class Ledger:
             self.traced = deque(maxlen=_TRACE_KEPT) if spec.trace else None
 
     def end(self, request: bytes, pending: Pending, outcome: Outcome) -> None:
-        """Count the outcome of a request without a replica's answer."""
+        """Count the outcome of a request that ended, and trace it."""
         self.outcomes.count[outcome] += 1
         self.trace(request, pending, outcome, self.clock())
 
     def trace(
         self, request: bytes, pending: Pending, outcome: Outcome, now: float, replica: str = ""
     ) -> None:
-        """Keep how and when a request ended, if it is traced."""
+        """Record how and when a request ended, if the service is traced."""
         if self.traced is None:
             return
         arrived, trace = pending.arrived, pending.trace or Trace({}, {})

@@ -1,10 +1,10 @@
 """The links of a client proxy, one per member, and its report of each replica.
 
-Seen through a gateway a replica is put as if it were linked directly, so that the manager judges it
-as it judges all others; of several sights the best counts. A replica whose types differ from ours
-is not asked: its bytes would be read as another message.
+A replica seen through a gateway is reported as if it were linked directly, so that the manager
+judges it like any other; of several reports the best counts. A replica whose types differ from ours
+is not asked: its bytes would be misread as another message.
 
-Under the client proxy's lock. Not here: which of them a service may ask (`proxied_service`).
+Under the client proxy's lock. Not here: which links a service may use (`proxied_service`).
 """
 
 import logging
@@ -155,7 +155,7 @@ class TypeCheck:
         if ours is None:
             ours = self._define(type_name)
             if not ours.known:
-                return ""  # until it is: where no types are loaded, a client tells its hash
+                return ""  # not known yet: without loaded types, a client reveals the hash later
             self._ours[type_name] = ours
         why = difference(type_name, ours, theirs)
         if why and (known is None or known[1] != why):
@@ -164,13 +164,13 @@ class TypeCheck:
         return why
 
     def forget(self, id: ReplicaId) -> None:
-        """Drop the state of a replica that is gone."""
+        """Forget a replica that is gone."""
         for key in [key for key in self._found if key[0] == id]:
             del self._found[key]
 
 
 class Links:
-    """The links of a client proxy; `keys` returns those of all services and topics at a slot."""
+    """The links of a client proxy; `keys` returns the keys of all services and topics at a slot."""
 
     def __init__(
         self, dialer: Dialer, events: LinkEvents, keys: Callable[[int], Mapping[str, str]]
@@ -182,7 +182,7 @@ class Links:
         self.members: dict[ReplicaId, Member] = {}
 
     def __iter__(self) -> Iterator[Link]:
-        """Go over all of them; safe while another thread changes them."""
+        """Iterate over all links; safe while another thread changes them."""
         return iter(list(self._links.values()))
 
     def reach(self, member: Member) -> None:
@@ -213,7 +213,7 @@ class Links:
         return self._links.pop(id)
 
     def draining(self, link: Link) -> bool:
-        """Whether a replica is draining: leaving by its own word, or marked by the manager."""
+        """Whether a replica is draining: it says that it is leaving, or the manager marked it."""
         return link.leaving or self.members[link.peer.id].draining
 
     @property
@@ -229,12 +229,12 @@ class Links:
         return frozenset(name for link in self for name in link.ready)
 
     def hanging(self) -> dict[ReplicaId, frozenset[str]]:
-        """Return the services that a replica reports as hanging."""
+        """Return, by replica, the services that it reports as hanging."""
         answers = {link.peer.id: link.status().probe_answer for link in self}
         return {id: answer.hanging for id, answer in answers.items() if answer is not None}
 
     def told(self) -> dict[str, list[Definition]]:
-        """Return the type definitions as each replica reports them."""
+        """Return each type's definitions as reported by replicas, one per replica."""
         told: dict[str, list[Definition]] = {}
         for link in self:
             answer = link.status().probe_answer
@@ -243,5 +243,5 @@ class Links:
         return told
 
     def types(self) -> dict[str, Definition]:
-        """Return the type definitions reported by most replicas."""
+        """Return each type's definition that most replicas report."""
         return {name: max(all_of, key=all_of.count) for name, all_of in self.told().items()}

@@ -1,4 +1,4 @@
-"""Restart the pool's manager after it was killed, or hangs. Its own file says how it is started."""
+"""Restart the pool's manager if it was killed or hangs. The manager's file says how to start it."""
 
 import logging
 import subprocess
@@ -17,13 +17,13 @@ NAME = "manager.json"
 LOOK_S = 1.0
 BACKOFF_LIMIT_S = 60.0
 STEADY_S = 60.0
-HANGS_AFTER_S = 120.0  # it may wait for its cloud
+HANGS_AFTER_S = 120.0  # it may be waiting for the cloud
 
 
 class ManagerRestart:
-    """Watches the manager of a pool's folder, ends one that hangs and restarts it.
+    """Watches the manager of a pool's folder: kills it if it hangs, restarts it if it is gone.
 
-    Its environment is to be what our own was before ROS was prepared in it.
+    `environ` is for the manager: our own environment before ROS was prepared in it.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class ManagerRestart:
         self.child: subprocess.Popen[bytes] | None = None
 
     def look(self) -> None:
-        """Restart the manager if it has been missing for a while, with growing pauses.
+        """Restart the manager if it has been missing for a while, with exponential backoff.
 
         Raises StateError: It cannot be started, or its file is damaged.
         """
@@ -67,7 +67,7 @@ class ManagerRestart:
         if self._hanging.end(holder):
             log.error("manager_hangs pid=%d", holder)
         missing = not any(map(disk.is_locked, locks))
-        if missing and self._missing:  # not for an instant only, as between two commands
+        if missing and self._missing:  # twice in a row: not just between two commands
             self._start(command, folder, log_path)
         self._missing = missing
 
@@ -77,14 +77,14 @@ class ManagerRestart:
         self._wait_s = LOOK_S if ran_s > STEADY_S else min(2 * self._wait_s, BACKOFF_LIMIT_S)
         self._look_at, self._started_at = now + self._wait_s, now
         try:
-            here = folder if folder.is_dir() else self._folder  # where `up` was, if still there
+            here = folder if folder.is_dir() else self._folder  # where `up` ran, if it still exists
             self.child = detached(command, log_path, folder=here, environ=self._environ)
         except OSError as error:
             raise StateError(f"the manager cannot be restarted: {error}") from error
         log.warning("manager_started_again pid=%d", self.child.pid)
 
     def close(self) -> None:
-        """End a restarted manager that is not working yet: the pool may be shutting down."""
+        """Kill a restarted manager that has no lock yet: the pool may be shutting down."""
         child = self.child
         if child is not None and child.poll() is None and not disk.is_locked(self._lock):
             child.kill()

@@ -1,7 +1,7 @@
-"""The durable state of a sequencer: term, last answer and its version.
+"""The durable state of a sequencer: term, position of the last answer, and its version.
 
-Four numbers in a memory-mapped file. A write is one store into memory that belongs to the
-kernel: it survives SIGKILL, and costs less than a microsecond.
+Four numbers in a memory-mapped file. A write is one store into the kernel's page cache: it
+survives SIGKILL, and costs less than a microsecond.
 """
 
 import mmap
@@ -21,9 +21,9 @@ _VERSION = re.compile(r"[0-9a-f]{16}")
 
 
 class OrderMark:
-    """The mark of one stateful service on one robot; its file is made if there is none.
+    """The mark of one stateful service on one robot; its file is created if missing.
 
-    Raises StateError: It cannot be used, or belongs to another pool.
+    Raises StateError: The file cannot be used, or belongs to another pool.
     """
 
     def __init__(self, path: Path, pool_uid: str) -> None:
@@ -52,12 +52,12 @@ class OrderMark:
 
     @property
     def holder(self) -> str | None:
-        """The version of the replicas that it came from; None if unknown."""
+        """The version of the replicas that the last answer came from; None if unknown."""
         word = self._words[_HOLDER]
         return f"{word:016x}" if word else None
 
     def new_term(self, nonce: int, *, above: int = 0) -> int:
-        """Return, and store, an epoch above `above` and all earlier ones."""
+        """Store and return a new epoch, greater than `above` and all earlier ones."""
         self._version = self.holder or ""  # another process may have written meanwhile
         epoch = orders.next_epoch(max(self._words[_TERM], above), nonce)
         self._words[_TERM] = epoch
@@ -65,13 +65,13 @@ class OrderMark:
         return epoch
 
     def write(self, position: Position, version: str = "") -> None:
-        """Store that this answer is being returned, and the version it comes from."""
-        # In this order: killed between the two, the file asks for no more than there is,
-        # for an index never falls when a term begins.
+        """Store the position of the answer being returned, and the version it comes from."""
+        # In this order: if killed between the two, the file never claims more than exists,
+        # since an index never falls when a term begins.
         if self._words[_EPOCH] != position.epoch:
             self._words[_EPOCH] = position.epoch
         self._words[_INDEX] = position.index
-        if version != self._version:  # last: the active one has a state up to the index
+        if version != self._version:  # last: the active version has the state up to the index
             self._version = version
             self._words[_HOLDER] = int(version, 16) if _VERSION.fullmatch(version) else 0
 

@@ -1,7 +1,7 @@
 """``fogft proxy --config FILE``: the client proxy as a process.
 
-It follows two files, the configuration and the membership, and writes one, its report. It
-needs no manager: started alone it goes on with the last membership on disk.
+It watches two files, the configuration and the membership, and writes its report. It needs no
+manager: started alone, it uses the last membership on disk.
 """
 
 import contextlib
@@ -53,27 +53,27 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_STATEFUL_BYTES = 64 << 20  # of requests; each is in the log of its order, too
+_STATEFUL_BYTES = 64 << 20  # limit on open requests; each is in the order's log, too
 TRACE_NAME = "trace.jsonl"
 _TRACE_BYTES = 16 << 20
 _REPORT_EVERY_S = 1.0
 _REPORT_AFTER_CHANGE_S = 0.05
-_LOOK_EVERY_S = 0.25  # at files, and what else needs no haste
+_LOOK_EVERY_S = 0.25  # at files and other things that are not urgent
 
 
 def run(
     config_path: Path, *, metrics: str | None = None, standby: bool = False, spare: bool = False
 ) -> None:
-    """Run until a signal ends it.
+    """Run until a signal stops it.
 
     Args:
-        metrics: Replaces the file's.
-        standby: Where one runs already, wait until it ends, and take its place at once.
-        spare: The same, and where one stands by already, wait to stand by.
+        metrics: Overrides the file's `metrics`.
+        standby: If a proxy is already running, wait until it ends and take over at once.
+        spare: The same, but if there is a standby already, first wait for its place.
 
     Raises:
-        PoolBusy: This pool's client proxy runs already, with `standby` another standby too,
-            with `spare` another spare.
+        PoolBusy: This pool's client proxy is already running; with `standby`, another standby
+            too; with `spare`, another spare.
         FogftError: The configuration, the credentials or ROS cannot be used.
     """
     begin_start()
@@ -117,7 +117,7 @@ def run(
 def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
     """Create the dialer of a proxy or gateway.
 
-    With several uplinks one is suspected in half the time: a false alarm costs a copy, no more.
+    With several uplinks, a link is suspected in half the time: a false alarm only costs a copy.
     """
     from fogft.link.zenoh.robot.dialer import ZenohDialer
 
@@ -136,7 +136,7 @@ def make_dialer(config: ClientProxyConfig) -> UplinkDialer:
 
 
 class _Running:
-    """A client proxy that runs, with all that its thread sees to."""
+    """A running client proxy, with everything that its main loop looks after."""
 
     def __init__(
         self,
@@ -155,7 +155,7 @@ class _Running:
         self.config_path, self.metrics, self.config = config_path, metrics, config
         self.lock, self.managing = lock, managing
         self.held = in_line.is_held(config.lock)
-        made: list[ClientProxy] = []  # the node asks the proxy that is made with it
+        made: list[ClientProxy] = []  # the proxy, once created: the node needs it and vice versa
         joined = self.joined = middleware.join(
             config.rmw,
             _node_name("fogft_proxy", config.pool),
@@ -173,7 +173,7 @@ class _Running:
         made.append(proxy)
         check_field = functools.partial(trouble, bool_field)
         self.seen = SeenFromRos(config.pool, config.robot, self._make_visible, check_field)
-        self.again = False  # whether the configuration is to be tried again
+        self.again = False  # whether to try the configuration again
         try:
             proxy.serve(self.seen.follow(config.services))
         except RosError:
@@ -202,7 +202,7 @@ class _Running:
         shared: dict[str, Any] = {"wake": wake, "fault_of": fault_of, "id_of": self.id_of}
         if spec.part is not Part.NONE:
             return self.actions.make(spec, respond, **shared)
-        # The policy may become `empty` later.
+        # The policy may change to `empty` later.
         empty = middleware.empty_response(self.config.rmw, spec.type, needed=spec.needs_type)
         make = functools.partial(Dispatcher, spec, respond, empty_response=empty, **shared)
         if spec.state is not None:
@@ -230,7 +230,7 @@ class _Running:
             return None
 
     def close(self) -> None:
-        """Leave, and let another one work."""
+        """Close everything and release the lock, so that another proxy can take over."""
         self.managing.close()
         self.scrape.close()
         self.following.close()
@@ -242,7 +242,7 @@ class _Running:
         return {name: self.joined.callers(name) for name in self.proxy.offered}
 
     def release(self) -> None:
-        """Let another proxy work: it must not take us for dead, and needs our ports."""
+        """Let another proxy take over: it must not declare us dead, and needs our ports."""
         self.scrape.close()
         self.following.close()
         try_step(self._forget_participant, self.config.status)
@@ -257,12 +257,12 @@ class _Running:
     def loop(self, stop: threading.Event) -> bool:
         """Serve until told to stop, or until the pool's folder is gone.
 
-        Returns True where another process is to go on, because this one was stopped for long.
+        Returns True if another process must go on, because this one was suspended for long.
         """
         proxy, config, folder = self.proxy, self.config, self.config_path.parent
         memory, watchdog = memory_tuning.Trimmer(), Watchdog()
         watched_config = Watched(self.config_path, from_now=True)
-        # It is written after its key.
+        # The certificate is written after its key.
         watched_certificate = Watched(config.credentials.certificate, from_now=True)
         announcements = Watched(config.announcements) if config.announcements else None
         started = reported = time.monotonic()
@@ -272,7 +272,7 @@ class _Running:
         while not stop.is_set():
             changed = proxy.run_once(_LOOK_EVERY_S) or changed
             now = time.monotonic()
-            if now - looked < _LOOK_EVERY_S:  # requests' own deadlines are seen to by `run_once`
+            if now - looked < _LOOK_EVERY_S:  # `run_once` handles the deadlines of requests
                 continue
             looked = now
             memory.look()
@@ -299,10 +299,10 @@ class _Running:
                 reported, changed = now, False
                 if self.again:
                     watched_config.forget()
-                if self.lock.lost or not folder.exists():  # the pool's: its end is the pool's
+                if self.lock.lost or not folder.exists():  # without it the pool has ended
                     log.warning("folder_gone path=%s", folder)
                     return False
-                # The id of this process in DDS, once it offers a service.
+                # The DDS participant id of this process, once it offers a service.
                 ids = map(self.joined.participant, proxy.offered)
                 participant = participant or next(filter(None, ids), b"")
                 told = {"uptime_s": now - started, "participant": participant.hex()}
@@ -333,7 +333,7 @@ class _Running:
             self.proxy.follow(membership)
 
     def _credentials_left_s(self) -> float | None:
-        """Return for how long a manager beside it can call the cloud, as far as it says so."""
+        """Return how long the local manager's cloud credentials are valid; None if unknown."""
         told: Any = None
         with contextlib.suppress(FogftError):
             told = disk.read_json(self.config.lock.parent / "status.json")
@@ -366,7 +366,7 @@ def try_step(step: Callable[[], None], path: Path) -> bool:
     """
     try:
         step()
-    except (FogftError, OSError) as error:  # of the system: no descriptor, no folder
+    except (FogftError, OSError) as error:  # OSError: no file descriptor, no folder
         reason = error.message if isinstance(error, FogftError) else str(error)
         if _troubles.get(path) != reason:
             _troubles[path] = reason
@@ -377,7 +377,7 @@ def try_step(step: Callable[[], None], path: Path) -> bool:
 
 
 def _same(old: ClientProxyConfig, new: ClientProxyConfig, path: Path) -> ClientProxyConfig:
-    """Return the new configuration. Raises StateError where this process cannot take it."""
+    """Return the new configuration. Raises StateError if this process cannot apply it."""
     if (new.pool_uid, new.domain_id, new.rmw) != (old.pool_uid, old.domain_id, old.rmw):
         raise StateError(
             f"`{path}`: pool_uid, domain_id and rmw cannot change while the proxy runs"
@@ -386,8 +386,8 @@ def _same(old: ClientProxyConfig, new: ClientProxyConfig, path: Path) -> ClientP
 
 
 def _bury(config: ClientProxyConfig) -> None:
-    """Tell ROS that the process which had the lock before us is gone: if killed, it could not."""
-    with contextlib.suppress(StateError, ValueError):  # what a file says
+    """Tell ROS that the previous holder of the lock is gone: if killed, it could not do so."""
+    with contextlib.suppress(StateError, ValueError):  # from reading and parsing the file
         left = disk.read_json(config.status)
         if isinstance(left, dict) and isinstance(said := left.get("participant"), str):
             domain = own_domain() if config.domain_id is None else config.domain_id
@@ -395,7 +395,7 @@ def _bury(config: ClientProxyConfig) -> None:
 
 
 def _trace(path: Path, proxy: ClientProxy, spans: Spans | None) -> None:
-    """Append how requests ended, a JSON object a line, or export it; keep one older file."""
+    """Append request outcomes as JSON lines, keeping one older file, or export them as spans."""
     lines = proxy.trace()
     if not lines:
         return

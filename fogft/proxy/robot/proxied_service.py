@@ -1,8 +1,8 @@
 """One service on the robot: its dispatcher, and its ROS server while it is offered.
 
-`wait_for_service` in the robot's code is true exactly while it is. A service that is withdrawn
-loses what is sent to it meanwhile, so it is not withdrawn for a moment's silence, nor under a
-request that may still be answered.
+`wait_for_service` in the robot's code is true exactly while it is offered. Requests sent to a
+withdrawn service are lost, so a service is not withdrawn during a brief outage, nor while a
+request may still be answered.
 Owns: which links may be asked.
 """
 
@@ -18,8 +18,8 @@ from fogft.ros.port import RosClient, RosNode, RosServer
 
 log = logging.getLogger(__name__)
 
-_LOOK_EVERY_S = 2.0  # whether clients understand our middleware, and who else offers it
-HOLD_S = 3.0  # longer than the command of a lone replica takes to be started again
+_LOOK_EVERY_S = 2.0  # check for clients with other middleware, and other servers of the service
+HOLD_S = 3.0  # longer than it takes to restart the command of a lone replica
 
 
 class ProxiedService:
@@ -51,11 +51,11 @@ class ProxiedService:
         self.dispatcher.adopt(spec, self._fallback)
 
     def may_ask(self, links: Sequence[Link], draining: Collection[ReplicaId]) -> list[Link]:
-        """Return the links with our type over which its requests may be sent."""
-        if self.spec.state is not None:  # replicas are brought to readiness by what is sent
+        """Return the links, among those with our type, over which requests may be sent."""
+        if self.spec.state is not None:  # replicas become ready by what is sent to them
             return [link for link in links if link.usable]
         ready = [link for link in links if self.spec.name in link.ready]
-        if self.spec.part is Part.CANCEL:  # who is told to stop may drain; who is to work not
+        if self.spec.part is Part.CANCEL:  # draining replicas get cancellations, but no new work
             return ready
         return [link for link in ready if link.peer.id not in draining] or ready
 
@@ -89,7 +89,7 @@ class ProxiedService:
         try:
             asked = self.dispatcher
             self.server = node.serve(spec.name, spec.type, asked.submit, asked.burst)
-        except RosError as error:  # it shall not take the other services with it
+        except RosError as error:  # it must not affect other services
             self._note("service_not_advertised", error.message)
         else:
             self._note("", "")
@@ -101,7 +101,7 @@ class ProxiedService:
         self.trouble = trouble
 
     def end(self) -> None:
-        """Answer open requests as at their deadlines, and close it: another takes its place."""
+        """Answer open requests as at their deadlines, and close: another takes its place."""
         self.dispatcher.expire(every=True)
         for end in (self.server, self._fallback):
             if end is not None:

@@ -1,6 +1,6 @@
 """Offer one service's requests to links, and cancel requests at links.
 
-The one place where a request leaves for a replica. Which links may be asked: `proxied_service`.
+The only place where a request is sent to a replica. Which links may be asked: `proxied_service`.
 """
 
 import threading
@@ -22,14 +22,14 @@ class Sender:
         self._ledger = ledger
         decide = ledger.requests.decide
         self._replication = decide if decide.replicates else None
-        self._sending = threading.Lock()  # what replicas must have leaves in its order
+        self._sending = threading.Lock()  # keeps replicated requests in order
         self._in_burst = False
         self._hanging: set[int] = set()
-        self.links: dict[int, Link] = {}  # those that may be asked, by replica
+        self.links: dict[int, Link] = {}  # links that may be asked, by replica
         self.able: tuple[int, ...] = ()  # the replicas that the policy may choose
 
     def burst(self, begins: bool) -> None:
-        """Batch what is sent until the burst ends into few messages."""
+        """Begin or end a burst: what is sent until its end is batched into few messages."""
         self._in_burst = begins
         if not begins:
             for link in list(self.links.values()):
@@ -39,9 +39,9 @@ class Sender:
         self, request: bytes, payload: bytes, links: Mapping[int, Link], chosen: Sequence[int],
         timeout_s: float,
     ) -> int:  # fmt: skip
-        """Offer a new request to its chosen replicas; return how many have taken it."""
+        """Offer a new request to its chosen replicas; return how many accepted it."""
         name, is_spare = self._ledger.spec.name, self._ledger.requests.choose.is_spare
-        several, taken = len(chosen) > 1, 0  # one alone is no spare
+        several, taken = len(chosen) > 1, 0  # a single copy is never a spare
         for replica in chosen:
             spare = several and is_spare(request, replica)
             handling = Handling.DROP_IF_BUSY if spare else Handling.NORMAL
@@ -53,7 +53,7 @@ class Sender:
                 self._declined(request, replica, is_copy=True)
         self._count(taken)
         if several and request not in self._ledger.requests:
-            # Answered before the last link had it: its answer could not reach that one.
+            # Answered before the last link had it: that link was not told of the end.
             self.forget(request, chosen)
         return taken
 
@@ -66,7 +66,7 @@ class Sender:
     ) -> None:
         """Set the links that may be asked now, and offer them open requests.
 
-        Those `hanging` are among them: they say that the service answers nothing of what it has.
+        Replicas in `hanging` may be among them: they report that their service is not responding.
         """
         routed = {key_of(link): link for link in links}
         replication, now = self._replication, self._ledger.clock()
@@ -94,13 +94,13 @@ class Sender:
         self.replicate()
 
     def offer_more(self, now: float) -> float:
-        """Ask the policy who needs a further replica; return when it is to be asked again."""
+        """Send open requests to more replicas as the policy says; return when to call again."""
         newest_first = self._ledger.spec.freshness is Freshness.LATEST
         with self._ledger.lock:
             links, requests = self.links, self._ledger.requests
             steps = requests.more(self.able, now, newest_first=newest_first)
             look_at = requests.choose.look_at
-        full: set[int] = set()  # who declined a request a moment ago is offered no other
+        full: set[int] = set()  # a replica that declined a request just now is offered no other
         for request, replica in steps:
             if not self._offer(request, replica, links[replica], skip=replica in full):
                 full.add(replica)
@@ -131,7 +131,7 @@ class Sender:
         return True
 
     def replicate(self) -> None:
-        """Send all that must be replicated."""
+        """Send everything that must be replicated."""
         replication, ledger = self._replication, self._ledger
         if replication is None:
             return

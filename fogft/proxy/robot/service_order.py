@@ -1,7 +1,7 @@
-"""The order of one stateful service on a robot, term after term.
+"""Orders the requests of one stateful service on a robot, across terms.
 
-All that it decides is `ordering.sequencer`'s; here are the requests that have a number, those that
-wait for one, and the mark that survives this process. Protocol: docs/design/state.md.
+The decisions are made in `ordering.sequencer`. This module keeps the numbered requests, those
+waiting for a number, and the mark that survives this process. Protocol: docs/design/state.md.
 """
 
 import logging
@@ -19,14 +19,14 @@ from fogft.requests.pending import POISON_DEATHS
 
 log = logging.getLogger(__name__)
 
-# An order is not given up at its caller's deadline: it must be applied all the same.
+# An order is not abandoned at its caller's deadline: it must still be applied.
 _ATTEMPT_S = 60.0
 
 
 class ServiceOrder(Decide):
     """Numbers requests, and decides what to send to which replica and which answers count.
 
-    While `held`, another proxy orders still: requests wait until `take_over`.
+    While `held`, another proxy still orders: requests wait until `take_over`.
     """
 
     replicates = sends_requests = True
@@ -49,12 +49,12 @@ class ServiceOrder(Decide):
         self._replicas = Reachable((), {}, ())
         self._requests: dict[int, bytes] = {}  # by number
         self._numbers: dict[bytes, int] = {}
-        self._waiting: dict[bytes, bytes] = {}  # no replica can take them yet; oldest first
+        self._waiting: dict[bytes, bytes] = {}  # not numbered yet; oldest first
         self._told = ""
         self._term = self._begin_term()
 
     def _begin_term(self, above: int = 0, begin: Handover | None = None) -> Sequencer:
-        self._numbers.clear()  # what has one has its answer, or gets none: it was another term's
+        self._numbers.clear()  # numbered requests of an earlier term are answered, or never will be
         self._requests.clear()
         epoch = self._mark.new_term(secrets.randbits(32), above=above)
         mark = self._mark.position
@@ -62,11 +62,11 @@ class ServiceOrder(Decide):
         return Sequencer(epoch, mark=mark, holder=self._mark.holder, begin=begin)
 
     def hold(self) -> None:
-        """Stop ordering: another proxy does, and its term ends this one."""
+        """Stop ordering: another proxy takes over, and its term ends this one."""
         self._held = True
 
     def take_over(self, now: float) -> None:
-        """Begin a term from the last answer, if another proxy has ordered until now."""
+        """Begin a term after the last answer, if another proxy has ordered until now."""
         if self._held:
             self._held, self._term = False, self._begin_term()
             self._reach(now)
@@ -93,7 +93,7 @@ class ServiceOrder(Decide):
             return "no reachable replica has the state; see docs/design/state.md"
         return ""
 
-    # -- what a caller wants --------------------------------------------------------------
+    # -- callers' requests ----------------------------------------------------------------
 
     def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         """Number a request; it waits if no replica can take it."""
@@ -109,20 +109,20 @@ class ServiceOrder(Decide):
         return True
 
     def closed(self, request: bytes, pending: Pending) -> None:
-        """Note that nobody waits for this answer any more. Numbered requests are still applied."""
+        """Note that no caller awaits the answer any more. Numbered requests are still applied."""
         self._waiting.pop(request, None)
         number = self._numbers.pop(request, None)
         if number is not None:
             del self._requests[number]
             self._term.abandon(number)
 
-    # -- what replicas say ----------------------------------------------------------------
+    # -- replicas' replies ----------------------------------------------------------------
 
     def request_of(self, id: bytes) -> bytes | None:
-        """Return the request of a number; None for an order about no request."""
+        """Return the request of an order, b"" if it is over; None for an order about no request."""
         try:
             op, epoch, number = decode(id)
-        except OrderError:  # of the time before this service was stateful
+        except OrderError:  # an attempt from before this service was stateful
             return None
         if op not in (Op.APPLY, Op.RECALL):
             return None
@@ -131,7 +131,7 @@ class ServiceOrder(Decide):
     def judge(
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
-        """Take a reply; if it answers a number, store that it is being returned."""
+        """Take a reply; if it answers a request, store its position before it is returned."""
         current = self._current(id)
         if current is None:
             return Means.NOTHING
@@ -159,7 +159,7 @@ class ServiceOrder(Decide):
             op, _, number = current
             kills = self._term.refused(replica, op, number, refusal, self._clock(), detail=detail)
             if kills and pending is not None:
-                pending.deaths = POISON_DEATHS  # it is given up
+                pending.deaths = POISON_DEATHS  # so the request is given up
             elif kills:
                 log.error("request_poison service=%s number=%d", self._name, number)
         self._wake_if_due()
@@ -181,7 +181,7 @@ class ServiceOrder(Decide):
         if self._term.due:
             self._wake()
 
-    # -- what is sent ---------------------------------------------------------------------
+    # -- sending --------------------------------------------------------------------------
 
     def reach(self, replicas: Reachable, now: float) -> None:
         """Set the reachable replicas."""
@@ -193,7 +193,7 @@ class ServiceOrder(Decide):
         self._term.reach(versions, now, versions=versions, draining=draining)
 
     def take(self, now: float, timeout_s: float) -> list[Send]:
-        """Number waiting requests, and return the orders to send, in order."""
+        """Number the waiting requests, and return the orders to send, in sequence."""
         if self._held:
             return []
         self._tick(now)
@@ -217,20 +217,20 @@ class ServiceOrder(Decide):
         ]
 
     def _tick(self, now: float) -> None:
-        if self._term.deposed_by is not None:  # by a term of ours that the file has lost track of
+        if self._term.deposed_by is not None:  # by a term of ours that is not in the mark's file
             above = self._term.deposed_by
             log.warning("term_ended service=%s obeyed=%x", self._name, above)
             self._term = self._begin_term(above)
             self._reach(now)
         self._term.tick(now)
         begin = self._term.handover
-        if begin is not None:  # all numbers given are answered, and none waits
+        if begin is not None:  # every number given is answered, and none waits
             log.info("version_changed service=%s version=%s", self._name, begin.version)
             self._term = self._begin_term(begin=begin)
             self._reach(now)
 
     def report(self) -> dict[str, Any]:
-        """Return the state of the order, as `proxy-status.json` has it."""
+        """Return the state of the order, as reported in `proxy-status.json`."""
         term = self._term
         log_ = term.log
         order = {

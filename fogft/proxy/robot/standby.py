@@ -1,8 +1,8 @@
 """The standby client proxy, and hand-over to it. Design: docs/design/manager.md.
 
-The standby has loaded everything and its DDS participant is known, but it offers nothing and no
-node of it is seen. It waits for the lock, which the kernel gives it when the holder ends. Behind it
-a spare waits for its place, which has no thread of ROS's or Zenoh's yet, so that it can fork.
+The standby has loaded everything and its DDS participant is discovered, but it offers no service
+and has no visible node. It waits for the lock, which the kernel grants when the holder ends. A
+spare waits for the standby's place; it has no ROS or Zenoh threads yet, so it can fork.
 """
 
 import contextlib
@@ -29,16 +29,16 @@ from fogft.ros.joining import EarlyJoin, Pauses
 log = logging.getLogger(__name__)
 
 LOOK_S = 0.2
-BEGIN_LIMIT_S = 15.0  # the standby offers our services by then, or it has failed
-RENEWED_AFTER_S = 0.5  # a pause, a standby has joined anew and is known
-COPIES = 10  # of copies, at most so many within a time: they may be ending by themselves
+BEGIN_LIMIT_S = 15.0  # if the standby does not offer our services by then, it has failed
+RENEWED_AFTER_S = 0.5  # this long after a pause, a standby has rejoined and is discovered
+COPIES = 10  # limit on copies within COPIES_WITHIN_S: they may be failing at once
 COPIES_WITHIN_S = 60.0
-KNOWN_AFTER_S = 1.0  # once it offers them and knows the callers: until they know its services
-ORDER_LIMIT_S = 20.0  # what was ordered is answered by then, or not at all
-ANEW_LIMIT_S = 2.0  # without a standby: who asks now is answered only afterwards
-FINISH_LIMIT_S = 130.0  # in all less than systemd and `fogft service install` wait
-_PACED_S = 0.5  # until responses that are spread for their client are out
-# What a client proxy imports only when it needs it.
+KNOWN_AFTER_S = 1.0  # time for callers to discover the services of a standby that knows them
+ORDER_LIMIT_S = 20.0  # ordered requests are answered by then, or not at all
+ANEW_LIMIT_S = 2.0  # without a standby: new requests are answered only after the restart
+FINISH_LIMIT_S = 130.0  # all limits together: less than systemd and `fogft service install` wait
+_PACED_S = 0.5  # until responses that are paced for their client are sent
+# Modules that a client proxy imports only when needed.
 _NEEDED = (
     "fogft.link.zenoh.robot.dialer",
     "fogft.proxy.robot.process",
@@ -52,11 +52,11 @@ def wait(
 ) -> EarlyJoin | None:
     """Prepare as much as possible, then wait for the lock; return the prepared ROS node.
 
-    Returns early, without the lock, when `stop` is set or the pool's folder is gone. A `spare`
+    Returns early, without the lock, if `stop` is set or the pool's folder is gone. A `spare`
     waits for the standby's place first.
 
     Raises:
-        PoolBusy: Another one is next in line already.
+        PoolBusy: There is a standby already, or with `spare` a spare.
         FogftError: ROS cannot be used.
     """
     for module in _NEEDED:
@@ -65,7 +65,7 @@ def wait(
     place = disk.Lock(disk.standby_lock(config.lock))
     if spare:
         _wait_as_spare(config, place, stop)
-    elif not place.acquire(wait=False):  # whoever holds it is ready to take over
+    elif not place.acquire(wait=False):  # its holder is ready to take over
         raise PoolBusy(f"the client proxy of pool `{config.pool}` already has a standby")
     if stop.is_set():
         return None
@@ -89,7 +89,7 @@ def wait(
 
 
 def _wait_as_spare(config: ClientProxyConfig, place: disk.Lock, stop: threading.Event) -> None:
-    """Wait for the standby's place; leave a copy of this process that waits for it in turn."""
+    """Wait for the standby's place, then fork the next spare."""
     spare, copied = disk.Lock(disk.standby_lock(disk.standby_lock(config.lock))), list[float]()
     while True:
         if not spare.acquire(wait=False):
@@ -98,11 +98,11 @@ def _wait_as_spare(config: ClientProxyConfig, place: disk.Lock, stop: threading.
         taken = _take(place, config, stop)
         spare.release()
         copied = [at for at in copied if at > time.monotonic() - COPIES_WITHIN_S]
-        # systemd counts only on what it has started.
+        # systemd supervises only processes that it has started.
         if not taken or len(copied) >= COPIES or "NOTIFY_SOCKET" in os.environ or os.fork():
             return
         copied.append(time.monotonic())
-        place.release()  # the one that we are a copy of has it
+        place.release()  # the parent holds it
 
 
 def _take(
@@ -111,7 +111,7 @@ def _take(
     stop: threading.Event,
     look: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Wait for a lock; return whether we have it, or are to stop."""
+    """Wait for a lock; return whether it was acquired, False if told to stop."""
 
     def take() -> None:
         taken = False
@@ -134,14 +134,14 @@ def _take(
 
 
 def request_ids(key: Path, identity: Callable[[Any], Any]) -> Callable[[str, Any], bytes]:
-    """Return what gives requests their ids: both proxies of a robot give a request the same.
+    """Return a function that makes request ids: both proxies of a robot compute the same id.
 
-    Others cannot guess it: the robot's private `key` is part of it. `identity` returns what both
-    know a request by, of its handle; without an id of ROS's own it gets a random one.
+    Others cannot guess the id: it depends on the robot's private `key`. `identity` returns, for a
+    request's handle, what both know the request by; without a ROS request id, the id is random.
     """
     try:
         secret = hashlib.sha256(key.read_bytes()).digest()
-    except OSError:  # who needs the key will say so
+    except OSError:  # reported by whoever needs the key
         secret = os.urandom(32)
 
     def id_of(service: str, handle: Any) -> bytes:
@@ -161,9 +161,9 @@ def hand_over(
 ) -> bool:
     """Hand over to the standby; return, when done, whether there was one.
 
-    `callers` counts who may call each service that we offer; `release` gives up the lock, and all
-    else that the standby needs for itself. Replicas that dial in have one door: nothing is shared.
-    Where the pool's folder goes, nothing more is waited for.
+    `callers` counts the clients of each service that we offer; `release` gives up the lock and
+    everything else that the standby needs. With `dial_in` there is no hand-over: the port cannot be
+    shared. If the pool's folder disappears, all waits end.
     """
     taken, order = _files(config.lock)
     lock = disk.Lock(order)
@@ -200,18 +200,18 @@ def hand_over(
 
 
 def start_anew(proxy: ClientProxy) -> None:
-    """Answer what is under way, as far as that is soon, before this process starts anew."""
+    """Take no more requests and wait briefly for open ones, before this process restarts."""
     proxy.take_no_more()
     _run(proxy, ANEW_LIMIT_S, lambda: proxy.waiting() == 0)
 
 
 def is_held(lock: Path) -> bool:
-    """Whether the proxy that hands over to us still orders stateful services."""
+    """Whether the proxy that is handing over to us still orders stateful services."""
     return disk.is_locked(_files(lock)[1])
 
 
 def taken_before(lock: Path) -> Mapping[str, Collection[bytes]] | None:
-    """Return the requests it has taken, by service; None if it was killed or ran out of space."""
+    """Return the requests that proxy took, by service; None if it was killed or its disk full."""
     with contextlib.suppress(StateError, ValueError, TypeError, AttributeError):
         told = disk.read_json(_files(lock)[0])
         return {str(name): set(map(bytes.fromhex, ids)) for name, ids in told.items()}
@@ -231,7 +231,7 @@ def _run(proxy: ClientProxy, limit_s: float, done: Callable[[], bool]) -> bool:
 
 
 def _takes(report: Path, callers: Mapping[str, int]) -> bool:
-    """Whether another proxy offers all of these services, to as many callers at least."""
+    """Whether another proxy offers all of these services, to at least as many callers."""
     with contextlib.suppress(StateError, AttributeError, KeyError, TypeError):
         told = disk.read_json(report)
         theirs = told["callers"]

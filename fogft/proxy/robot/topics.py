@@ -1,6 +1,6 @@
-"""Topics on the robot: sends its messages to every replica, publishes the replicas' here.
+"""Topics on the robot: sends its messages to every replica, publishes the replicas' messages here.
 
-Owns: the robot's subscriptions and publishers, what each replica still has to get, and pulls.
+Owns: the robot's subscriptions and publishers, each replica's outbox, and pulls.
 """
 
 from __future__ import annotations
@@ -32,28 +32,28 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_MESSAGE_S = 10.0  # a message that is not confirmed in this time goes again
+_MESSAGE_S = 10.0  # a message not confirmed within this time is sent again
 _PULL_S = 10.0
 _AGAIN_S = 0.2  # after a refusal
-_AT_ONCE_S = 0.1  # a pull that is answered sooner with nothing was not held
-_LOOK_EVERY_S = 2.0  # whether publishers are heard, and how often they publish
+_AT_ONCE_S = 0.1  # a replica that answers a pull sooner, without messages, did not hold it
+_LOOK_EVERY_S = 2.0  # check whether publishers are heard, and compute the rate
 _UNCONFIRMED_LIMIT = 4096
-_STATUS_BYTES = 128 << 10  # all replicas' are merged anew for each that comes: of 4000 goals
+_STATUS_BYTES = 128 << 10  # 4000 goals; limited since each status makes us merge all replicas'
 
 
-# Makes one message of what several replicas said last; None where there is nothing to say.
+# Merges the last messages of several replicas into one; None if there is nothing to publish.
 Merge = Callable[[Mapping[int, bytes]], bytes | None]
 
 
 class _Way:
-    """A topic and one replica."""
+    """The state of one topic towards one replica."""
 
     def __init__(self, topic: TopicSpec) -> None:
         self.outbox = Outbox(topic.depth)
         self.session, self.after = frames.NO_SESSION, 0
         self.rest_until = self.pulled_at = 0.0
         self.out: dict[bytes, int] = {}  # request id -> a message's number; 0 for a pull
-        self.offer: Callable[..., bool] | None = None  # of the connection that they are on
+        self.offer: Callable[..., bool] | None = None  # of the connection that `out` is on
 
 
 class RobotTopic:
@@ -68,7 +68,7 @@ class RobotTopic:
         self._merge = merge
         self._lock = threading.RLock()
         self._session = os.urandom(frames.SESSION_BYTES)
-        # All that it numbers; kept for replicas that come later where it is latched.
+        # Numbers the messages and, if latched, keeps them for replicas that come later.
         self._kept = Ring(topic.depth if topic.latched else 0, latched=True)
         self._ways: dict[int, _Way] = {}
         self._links: dict[int, Link] = {}
@@ -99,7 +99,7 @@ class RobotTopic:
                 end.close()
 
     def report(self) -> dict[str, Any]:
-        """Return its counters and rate, and why it does not get through."""
+        """Return counters, the rate and, if messages do not get through, the reason."""
         trouble = {"trouble": self.trouble} if self.trouble else {}
         return {**self.count, "rate_hz": round(self._rate_hz, 2), **trouble}
 
@@ -120,7 +120,7 @@ class RobotTopic:
             self._send()
 
     def route(self, links: Mapping[int, Link], members: Iterable[int]) -> None:
-        """Set the links to use now, and the replicas."""
+        """Set the links to use now, and all replicas."""
         with self._lock:
             known = set(members)
             for key in self._ways.keys() - known:
@@ -159,7 +159,7 @@ class RobotTopic:
             if self.topic.origin is Origin.ROBOT:
                 self._send_messages(way, link)
             elif not (self.topic.latched or self._selection.wants(key, now)):
-                way.session = frames.NO_SESSION  # later, it begins with what comes then
+                way.session = frames.NO_SESSION  # a later pull begins with the messages of then
             elif not way.out:
                 way.pulled_at = now
                 pull = frames.encode_pull(way.session, way.after)
@@ -167,7 +167,7 @@ class RobotTopic:
 
     def _send_messages(self, way: _Way, link: Link) -> None:
         if way.out and way.offer != link.offer:
-            return  # by a new connection they would be overtaken
+            return  # messages on a new connection would overtake them
         way.offer = link.offer
         while (one := way.outbox.next()) is not None:
             frame = frames.encode_message(self._session, *one)
@@ -210,7 +210,7 @@ class RobotTopic:
         if reason != Refusal.LOST:
             way.rest_until = self._clock() + _AGAIN_S
         if reason == Refusal.MALFORMED or not self.topic.reliable:
-            way.outbox.confirmed(number)  # sending it again cannot help, or is not asked for
+            way.outbox.confirmed(number)  # sending it again would not help, or is not required
         elif number:
             way.outbox.returned([number])
 
@@ -234,7 +234,7 @@ class RobotTopic:
             self._pass(key, message, now)
 
     def _misread(self, key: int, fault: str) -> None:
-        """Hold it against a replica that it sent what is no message."""
+        """Count a malformed message against its replica."""
         self.malformed[key] += 1
         self.count["refused"] += 1
         if worth_logging(self.malformed[key]):
@@ -246,9 +246,9 @@ class RobotTopic:
             return
         try:
             if self.topic.select is Select.STATUS and len(message) > _STATUS_BYTES:
-                self.count["dropped"] += 1  # of an action with many goals: no fault of the replica
+                self.count["dropped"] += 1  # an action with many goals: not the replica's fault
                 return
-            self._publisher.check(message)  # first: what is no message does not lead
+            self._publisher.check(message)  # first: a malformed message must not be selected
         except Unreadable as error:
             self._misread(key, error.message)
             return
@@ -280,7 +280,7 @@ class TopicsOnRobot:
     _trouble: dict[str, str] = field(default_factory=dict, init=False)
 
     def serve(self, topics: Iterable[TopicSpec], node: SerialisedNode) -> bool:
-        """Pass exactly these topics; return whether they have changed."""
+        """Forward exactly these topics; return whether they have changed."""
         wanted = {topic.key_name: topic for topic in topics}
         changed = False
         for name, old in list(self._topics.items()):
@@ -309,34 +309,34 @@ class TopicsOnRobot:
         return {name: one.topic.type for name, one in self._topics.items()}
 
     def route(self, links: Mapping[int, Link]) -> None:
-        """Set the links to all replicas, by the dispatcher's numbers."""
+        """Set the links to all replicas, by replica key."""
         for name, one in self._topics.items():
             one.route({k: link for k, link in links.items() if name in link.ready}, links)
 
     def answered(self, key: int, answer: Answer) -> None:
         """Pass the end of an attempt to its topic."""
         topic = self._topics.get(answer.service)
-        if topic is not None:  # else it is passed no more
+        if topic is not None:  # else it is no longer forwarded
             topic.answered(key, answer)
 
     def misreads(self, key: int) -> bool:
-        """Whether a replica's messages were malformed, repeatedly."""
+        """Whether a replica's messages were repeatedly malformed."""
         return any(one.malformed[key] >= MALFORMED_LIMIT for one in self._topics.values())
 
     def __len__(self) -> int:
         return len(self._topics)
 
     def tick(self) -> None:
-        """Send what is due."""
+        """Send due messages and pulls of all topics."""
         for one in self._topics.values():
             one.tick()
 
     def report(self) -> dict[str, Any]:
-        """Return counters by topic, and why some do not get through."""
+        """Return counters by topic, with the reason if one does not get through."""
         counts = {one.topic.name: one.report() for one in self._topics.values()}
         return {**counts, **{name: {"trouble": why} for name, why in self._trouble.items()}}
 
     def close(self) -> None:
-        """Close the publisher or subscription."""
+        """Close all publishers and subscriptions."""
         for one in self._topics.values():
             one.close()
