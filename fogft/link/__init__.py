@@ -1,4 +1,4 @@
-"""One link for each replica: its port, its window, and the bytes on the wire.
+"""Links, one per replica: the port (interface), the send window, and the wire format.
 
-Not here: Zenoh (`zenoh`), and which replica is asked (`fogft.requests`).
+Not here: Zenoh (`zenoh`), choosing which replica to ask (`fogft.requests`).
 """

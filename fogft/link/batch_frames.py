@@ -1,7 +1,7 @@
-"""Several small requests, or several small answers, in one message: the bytes. Pure.
+"""Wire format of a batch: several small requests, or several small answers, in one message. Pure.
 
-A message costs both ends far more than the few bytes in it. Like `frame`, a decoder returns a value
-or raises `FrameError`. What is sent together is decided in `window` and `reply_queue`.
+A message costs both ends far more than the few bytes in it. As in `frame`, decoders return a value
+or raise `FrameError`. `window` and `reply_queue` decide what is batched.
 """
 
 import struct
@@ -16,10 +16,10 @@ from fogft.model import refusal
 from fogft.model.names import REQUEST_ID_BYTES
 
 LIMIT = 64  # entries
-ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload leaves alone: it does not wait, nor make wait
+ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload is sent alone: it neither waits nor delays others
 BYTES_LIMIT = 16 << 10  # of all payloads together
 
-BATCH = bytes((frame.VERSION | 0x10,))  # the first byte of a header that is one of several
+BATCH = bytes((frame.VERSION | 0x10,))  # the first byte of a batch's header
 _STAMPED = len(BATCH) + STAMP_BYTES
 _REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdBI")  # id, remaining seconds, handling, length
 _ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s{frame.LOAD_BYTES}s?I")  # ..., refusal, length
@@ -40,7 +40,7 @@ def encode_requests(
 
 
 def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
-    """Return the requests of a batch, each with a header of its own. Raises FrameError."""
+    """Return the requests of a batch, each with its own header. Raises FrameError."""
     if header[:1] != BATCH:
         raise FrameError("no batch of requests")
     seen = header[1:_STAMPED]
@@ -53,7 +53,7 @@ def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, 
 
 
 def encode_answers(stamp: bytes, answers: Answers) -> tuple[bytes, bytes]:
-    """Return header and payload for answers."""
+    """Return header and payload for a batch of answers."""
     parts = []
     for id, load, payload, reason in answers:
         said = reason.encode("ascii") if reason else payload
@@ -78,7 +78,7 @@ def decode_answers(header: bytes, payload: bytes) -> tuple[bytes, list[Answer]]:
 
 
 def _entries(form: struct.Struct, payload: bytes) -> list[tuple[tuple[Any, ...], bytes]]:
-    """Return each entry's fields, the last of which is its length, and its bytes."""
+    """Return each entry's fields (the last one is its length) and its bytes."""
     found = []
     at, end = 0, len(payload)
     while at < end:

@@ -1,10 +1,10 @@
-"""Compress payloads on thin uplinks where that pays, and decompress them. No Zenoh.
+"""Compress payloads on slow links if that saves time, and decompress them. No Zenoh.
 
-zlib at its lowest level: on the links where compression can pay at all it is not what limits. What
-pays is measured for each service. What does not shrink is left alone, and tried again rarely.
+Uses zlib at its lowest level: on links where compression can pay, zlib is not the bottleneck.
+The gain is measured per service. Payloads that do not shrink are sent as is, and rarely retried.
 
-A few kilobytes may become 64 MiB. Zenoh's thread, which brings the bytes of all links, must not
-spend that time, nor may one peer wait behind another: a thread of each peer's own decompresses.
+A few kilobytes may decompress to 64 MiB. Zenoh's thread, which receives for all links, must not
+spend that time, and no peer may wait behind another, so each peer has a decompression thread.
 """
 
 import contextlib
@@ -19,32 +19,32 @@ from fogft.process import on_thread
 
 log = logging.getLogger(__name__)
 
-# What a replica reads, and finds out by itself for answers: robots of 0.2.0 ask for these words.
+# A replica reads zlib, and compresses answers on its own: robots of 0.2.0 look for these words.
 ACCEPTED = frozenset({"zlib", "zlib-answers"})
-LEAST_BYTES = 2048  # smaller ones leave in one packet or two
-LIMIT_BYTES = 64 << 20  # more than a window holds: a frame that claims more is refused
-FASTEST_BYTES_PER_S = 30e6  # a link that drains faster gains nothing by zlib
+LEAST_BYTES = 2048  # smaller ones fit into one or two packets
+LIMIT_BYTES = 64 << 20  # payloads that decompress to more are refused
+FASTEST_BYTES_PER_S = 30e6  # faster links gain nothing from zlib
 _SAMPLE_BYTES = 32 << 10
-_GAIN = 0.9  # of the time to leave, at most so much may remain
+_GAIN = 0.9  # compress if at most this share of the sending time remains
 _LEVEL = 1
 _FIRST_PAUSE, _LONGEST_PAUSE = 16, 1024
 _SHARE_OF_NEW = 0.3
 
 
 class Compression:
-    """Compresses the payloads of one service on one connection, by its last `ratio`. One thread."""
+    """Compresses one service's payloads on one connection; tracks their `ratio`. One thread."""
 
     def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
         self._clock = clock
         self.ratio: float | None = None
         self._s_per_byte = 0.0
-        self._rest = 0  # so many are left alone before the next trial
+        self._rest = 0  # payloads to skip before the next trial
         self._pause = _FIRST_PAUSE
 
     def pack(self, payload: bytes, bytes_per_s: float | None) -> bytes | None:
-        """Return the compressed payload; None if it is to be sent uncompressed.
+        """Return the compressed payload; None to send it uncompressed.
 
-        `bytes_per_s` is what the link was seen to drain; None for not known, which is fast.
+        `bytes_per_s` is the measured rate of the link; None if unknown, which counts as fast.
         """
         if bytes_per_s is None or bytes_per_s > FASTEST_BYTES_PER_S:
             return None
@@ -76,12 +76,12 @@ class Compression:
 
     def _pays(self, bytes_per_s: float) -> bool:
         assert self.ratio is not None
-        s_per_byte = 1 / max(bytes_per_s, 1.0)  # it may have stood still when it was seen
+        s_per_byte = 1 / max(bytes_per_s, 1.0)  # it may have been measured while stalled
         return self._s_per_byte + self.ratio * s_per_byte < _GAIN * s_per_byte
 
 
 def unpack(packed: bytes, limit: int = LIMIT_BYTES) -> bytes:
-    """Decompress a payload. Raises ValueError: it is incomplete, or above `limit` bytes."""
+    """Decompress a payload. Raises ValueError: invalid, incomplete, or above `limit` bytes."""
     reader = zlib.decompressobj()
     try:
         payload = reader.decompress(packed, limit)
@@ -92,23 +92,23 @@ def unpack(packed: bytes, limit: int = LIMIT_BYTES) -> bytes:
     return payload
 
 
-WAITING_LIMIT = 64  # payloads of one peer
-WAITING_BYTES_LIMIT = 64 << 20  # of them together, packed
+WAITING_LIMIT = 64  # payloads queued per peer
+WAITING_BYTES_LIMIT = 64 << 20  # their total, compressed
 
-Done = Callable[[bytes | None], None]  # takes the payload; None where it cannot be decompressed
+Done = Callable[[bytes | None], None]  # takes the payload; None if it cannot be decompressed
 
 
 class Unpacker:
-    """Decompresses the payloads of several peers. Any thread."""
+    """Decompresses payloads on one thread per peer. Callable from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._waiting: dict[str, deque[tuple[bytes, Done, bool]]] = {}
 
     def put(self, peer: str, content: bytes, done: Done, *, packed: bool = True) -> bool:
-        """Decompress a payload, if it is `packed`, then call `done` in the peer's thread.
+        """Queue a payload: the peer's thread decompresses it, if `packed`, and calls `done`.
 
-        False where too much of this peer waits, or there can be no more threads.
+        False if too much of this peer is queued, or no thread can be started.
         """
         with self._lock:
             waiting = self._waiting.get(peer)
@@ -133,10 +133,10 @@ class Unpacker:
                     return
                 content, done, packed = self._waiting[peer].popleft()
             payload: bytes | None = None
-            with contextlib.suppress(ValueError):  # whose payload it was counts it, and logs some
+            with contextlib.suppress(ValueError):  # `done` counts the failure, and logs some
                 payload = unpack(content) if packed else content
             try:
                 done(payload)
-            except Exception:  # the next ones go on
+            except Exception:  # continue with the next ones
                 log.exception("payload_not_taken peer=%s", peer)
             del content, payload, done  # while this thread waits for the lock, and after

@@ -1,12 +1,12 @@
-"""What may be sent now: as many bytes as cannot block, and one large message after the other.
+"""Flow control for sending: a byte credit that cannot block, and one large message at a time.
 
-Sending blocks only when the peer takes nothing and all buffers on the way are full: the smallest
-send and receive buffers of Linux sockets with two batches of Zenoh's, together over 200 KB. So less
-than that may be sent from a thread that must never block. Kept true by
+Sending blocks only when the peer reads nothing and all buffers on the path are full: the smallest
+send and receive buffers of Linux sockets plus two Zenoh batches, over 200 KB in total. So a thread
+that must never block may send less than that. Tested by
 tests/link/zenoh/robot/test_memory_bounds.py.
 
-Copies of one large request that leave together all arrive late: with 0.92 MB over loopback the
-first of three responses took 2.33 ms in turns and 3.29 ms together.
+Copies of one large request sent concurrently all arrive late: with 0.92 MB over loopback, the
+first of three responses took 2.33 ms one at a time and 3.29 ms concurrently.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import threading
 
 from fogft.byte_limit import SMALL_BYTES
 
-_FRAME_BYTES = 256  # what travels with a payload: key, header, encryption
+_FRAME_BYTES = 256  # overhead per payload: key, header, encryption
 
 
 class Credit:
-    """A credit of bytes for one peer: used by sending, regained by what the peer acknowledges."""
+    """A credit of bytes for one peer: used by sending, regained by its acknowledgements."""
 
     limit_bytes = 64 << 10
 
@@ -30,7 +30,7 @@ class Credit:
         self._queued = 0
 
     def take(self, size: int) -> int | None:
-        """Reserve a small send; return its mark, or None where it might block."""
+        """Reserve credit for a small send; return its mark, or None if the send might block."""
         if size > SMALL_BYTES:
             return None
         with self._lock:
@@ -43,14 +43,14 @@ class Credit:
             return mark
 
     def queue(self, size: int) -> int:
-        """Count a send for the thread that may block; until `dequeued` nothing is taken."""
+        """Count a send by the thread that may block; until `dequeued`, `take` returns None."""
         with self._lock:
             self._queued += 1
             self._sent += size + _FRAME_BYTES
             return self._sent
 
     def dequeued(self) -> None:
-        """Note that one blocking send is done."""
+        """Note that one queued send is done."""
         with self._lock:
             self._queued -= 1
 
@@ -60,16 +60,16 @@ class Credit:
             self._heard = max(self._heard, self._sent if mark is None else mark)
 
 
-LARGE_BYTES = 64 << 10  # smaller requests fit into one batch of Zenoh's
+LARGE_BYTES = 64 << 10  # smaller requests fit into one Zenoh batch
 
 
 class LargeSendGate:
-    """Lets one large message of a robot be sent at a time, over all links.
+    """Serializes a robot's large messages over all of its links.
 
-    Who is stuck in its turn loses it: a frozen replica delays the others by `patience_s` once.
+    A send that is stuck loses its turn: a frozen replica delays the others by `patience_s`, once.
     """
 
-    patience_s = 0.005  # how long to wait for another's turn to end
+    patience_s = 0.005  # how long to wait for another send to finish
 
     def __init__(self) -> None:
         self._turn = threading.Lock()
@@ -79,7 +79,7 @@ class LargeSendGate:
         turn = self._turn
         if turn.acquire(timeout=self.patience_s):
             return turn
-        if self._turn is turn:  # whoever has it is stuck: the next do not wait for it again
+        if self._turn is turn:  # its holder is stuck: later sends do not wait for it again
             self._turn = threading.Lock()
         return None
 

@@ -1,7 +1,7 @@
-"""The port between proxies: a robot's links on one side, a replica's listener on the other.
+"""The interface between proxies: a robot's links on one side, a replica's listener on the other.
 
 Law of this port: `Link.offer` never blocks, whatever the peer does; a slow or dead peer
-costs its own link only. Callbacks come from the wire's threads; they must not block.
+affects only its own link. Callbacks run on the transport's threads; they must not block.
 Implementations: `fogft.link.zenoh.robot.link` and `uplinks`, `tests.fakes.link`. A replica's end is
 `fogft.link.zenoh.replica.listener`.
 """
@@ -28,8 +28,8 @@ class SendOptions:
 
     latest: frozenset[str] = frozenset()
     plain: frozenset[str] = frozenset()
-    # Of others, such as topics and the orders of a stateful service, a request's time only says
-    # when it is sent again.
+    # For other services, such as topics and the orders of a stateful service, the time of a
+    # request is not a deadline: it only says when to resend it.
     timed: frozenset[str] = frozenset()
 
     @classmethod
@@ -47,7 +47,7 @@ class Probe:
     """The content of a robot's probe."""
 
     robot: Line
-    describe: bool = False  # the answer shall tell the definitions of the services' types
+    describe: bool = False  # the answer should include the definitions of the services' types
     version: Line = ""  # of fogft on the robot; empty before 0.2.0
 
 
@@ -55,18 +55,18 @@ class Probe:
 class ReplicaWord:
     """A replica's own state, as reported in probe answers and by gateways.
 
-    What changes all the time, durations and counts, makes no two of them differ.
+    Durations and counts that change all the time are ignored when two reports are compared.
     """
 
     slot: Count
     generation: Count
     ready: frozenset[Line] = frozenset()  # names of the services that it can answer now
-    draining: bool = False  # the replica is leaving: its machine said that it will be taken
-    at_risk: bool = False  # its cloud recommends to move it; it serves on meanwhile
+    draining: bool = False  # the replica is leaving: its machine got a preemption notice
+    at_risk: bool = False  # its cloud recommends moving it; it continues to serve
     restarts: Count = 0  # of the user's `run` command
-    detail: Line = ""  # why it is not ready, in words; empty when it is
+    detail: Line = ""  # why it is not ready, in words; empty if it is ready
     version: Line = ""  # of fogft on the replica; empty before 0.2.0
-    # Since it last heard of the pool's manager, and until it shuts down unless it hears again.
+    # Time since the manager last renewed its lease, and until it shuts down without a renewal.
     lease_age_s: Seconds | None = field(default=None, compare=False)
     lease_left_s: Seconds | None = field(default=None, compare=False)
 
@@ -78,11 +78,11 @@ class GatewayView(ReplicaWord):
     state: LinkState
     silent_for_s: Seconds = field(default=0.0, compare=False)
     rtt_s: Seconds | None = field(default=None, compare=False)
-    through: Line = ""  # the further gateways on the way: ``lab`` or ``lab/edge``; empty for none
+    through: Line = ""  # further gateways on the path: ``lab`` or ``lab/edge``; empty for none
 
     @classmethod
     def of(cls, report: Mapping[str, Any]) -> GatewayView:
-        """Return one from what a client proxy reports of a link."""
+        """Build a view from a client proxy's report of a link."""
         known = {field.name: report[field.name] for field in fields(cls) if field.name in report}
         known |= {"state": LinkState(report["state"]), "ready": frozenset(report["ready"])}
         known["draining"] = report["leaving"]
@@ -93,31 +93,31 @@ class GatewayView(ReplicaWord):
 class ProbeAnswer(ReplicaWord):
     """A replica's answer to a probe."""
 
-    # Random text made when the server proxy started. A new one at the same id means that it forgot
-    # every request.
+    # Random text generated when the server proxy started. A new value at the same id means that it
+    # has restarted, and forgotten every request.
     incarnation: Line
     in_flight: Count = field(default=0, compare=False)
     work: Mapping[Line, Seconds] = field(default_factory=dict, compare=False)  # since its start
-    # Service name -> type of what `run` offers, where it is to be found out or not the configured.
+    # Service name -> type that `run` offers, if none is configured or it differs from that one.
     offered: Mapping[Line, Line] = field(default_factory=dict)
-    types: Mapping[Line, Definition] = field(default_factory=dict)  # by name, where a probe asks
+    types: Mapping[Line, Definition] = field(default_factory=dict)  # by name, if the probe asks
     behind: tuple[GatewayView, ...] = ()
-    accepts: frozenset[Line] = frozenset()  # names of compressions; since 0.2.0 all of them
-    # Services that have work, and have answered nothing for far longer than they take.
+    accepts: frozenset[Line] = frozenset()  # the compressions it supports; since 0.2.0, all
+    # Services that have requests and have answered none for far longer than they usually take.
     hanging: frozenset[Line] = frozenset()
-    # Connections turned away: nobody with a certificate spoke.
+    # Connections rejected because the peer did not authenticate.
     strangers: Count = field(default=0, compare=False)
 
 
-@dataclass(slots=True)  # made for each answer: a frozen one costs thrice as much
+@dataclass(slots=True)  # one per answer: a frozen one costs three times as much
 class Answer:
-    """The end of one attempt: `payload` if the service answered, else a `refusal`."""
+    """The outcome of one attempt: `payload` if the service answered, else a `refusal`."""
 
     request_id: bytes
     payload: bytes | None = None
     refusal: Refusal | None = None
     service: str = ""  # the name given to `Link.offer`
-    detail: str = ""  # what belongs to a refusal of its kind
+    detail: str = ""  # of the refusal, if its kind has one
     load: Load | None = None
 
 
@@ -127,11 +127,11 @@ class LinkEvents(Protocol):
     def answered(self, link: Link, answer: Answer) -> None:
         """An attempt has ended. Called exactly once for each accepted `offer`.
 
-        One whose link dies ends with ``Refusal.LOST``; the link drops what comes later.
+        If its link dies it ends with ``Refusal.LOST``, and the link drops later answers to it.
         """
 
     def late(self, link: Link, answer: Answer) -> None:
-        """A forgotten attempt has ended. Of a connection that was given up it may not be told."""
+        """A forgotten attempt has ended. May not be called if its connection was given up."""
 
     def changed(self, link: Link) -> None:
         """The link's `state`, `probe_answer` or room in its window has changed."""
@@ -141,7 +141,7 @@ class LinkEvents(Protocol):
 class Peer:
     """A replica to dial: its endpoint (``host:port``) and the name its certificate must have.
 
-    It is reached through one of our network interfaces; empty for whatever the routes say.
+    `interface` is the local network interface to use; empty to follow the routing table.
     """
 
     id: ReplicaId
@@ -162,12 +162,12 @@ class LinkStatus:
     in_flight: int
     reopened: int
     detail: str
-    uplinks: tuple[Mapping[str, Any], ...] = ()  # how each does, where there are several
-    ignores: bool = False  # it takes requests and never ends them, though others answer them
+    uplinks: tuple[Mapping[str, Any], ...] = ()  # the status of each, if there are several
+    ignores: bool = False  # it takes requests and never ends them, though other replicas do
 
 
 class Link(Protocol):
-    """A robot's connection to one replica: own session, own sender thread, bounded window."""
+    """A robot's connection to one replica: its own session, sender thread and bounded window."""
 
     peer: Peer  # the replica at the other end
 
@@ -177,15 +177,15 @@ class Link(Protocol):
 
     @property
     def ready(self) -> frozenset[str]:
-        """Services that the last probe answer called ready; empty unless UP. Cheap."""
+        """Services that the last probe answer reported ready; empty unless UP. Cheap."""
 
     @property
     def leaving(self) -> bool:
-        """Whether the replica said that its machine will be taken. Cheap."""
+        """Whether the replica reported that its machine is being preempted. Cheap."""
 
     @property
     def thin(self) -> bool:
-        """Whether its path was seen to drain slowly. Cheap."""
+        """Whether its network path was measured to be slow. Cheap."""
 
     def offer(
         self,
@@ -197,18 +197,18 @@ class Link(Protocol):
         more: bool = False,
         handling: Handling = Handling.NORMAL,
     ) -> bool:
-        """Take one attempt, or return False when the window is full or the link not usable.
+        """Accept one attempt, or return False if the window is full or the link not usable.
 
         Never blocks. `service` is the name in the pool; its key was set by `services`. With `more`,
-        others follow at once, then `send`: it may wait for them, to leave in one message. Not to be
-        called from within a `LinkEvents` callback: it may send.
+        other offers and then `send` must follow at once, so that they can share one message. Must
+        not be called from a `LinkEvents` callback, because it may send.
         """
 
     def send(self) -> None:
         """Flush requests that were offered with `more`. Cheap; never blocks."""
 
     def forget(self, request_id: bytes) -> None:
-        """Free the window of a request whose answer is no longer wanted; the replica is told."""
+        """Cancel a request whose answer is no longer wanted: free its window, tell the replica."""
 
     def flush(self) -> None:
         """Send cancellations for forgotten, unanswered requests. Cheap; never blocks."""
@@ -224,10 +224,10 @@ class Dialer(Protocol):
     """Creates links. One for each client proxy."""
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> Link:
-        """Start a link to the keys of these services; return at once, in CONNECTING."""
+        """Start a link for these services (name -> key); return at once, in state CONNECTING."""
 
     def adopt(self, options: SendOptions) -> None:
-        """Set the options of services, from the next connection on."""
+        """Set the options of services, effective from the next connection."""
 
     def renew(self) -> None:
         """Reload the credentials from their files. No request is lost."""
@@ -239,7 +239,7 @@ class Dialer(Protocol):
         """Return newer records that replicas sent in reply; nothing is verified."""
 
     def certificate(self) -> str:
-        """Return the common name of the certificate of every link; empty while they differ."""
+        """Return the common name of the certificate that all links use; empty if they differ."""
 
     def close(self) -> None:
         """Close every link."""
@@ -249,16 +249,16 @@ class Incoming(Protocol):
     """A request at the replica. The first `reply` or `refuse` counts; later ones do nothing."""
 
     service: str
-    request_id: bytes  # 16 bytes, made by the client proxy
-    robot: str  # who asks; replies to one robot never wait for another
-    remaining_s: float  # when the robot sent it
+    request_id: bytes  # 16 bytes, generated by the client proxy
+    robot: str  # the sender; replies to one robot never wait for another
+    remaining_s: float  # time to its deadline when the robot sent it
     handling: Handling
     payload: bytes
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
-        """Send the serialised response, with what the replica has to do for this service.
+        """Send the serialised response, with the replica's load of this service.
 
-        Never blocks. With `more`, others will soon follow, to leave in one message with it.
+        Never blocks. With `more`, other replies follow soon, so that they can share one message.
         """
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:

@@ -1,6 +1,6 @@
-"""Probes and their answers as JSON; older peers ignore keys added later. Pure.
+"""Wire format of probes and their answers: JSON; older peers ignore keys added later. Pure.
 
-Like `frame`: a decoder returns a value or raises `FrameError`, whatever bytes come in.
+As in `frame`, a decoder returns a value or raises `FrameError`, for any input.
 """
 
 import json
@@ -16,13 +16,13 @@ from fogft.records.record import read_json
 
 T = TypeVar("T")
 PROBE_LIMIT = 1024
-PROBE_ANSWER_LIMIT = 256 << 10  # `NAMES_BYTES_LIMIT` has room in it twice, with types
+PROBE_ANSWER_LIMIT = 256 << 10  # room for `NAMES_BYTES_LIMIT` twice, and types
 DETAIL_LIMIT = 500
 BEHIND_LIMIT = 128
 BEHIND_DETAIL_LIMIT = 100
 
 
-@lru_cache(maxsize=16)  # a robot says the same in each
+@lru_cache(maxsize=16)  # a robot's probes are all the same
 def encode_probe(probe: Probe) -> bytes:
     """Return a probe as compact JSON."""
     return _encoded(probe)
@@ -37,8 +37,8 @@ def decode_probe(frame: bytes) -> Probe:
 def encode_probe_answer(answer: ProbeAnswer) -> bytes:
     """Return a probe's answer as compact JSON; a long `detail` is cut.
 
-    Where it does not fit, definitions of types are left out, then the later half of what is behind,
-    then the next. Raises ValueError: it names more services than any pool file may.
+    If it does not fit, type definitions are left out, then the second half of `behind`, then of
+    the rest. Raises ValueError: it names more services than any pool file may.
     """
     behind = tuple(_shortened(one) for one in answer.behind)
     written = replace(answer, detail=as_line(answer.detail[:DETAIL_LIMIT]), behind=behind)

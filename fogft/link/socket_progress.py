@@ -1,10 +1,10 @@
-"""How fast one connection drains, since when it does not, and what cannot arrive in time over it.
+"""Measure one connection's throughput, detect stalls, and decline requests that would be late.
 
-1 MB needs eight seconds at 1 Mbit/s: a send that takes long is a fault only where nothing moves.
-The kernel counts what the peer has acknowledged, so no time-out has to be guessed.
+1 MB needs eight seconds at 1 Mbit/s, so a slow send is a fault only if no bytes move at all.
+The kernel counts the bytes that the peer acknowledged, so no time-out has to be guessed.
 
-What would be too late at the rate that was seen is declined at once, and may go elsewhere. The rate
-is known for ten seconds only: then a request is let through, by which the link is measured anew.
+A request that would be late at the measured rate is declined at once, and may go elsewhere. A rate
+is valid for ten seconds only: then a request is let through, which measures the link again.
 """
 
 import logging
@@ -17,41 +17,41 @@ from fogft.link.compression import Compression
 from fogft.link.window import OpenAttempt
 
 SPAN_S = 0.5
-ENOUGH = 4  # spans, before anybody is turned away: longer than any pause that is no loss
-_MORE = 4  # times; less may be a step
-KEPT_S = 10.0  # then a link is measured anew
+ENOUGH = 4  # spans before requests are declined: longer than any pause that is not a loss
+_MORE = 4  # times the rate; less may be one step of acknowledgements
+KEPT_S = 10.0  # how long a span counts; then the link is measured again
 
 
 class Throughput:
     """The throughput of one connection. Times are monotonic seconds.
 
-    `steady_bytes_per_s` is what two spans in a row carried at best, until more is seen.
+    `steady_bytes_per_s` is the better rate of two spans in a row; None once clearly exceeded.
     """
 
     def __init__(self) -> None:
         self.steady_bytes_per_s: float | None = None
-        self.spans: tuple[tuple[float, float], ...] = ()  # replaced, never changed: any thread
+        self.spans: tuple[tuple[float, float], ...] = ()  # replaced, never mutated: any thread
         self._before: float | None = None  # the rate of the span before this one
         self._open = False  # whether a span has begun
         self._moved = 0
         self._lasted_s = 0.0
-        self._still_s = 0.0  # since something was acknowledged
+        self._still_s = 0.0  # since the last acknowledgement
 
     def look(self, moved: int, lasted_s: float, now: float, *, queued: bool) -> None:
-        """Take the bytes acknowledged since; `queued`: more were waiting the whole time."""
+        """Add the bytes acknowledged in `lasted_s`; `queued`: more were waiting all that time."""
         self._still_s += lasted_s
         if not queued:
             self._open, self._before = False, None
             steady = self.steady_bytes_per_s
             if steady is not None and moved > _MORE * steady * self._still_s:
-                self.steady_bytes_per_s = None  # it carries more by now
+                self.steady_bytes_per_s = None  # it has become faster
         elif moved:
             self._step(moved, self._still_s, now)
         if moved:
             self._still_s = 0.0
 
     def _step(self, moved: int, lasted_s: float, now: float) -> None:
-        """Acknowledgements come in steps, perhaps of many bytes: spans begin and end with one."""
+        """Measure spans, which begin and end with an acknowledgement: these come in steps."""
         if not self._open:
             self._open, self._moved, self._lasted_s = True, 0, 0.0
             return
@@ -71,9 +71,9 @@ class Throughput:
         return median_high(rates) if len(rates) >= ENOUGH else None
 
 
-BULK_BYTES = 16 << 10  # only more is a queue: a frozen peer's kernel takes what is small
-_TRICKLE_BYTES = 2048  # less in one look is no flow: probes' answers are a few hundred bytes
-_SHARE_OF_NEW = 0.3  # in the average of the rate
+BULK_BYTES = 16 << 10  # only more counts as a queue: even a frozen peer's kernel accepts less
+_TRICKLE_BYTES = 2048  # less per look is not a flow: probe answers have a few hundred bytes
+_SHARE_OF_NEW = 0.3  # weight of a new sample in the average rate
 _SHORTEST_LOOK_S = 0.05
 
 
@@ -84,8 +84,8 @@ class Flow:
     acknowledged: int  # bytes that the peer's kernel has acknowledged so far
     received: int  # bytes that came from the peer so far
     outstanding: int  # bytes handed to the kernel that are not acknowledged
-    round_trip_s: float = 0.0  # to an acknowledgement, smoothed, with four times its variation
-    unsent: int = 0  # of those outstanding, what has not left: the path takes no more now
+    round_trip_s: float = 0.0  # smoothed time to an acknowledgement, plus four times its variation
+    unsent: int = 0  # outstanding bytes that were not sent: the path takes no more now
 
 
 class SocketProgress:
@@ -96,15 +96,15 @@ class SocketProgress:
         self._last: Flow | None = None
         self._last_at = 0.0
         self._progress_at: float | None = None  # None: nothing is outstanding
-        self._waited_s = 0.0  # with a queue, since the last look that found it moved
-        # Measured while more waited than the kernel could send at once; None before that
+        self._waited_s = 0.0  # with a queue, since the last look at which it had moved
+        # Measured while more was queued than the kernel could send at once; None before that
         self.bytes_per_s: float | None = None
 
     def look(self, flow: Flow, now: float, sending_for_s: float = 0.0) -> float:
-        """Take a new count; return for how many seconds since the last one data moved.
+        """Take new counters; return for how many seconds since the last ones data moved.
 
-        These are not to be held against the peer: whatever it says queues behind that. Something
-        large has been on its way into the kernel for `sending_for_s`.
+        That time does not count as silence of the peer: its messages queue behind the data. The
+        current large send has been passing bytes to the kernel for `sending_for_s`.
         """
         last, since_s = self._last, now - self._last_at
         if last is not None and since_s < _SHORTEST_LOOK_S:
@@ -119,7 +119,7 @@ class SocketProgress:
         moved = flow.acknowledged - last.acknowledged
         sending = sending_for_s >= since_s
         queued = sending or last.outstanding >= BULK_BYTES
-        # On a long path much is on its way without any queue.
+        # On a long path many bytes are in flight without any queue.
         full = sending or (last.unsent > 0 and flow.unsent > 0)
         self.throughput.look(moved, since_s, now, queued=full)
         if sending or (queued and flow.outstanding >= BULK_BYTES):
@@ -128,7 +128,7 @@ class SocketProgress:
         if (queued and moved > 0) or flow.received - last.received >= _TRICKLE_BYTES:
             waited_s, self._waited_s = self._waited_s, 0.0
             return waited_s + since_s
-        # Acknowledgements come in steps: what was waited for one counts when it has come.
+        # Acknowledgements come in steps: the wait for one counts as movement once it has come.
         self._waited_s = self._waited_s + since_s if queued else 0.0
         return 0.0
 
@@ -142,10 +142,10 @@ class SocketProgress:
         return 0.0 if self._progress_at is None else max(0.0, now - self._progress_at)
 
     def stalled(self, now: float, *, shortest_s: float, longest_s: float) -> bool:
-        """Whether the queue has been still for longer than pauses of this path explain.
+        """Whether the queue has not moved for longer than this path's normal pauses.
 
-        At least for `shortest_s`: the peer's processor may be busy. However slow the path, no
-        longer than `longest_s`.
+        The limit is at least `shortest_s`, as the peer's CPU may be busy, and at most `longest_s`,
+        however slow the path is.
         """
         last = self._last
         if last is None or last.outstanding < BULK_BYTES:
@@ -159,10 +159,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(eq=False)
 class DeadlineFilter:
-    """Judges the requests to `timed` services, of no use after their time. Any thread.
+    """Finds requests to `timed` services that would miss their deadline. Any thread.
 
-    `carries` returns the bytes a second that the link carries at a moment, None for not known;
-    `left` the bytes that have not arrived by then at that rate; `packs` a service's compression.
+    `carries` returns the link's rate (bytes per second) at a given time, None if unknown; `left`
+    the bytes that have not arrived by then at that rate; `packs` a service's compression.
     """
 
     timed: Collection[str]
@@ -178,7 +178,7 @@ class DeadlineFilter:
         now: float,
         before: Callable[[str], Iterable[OpenAttempt]] = lambda service: (),
     ) -> bool:
-        """Whether an attempt may arrive in time behind what leaves `before` it."""
+        """Whether an attempt may arrive in time behind the attempts that are sent `before` it."""
         rate = self.carries(now) if attempt.service in self.timed else None
         if rate is None:
             return True
@@ -194,7 +194,7 @@ class DeadlineFilter:
         return False
 
     def _on_the_way(self, attempt: OpenAttempt) -> float:
-        """Return how many bytes an attempt will be at least; 0 where that is not known."""
+        """Return the expected size of an attempt on the wire; 0 if unknown."""
         compression = self.packs(attempt.service)
         if compression is None:
             return attempt.size

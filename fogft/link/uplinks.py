@@ -1,8 +1,8 @@
-"""Several uplinks at once: a link for each replica *and* interface, combined into one.
+"""Use several uplinks at once: one link per replica *and* network interface, combined into one.
 
-A request goes out on one uplink or on all, as its service's policy says, under one id: the replica
-runs it once. When an uplink is lost with requests on it, they go out on another one. Only when no
-uplink is left an attempt ends as lost.
+A request is sent on one uplink or on all, as its service's policy says, under one id: the replica
+runs it once. When an uplink is lost, its requests are resent on another one. An attempt ends as
+lost only when no uplink is left.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 def choose(
     policy: UplinkPolicy, usable: Sequence[int], current: int | None
 ) -> tuple[Sequence[int], int | None]:
-    """Return which of the usable uplinks a request takes, and which is current from now on.
+    """Return which of the usable uplinks to send a request on, and the new current uplink.
 
-    Those usable are up and not on the request already, in the pool file's order. `current` is the
-    one that `failover` uses; None before the first.
+    `usable` uplinks are up and not tried for the request yet, in the pool file's order. `current`
+    is the one that `failover` uses; None before the first.
     """
     if policy is UplinkPolicy.ALL or not usable:
         return usable, current
@@ -52,7 +52,7 @@ def choose(
 
 @dataclass
 class _Attempt:
-    """One accepted offer: what it needs to go out again, and the uplinks that it is on."""
+    """One accepted offer: the data to resend it, and the uplinks that carry it (`on`)."""
 
     service: str
     payload: bytes
@@ -72,8 +72,8 @@ class UplinksLink:
         self._events = events
         self._lock = threading.Lock()
         self._attempts: dict[bytes, _Attempt] = {}
-        self._again: list[bytes] = []  # on no uplink now
-        # How many uplinks may still tell of the end of a request that was forgotten, or answered.
+        self._again: list[bytes] = []  # requests on no uplink now, to be resent
+        # How many uplinks may still report the end of a forgotten or answered request.
         self._may_tell: OrderedDict[bytes, int] = OrderedDict()
         self._current: int | None = None
         self._closed = False
@@ -101,7 +101,7 @@ class UplinksLink:
 
     @property
     def thin(self) -> bool:
-        """Whether all uplinks were seen to drain slowly."""
+        """Whether all uplinks were measured to be slow."""
         return all(link.thin for link in self._links)
 
     def offer(
@@ -114,13 +114,13 @@ class UplinksLink:
         more: bool = False,
         handling: Handling = Handling.NORMAL,
     ) -> bool:
-        """Take one attempt, or return False when no uplink takes it. Never blocks."""
+        """Accept one attempt, or return False if no uplink accepts it. Never blocks."""
         attempt = _Attempt(service, payload, time.monotonic() + remaining_s, handling)
         with self._lock:
             if self._closed or request_id in self._attempts:
                 return False
             by: Collection[int] = ()
-            if service.startswith(topic.PREFIX):  # by another uplink it would overtake the others
+            if service.startswith(topic.PREFIX):  # on another uplink it would overtake earlier ones
                 if self._again:
                     return False
                 others = (one.on for one in self._attempts.values() if one.service == service)
@@ -128,7 +128,7 @@ class UplinksLink:
             self._attempts[request_id] = attempt
         if self._send(request_id, attempt, by):
             return True
-        with self._lock:  # unless it has ended meanwhile, which was told
+        with self._lock:  # if it is gone, it has ended meanwhile, and that was reported
             return self._attempts.pop(request_id, None) is None
 
     def _send(self, request_id: bytes, attempt: _Attempt, by: Collection[int] = ()) -> bool:
@@ -151,7 +151,7 @@ class UplinksLink:
     def _send_on(self, index: int, request_id: bytes, attempt: _Attempt) -> bool:
         with self._lock:
             if self._attempts.get(request_id) is not attempt:
-                return True  # it was answered by another uplink, or is not wanted any more
+                return True  # it was answered over another uplink, or is no longer wanted
             attempt.on.add(index)
         left_s = attempt.deadline - time.monotonic()
         if not self._links[index].offer(
@@ -162,7 +162,7 @@ class UplinksLink:
             return False
         with self._lock:
             ended = self._attempts.get(request_id) is not attempt
-        if ended:  # while it was sent: `forget` could not reach this uplink
+        if ended:  # while it was being sent: `forget` could not reach this uplink
             self._links[index].forget(request_id)
         return True
 
@@ -196,7 +196,7 @@ class UplinksLink:
             link.flush()
 
     def status(self) -> LinkStatus:
-        """Return a snapshot: the best uplink's, with all that is in flight."""
+        """Return the best uplink's snapshot, with the counts of all uplinks."""
         found = [link.status() for link in self._links]
         best = min(found, key=lambda s: (_STATES.index(s.state), s.silent_for_s))
         return replace(
@@ -220,7 +220,7 @@ class UplinksLink:
             self._closed = True
         for link in self._links:
             link.close()
-        self.flush()  # what is on no uplink finds none
+        self.flush()  # requests on no uplink find none now, and end
 
     # -- events of the uplinks' links (their threads) -------------------------------------
 
@@ -233,13 +233,13 @@ class UplinksLink:
                 return
             attempt.on.discard(index)
             if answer.payload is None and attempt.on:
-                return  # it is under way elsewhere
+                return  # another uplink still carries it
             kind = answer.refusal
             again = kind is not None and Effect.OTHER_UPLINK in kind.effect and not self._closed
             if again:
                 self._again.append(answer.request_id)
         if again:
-            self._events.changed(self)  # `flush` follows; from here nothing may be sent
+            self._events.changed(self)  # the owner calls `flush`: a callback must not send
         else:
             self._end(answer.request_id, answer)
 
@@ -256,7 +256,7 @@ class UplinksLink:
         self._events.answered(self, answer)
 
     def late(self, link: Link, answer: Answer) -> None:
-        """Report wasted work, once, unless another uplink may tell more."""
+        """Report wasted work once; a cancellation only if no other uplink may report more."""
         id = answer.request_id
         with self._lock:
             may_tell = self._may_tell.get(id, 1)
@@ -278,7 +278,7 @@ class UplinkDialer:
         self.inner = inner
         self.adopt, self.renew, self.tell = inner.adopt, inner.renew, inner.tell
         self.certificate, self.close, self.newer = inner.certificate, inner.close, inner.newer
-        # The preferred one first; none for whatever the routes say.
+        # In order of preference; empty to follow the routing table.
         self.interfaces: tuple[str, ...] = ()
         self.policies: Mapping[str, UplinkPolicy] = {}
         self._options = SendOptions()
@@ -286,7 +286,7 @@ class UplinkDialer:
     def use(self, interfaces: Sequence[str], services: Sequence[ServiceSpec]) -> bool:
         """Set the uplinks and the options of services; return whether links must be redialled."""
         options = SendOptions.of(services)
-        # Not `timed`: who becomes stateful, or comes anew, has its links dialled anyway.
+        # Not `timed`: a service that is new or becomes stateful has its links redialled anyway.
         old = (self.interfaces, self._options.latest, self._options.plain)
         changed = (tuple(interfaces), options.latest, options.plain) != old
         self.interfaces, self._options = tuple(interfaces), options

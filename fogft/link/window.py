@@ -1,11 +1,11 @@
-"""What a connection keeps of attempts: those open, unanswered, about to leave, or cancelled.
+"""A connection's records of its attempts: open, unanswered, waiting to be sent, or cancelled.
 
 Whoever removes an attempt from its window reports its end, so that each end is reported once. The
-offering thread, the sender thread and Zenoh's threads meet here: each step holds one short lock.
+offering thread, the sender thread and Zenoh's threads all use this; each step holds a lock briefly.
 
-To tell a replica that a request was cancelled costs a message. So it is told at once only if the
-request has been out for `WORTH_S` and the replica was told nothing for `EVERY_S`, else with the
-next flush, and not at all if the answer comes first.
+A cancellation costs a message. So it is sent at once only if the request was sent `WORTH_S` ago or
+earlier and no cancellation was sent at once for `EVERY_S`; else with the next flush, and not at
+all if the answer comes first.
 """
 
 import heapq
@@ -20,31 +20,31 @@ from fogft.link import batch_frames
 from fogft.link.frame import CANCEL_LIMIT
 from fogft.requests.load import Handling
 
-# 512 small attempts cost less than 1 MB (here and in Zenoh); the bytes are what
-# a slow replica can make us hold.
+# 512 small attempts cost less than 1 MB (here and in Zenoh); the limit in bytes bounds
+# what a slow replica can make us hold.
 ATTEMPTS_LIMIT = 512
 BYTES_LIMIT = 64 << 20
 
 
 @dataclass(slots=True, eq=False)
 class OpenAttempt:
-    """A request on one connection. Moments are monotonic seconds."""
+    """A request on one connection. Times are monotonic seconds."""
 
     service: str
     request_id: bytes
-    payload: bytes | None  # None once it was sent, or is not wanted
+    payload: bytes | None  # None once it was sent, or is no longer wanted
     size: int
     offered: float
     deadline: float
     handling: Handling = Handling.NORMAL
-    mark: int = 0  # what the connection had sent once this was sent (`credit`)
+    mark: int = 0  # bytes that the connection had sent, this attempt included (`credit`)
     reads_packed: bool = False  # the answer may be compressed
     elsewhere: bool = False  # it was sent, and another replica answered its request in time
-    forgotten: bool = False  # it is not wanted any more, and was not sent
+    forgotten: bool = False  # it is no longer wanted, and was not sent
 
 
 class LinkWindow:
-    """The attempts open on one connection; `standing` more have room, for pulls of topics."""
+    """The attempts open on one connection, bounded; `standing` is extra room for topic pulls."""
 
     def __init__(self, standing: int = 0) -> None:
         self.limit = ATTEMPTS_LIMIT + standing
@@ -52,13 +52,13 @@ class LinkWindow:
         self._lock = threading.Lock()
         self._open: dict[bytes, OpenAttempt] = {}
         self._closed = False
-        self.declined = False  # an attempt, for lack of room
+        self.declined = False  # whether an attempt was declined for lack of room
 
     def __len__(self) -> int:
         return len(self._open)
 
     def admit(self, attempt: OpenAttempt) -> bool:
-        """Take an attempt in; False when full, closed, or its request is open already."""
+        """Add an attempt; False if full, closed, or its request is already open."""
         with self._lock:
             if self._closed or attempt.request_id in self._open:
                 return False
@@ -72,7 +72,7 @@ class LinkWindow:
             return True
 
     def attempts(self) -> list[OpenAttempt]:
-        """Return what is open now, oldest first."""
+        """Return the open attempts, oldest first."""
         with self._lock:
             return list(self._open.values())
 
@@ -81,7 +81,7 @@ class LinkWindow:
         return self._open.get(attempt.request_id) is attempt
 
     def remove(self, attempt: OpenAttempt) -> bool:
-        """End an attempt; False when it has ended before."""
+        """End an attempt; False if it has already ended."""
         with self._lock:
             if self._open.get(attempt.request_id) is not attempt:
                 return False
@@ -91,19 +91,19 @@ class LinkWindow:
             return True
 
     def forget(self, request_id: bytes) -> OpenAttempt | None:
-        """End the attempt of a request, whichever it is, and return it if there was one."""
+        """End the open attempt of a request, if there is one, and return it."""
         with self._lock:
             attempt = self._open.get(request_id)
             if attempt is not None:
-                attempt.forgotten = attempt.payload is not None  # before it is seen to be gone
+                attempt.forgotten = attempt.payload is not None  # set before it is seen to be gone
                 del self._open[request_id]
                 self.large.remove(attempt.size)
             return attempt
 
     def regained_room(self) -> bool:
-        """Whether an attempt was declined for lack of room that is there now. Asks once."""
+        """Whether there is room again after an attempt was declined; True once per decline."""
         with self._lock:
-            # A quarter free: a window that is full to the brim is not announced for each slot.
+            # A quarter must be free, so that a full window is not announced slot by slot.
             roomy = len(self._open) <= self.limit * 3 // 4
             if self.declined and roomy and self.large.held <= self.large.limit * 3 // 4:
                 self.declined = False
@@ -111,7 +111,7 @@ class LinkWindow:
             return False
 
     def close(self) -> list[OpenAttempt]:
-        """Let nothing more in, and return what was open: it has ended."""
+        """Accept nothing more; end the open attempts and return them."""
         with self._lock:
             self._closed = True
             ended = list(self._open.values())
@@ -120,8 +120,8 @@ class LinkWindow:
             return ended
 
 
-# A replica ends all that it takes, cancelled requests too. One that has ended none of so many in a
-# row that others answered, not even so long past their deadlines, ignores what it is sent.
+# A replica ends every request that it takes, cancelled ones too. It ignores requests if it has not
+# ended this many in a row that others answered, even this long past their deadlines.
 IGNORED_LIMIT = 3
 IGNORED_AFTER_S = 10.0
 
@@ -129,7 +129,7 @@ IGNORED_AFTER_S = 10.0
 class Unanswered:
     """The requests sent on one connection and not answered yet, by id."""
 
-    # The window holds 512; a replica that never answers what was forgotten holds no more than this.
+    # The window holds 512; this bounds forgotten requests that a replica never answers.
     limit = 8192
 
     def __init__(self) -> None:
@@ -141,14 +141,14 @@ class Unanswered:
 
     @property
     def owed(self) -> int:
-        """How many more requests were sent than answers came, those to unknown ids included."""
+        """Requests sent minus answers received, answers to unknown ids included."""
         return self._sent - self._answered
 
     def __len__(self) -> int:
         return len(self._attempts)
 
     def add(self, attempt: OpenAttempt) -> None:
-        """Note an attempt that is about to be sent; it takes the place of one of its request."""
+        """Note an attempt that is about to be sent; it replaces an earlier one of its request."""
         with self._lock:
             self._sent += 1
         self._attempts[attempt.request_id] = attempt
@@ -157,7 +157,7 @@ class Unanswered:
                 self._attempts.pop(id, None)
 
     def answered(self, request_id: bytes) -> OpenAttempt | None:
-        """Return whom an answer is for, once; None if nobody awaits it."""
+        """Return the attempt that an answer is for, once; None if no attempt awaits it."""
         self._answered += 1
         attempt = self._attempts.pop(request_id, None)
         if attempt is not None:
@@ -165,7 +165,7 @@ class Unanswered:
         return attempt
 
     def are_ignored(self, now: float) -> bool:
-        """Whether the replica ends nothing of what it takes, as far as is known now."""
+        """Whether the replica ignores the requests that it takes, as far as is known now."""
         for attempt in list(self._attempts.values()):
             if attempt.elsewhere and now >= attempt.deadline + IGNORED_AFTER_S:
                 attempt.elsewhere = False  # counted once
@@ -174,7 +174,7 @@ class Unanswered:
 
 
 class BatchBuffer:
-    """Small attempts of one service that wait to leave in one message. Any thread."""
+    """Small attempts of one service that wait to be sent in one message. Any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.RLock()
@@ -182,7 +182,7 @@ class BatchBuffer:
         self._bytes = 0
 
     def add(self, attempt: OpenAttempt) -> list[OpenAttempt]:
-        """Hold a small attempt; return those that leave now because it does not fit to them."""
+        """Add a small attempt; return the earlier ones to send now if it does not fit with them."""
         with self._lock:
             full = (
                 len(self.attempts) >= batch_frames.LIMIT
@@ -195,18 +195,18 @@ class BatchBuffer:
             return leaving
 
     def take(self) -> list[OpenAttempt]:
-        """Return all that is held, in order."""
+        """Remove and return the held attempts, in order."""
         with self._lock:
             taken, self.attempts, self._bytes = self.attempts, [], 0
             return taken
 
 
 WORTH_S = 0.005
-EVERY_S = 0.01  # under load each answer has a loser: they are told together
+EVERY_S = 0.01  # under load each answer has a loser: their cancellations are sent together
 
 
 class Cancellations:
-    """Ids of cancelled requests of which a replica is still to be told. Any thread."""
+    """Ids of cancelled requests that have not been sent to the replica yet. Any thread."""
 
     def __init__(self) -> None:
         self._ids: dict[bytes, None] = {}
@@ -217,7 +217,7 @@ class Cancellations:
 
     def add(self, request_id: bytes, sent_at: float, now: float) -> bool:
         """Cancel a request sent at `sent_at`; return whether to tell the replica at once."""
-        if len(self._ids) < CANCEL_LIMIT:  # what one message carries; of others nobody is told
+        if len(self._ids) < CANCEL_LIMIT:  # what fits into one message; others are not sent
             self._ids[request_id] = None
         if now - sent_at < WORTH_S or now - self._told_at < EVERY_S:
             return False
@@ -248,7 +248,7 @@ class SendQueue:
         return service in self._waiting
 
     def put(self, attempt: OpenAttempt | None) -> None:
-        """Queue an attempt; None ends the sender after all before it."""
+        """Queue an attempt; None ends the sender after everything queued before it."""
         waiting = self._waiting.get(attempt.service) if attempt is not None else None
         if attempt is None or waiting is None:
             self._queued.put(attempt)
@@ -266,7 +266,7 @@ class SendQueue:
             return heapq.heappop(self._waiting[turn])[2]
 
     def stalest(self, than: OpenAttempt) -> OpenAttempt | None:
-        """Return the oldest waiting attempt that a newer one of its service may replace."""
+        """Return the oldest waiting attempt that this newer one of its service may replace."""
         with self._lock:
             waiting = [entry for entry in self._waiting.get(than.service, ()) if entry[2].payload]
         oldest = max(waiting, default=None)

@@ -1,4 +1,4 @@
-"""Stateful services: the order of requests, snapshots, and catching up. Pure.
+"""Stateful services: ordering of requests, snapshots, and catching up. Pure.
 
 Not here: sending (`fogft.proxy`).
 """

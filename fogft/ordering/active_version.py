@@ -1,19 +1,19 @@
-"""Which version of a stateful service is active: whose answers count. Pure.
+"""Which version of a stateful service is active, so that its answers count. Pure.
 
-Replicas of another version stand by: they apply every request, and nobody sees their answers.
-A version becomes active by a handover, from a snapshot of the active one, or when that has left.
+Replicas of other versions are standbys: they apply every request, but their answers are discarded.
+A version becomes active by a handover from a snapshot of the active one, or when that is gone.
 
-Rules: docs/design/rolling-update.md. Not here: carrying the change out (`ordering.sequencer`).
+Rules: docs/design/rolling-update.md. Not here: performing the change (`ordering.sequencer`).
 """
 
 from collections import Counter
 from collections.abc import Iterable
 
-VACANCY_S = 3.0  # longer than links take to come up one after the other, or a service to restart
+VACANCY_S = 3.0  # longer than links take to come up one after another, or a service to restart
 
 
 class ActiveVersion:
-    """The active version of one service; None while there never was one."""
+    """The active version of one service; None until there is a first one."""
 
     def __init__(self, version: str | None = None) -> None:
         self.version = version
@@ -34,7 +34,7 @@ class ActiveVersion:
         self._is_gone = now - self._gone_since >= VACANCY_S
 
     def successor(self, joined: Iterable[str]) -> str | None:
-        """Return the version that follows one that is gone: that of most standbys."""
+        """Return the version that replaces one that is gone: that of most standbys."""
         return _most(joined) if self._is_gone else None
 
     def wanted(self, staying: Iterable[str]) -> str | None:

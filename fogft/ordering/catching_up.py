@@ -1,7 +1,7 @@
-"""What each replica of a stateful service still needs of one term's log. Pure.
+"""Bring each replica of a stateful service up to date with one term's log. Pure.
 
-Requests by number while the log has them, else a checkpoint and what came after. What is to be sent
-collects until `take`. Not here: what replicas answer, and who obeys (`sequencer`).
+It is sent the requests that it lacks while the log has them, else a checkpoint and the requests
+after it. Orders are collected until `take`. Not here: answers, and who obeys (`sequencer`).
 Protocol: docs/design/state.md.
 """
 
@@ -19,7 +19,7 @@ WINDOW = 128
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A service's own snapshot, taken after the request `index`."""
+    """A snapshot by the service itself, taken after request `index`."""
 
     index: int
     state: bytes
@@ -42,7 +42,7 @@ class OrderedLog:
 
     @property
     def last(self) -> int:
-        """The highest number given."""
+        """The highest number assigned."""
         return self.start + len(self._entries)
 
     def has_room(self, size: int) -> bool:
@@ -53,7 +53,7 @@ class OrderedLog:
         return within and len(self._entries) < self.entries_limit
 
     def append(self, payload: bytes) -> int:
-        """Number a request; ask `has_room` before."""
+        """Append a request and return its number; check `has_room` first."""
         self._entries.append(payload)
         self.held_bytes += len(payload)
         return self.last
@@ -63,7 +63,7 @@ class OrderedLog:
         return self._entries[index - self.start - 1]
 
     def empty(self, index: int) -> None:
-        """Have it applied without effect from now on, as a request that cannot be read is."""
+        """Empty a request: it is applied without effect, like one that cannot be read."""
         self.held_bytes -= len(self.get(index))
         self._entries[index - self.start - 1] = b""
 
@@ -72,7 +72,7 @@ class OrderedLog:
         return self.start <= index <= self.last
 
     def keep(self, checkpoint: Checkpoint) -> None:
-        """Store a newer snapshot, and drop what it covers. An older one is ignored."""
+        """Store a newer snapshot, and drop the requests it covers. An older one is ignored."""
         old = self.checkpoint
         if not self.covers(checkpoint.index) or (old and old.index >= checkpoint.index):
             return
@@ -80,7 +80,7 @@ class OrderedLog:
         self.drop(checkpoint.index)
 
     def drop(self, index: int) -> None:
-        """Drop everything up to a number, with any checkpoint before it."""
+        """Drop all requests up to a number, and any earlier checkpoint."""
         while self._entries and self.start < index:
             self.held_bytes -= len(self._entries.popleft())
             self.start += 1
@@ -91,15 +91,15 @@ class OrderedLog:
 class CatchingUp:
     """A term's log, and each replica's progress in it.
 
-    It `counts` whose state may be given to others, and whose answer to a caller. A term that was
-    `handed_over` begins with what replicas of another version left.
+    A replica `counts` if its state may be given to others, and its answer to a caller. A term that
+    was `handed_over` begins from the state of replicas of another version.
     """
 
     def __init__(self, epoch: int, counts: Callable[[int], bool], *, handed_over: bool) -> None:
         self.base: Position | None = None  # None until the term has begun
         self.log = OrderedLog(0)
         self.peers: dict[int, Peer] = {}
-        self.donor: int | None = None  # it was asked for a checkpoint
+        self.donor: int | None = None  # the replica that was asked for a checkpoint
         self._epoch = epoch
         self._counts = counts
         self._handed_over = handed_over
@@ -172,18 +172,18 @@ class CatchingUp:
             self.out.append(Order(replica, Op.RECALL, index))
 
     def _make_room(self, size: int) -> bool:
-        """No checkpoint came in time: drop what every member has applied: each can go on alone."""
+        """Without a checkpoint in time, drop requests that all members applied: none needs them."""
         members = [peer.acked for peer in self.peers.values() if peer.member]
         if members:
             self.log.drop(min(members))
         return self.log.has_room(size)
 
-    # -- replicas that lack some ----------------------------------------------------------
+    # -- replicas that are behind ---------------------------------------------------------
 
     def bring(self, replica: int, peer: Peer, *, waited: bool = False) -> None:
-        """Have a claimed replica join, from its own state or from the checkpoint.
+        """Make a claimed replica join, from its own state or from the checkpoint.
 
-        Where both are long ago it waits for a new checkpoint, unless it has `waited`.
+        If both are too old, it waits for a new checkpoint, unless it has already `waited`.
         """
         log, promise = self.log, peer.promise
         if self.base is None or promise is None or peer.open:
@@ -202,14 +202,14 @@ class CatchingUp:
             self.out.append(Order(replica, Op.RESTORE, kept.index, payload))
 
     def _knows(self, replica: int, at: Position) -> bool:
-        """Whether a replica's state is one that this term knows, and not one it stood by with."""
+        """Whether this term can continue from a replica's state; not if it is a standby's."""
         if at.epoch == self._epoch:
             return True
-        # One of the version that took over begins from what was handed over.
+        # A replica of the version that took over begins from the handed-over state.
         return at == self.base and not (self._handed_over and self._counts(replica))
 
     def bring_all(self, *, waited: bool = False) -> None:
-        """Have all waiting replicas join."""
+        """Make all waiting replicas join."""
         for replica, peer in self.peers.items():
             if peer.phase is Phase.CLAIMED:
                 self.bring(replica, peer, waited=waited)
@@ -232,12 +232,12 @@ class CatchingUp:
         """Request a checkpoint if one is needed."""
         log = self.log
         waits = any(peer.phase is Phase.CLAIMED for peer in self.peers.values())
-        # A log that begins with the service's first state needs none; nor does one just taken. A
-        # later term's begins with a position that a fresh replica does not know, called or not.
+        # A log that begins at the initial state, or has a checkpoint, needs none. A later term's
+        # log begins at a position that a fresh replica does not know, even before any request.
         begins_later = log.checkpoint is None and (log.start > 0 or self.base != START)
         full = max(len(log) / log.entries_limit, log.held_bytes / log.bytes_limit)
         if waits or begins_later or full >= 0.5:
-            # Of one that seldom answers first: it pauses for the snapshot.
+            # Prefer a replica that seldom answers first: it pauses for the snapshot.
             self.ask_for_checkpoint(
                 [
                     (not self._keeps_up(peer), peer.won, replica)
@@ -248,14 +248,14 @@ class CatchingUp:
             )
 
     def ask_for_checkpoint(self, donors: list[tuple[bool, int, int]], now: float) -> None:
-        """Request a checkpoint from the best of these replicas, unless one was requested lately."""
+        """Ask the best of these replicas for a checkpoint, unless one was requested recently."""
         if donors and self.donor is None and now >= self._checkpoint_at:
             self.donor = min(donors)[-1]
             self._checkpoint_at = now + CHECKPOINT_RETRY_S
             self.order(self.donor, Op.SNAPSHOT)
 
     def take_checkpoint(self, index: int, state: bytes) -> None:
-        """Store a checkpoint, and have replicas that wait for one join."""
+        """Store a checkpoint, and make the replicas that wait for one join."""
         self.log.keep(Checkpoint(index, state))
         self._checkpoint_at = 0.0
         self.bring_all(waited=True)

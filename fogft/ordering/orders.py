@@ -1,7 +1,7 @@
 """The orders between a sequencer and the replicas of a stateful service. Pure values.
 
-An order travels as an ordinary request whose 16-byte id is the order itself: operation, epoch and
-index. So a request needs no envelope. An answer is the payload that belongs to the operation, or a
+An order is sent as an ordinary request whose 16-byte id is the order itself: operation, epoch and
+index. So a request needs no envelope. Its answer is the payload defined for the operation, or a
 refusal. Protocol: docs/design/state.md.
 """
 
@@ -15,7 +15,7 @@ _PROMISE = struct.Struct(">QQB")
 _INDEX = struct.Struct(">Q")
 INDEX_LIMIT = 1 << 56
 _EPOCH_LIMIT = 1 << 64
-# What replicas may claim: beyond, a lie would leave the sequencer no numbers.
+# Limits on what replicas may report: a lie beyond them would leave the sequencer no numbers.
 _CLAIMED_INDEX_LIMIT, _CLAIMED_EPOCH_LIMIT = INDEX_LIMIT >> 1, _EPOCH_LIMIT >> 1
 
 
@@ -24,14 +24,14 @@ class OrderError(ValueError):
 
 
 class Op(IntEnum):
-    """The operations that a sequencer may order."""
+    """The operations that a sequencer can order."""
 
     CLAIM = 1
     JOIN = 2
     RESTORE = 3
     SNAPSHOT = 4
     APPLY = 5
-    RECALL = 6  # give the answer to a number that was applied; never applies it
+    RECALL = 6  # return the answer to a number already applied; never applies it
 
 
 OrderId = tuple[Op, int, int]  # operation, term, index
@@ -50,7 +50,7 @@ START = Position()
 
 @dataclass(frozen=True)
 class Promise:
-    """A replica's answer when it is claimed; `sound` is false after a failed restore."""
+    """A replica's answer to a claim; `sound` is false after a failed restore."""
 
     position: Position
     sound: bool
@@ -114,7 +114,7 @@ def decode_index(payload: bytes) -> int:
 
 
 def encode_snapshot(index: int, state: bytes) -> bytes:
-    """Return a state after an index: its own, or in a restore the last number until now."""
+    """Encode a state and an index: the state's own, or in a restore the last number so far."""
     return _INDEX.pack(index) + state
 
 

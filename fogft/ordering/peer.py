@@ -1,8 +1,8 @@
 """A sequencer's view of a replica in one term, and orders to it. Pure values.
 
-Callers go as fast as the fastest replica, so a slower one falls behind. Should the faster ones die,
-every caller would wait until it has applied all that it lacks. So one that is far behind is given a
-snapshot instead, though not too often. What follows from all this is the `sequencer`'s.
+Callers proceed at the pace of the fastest replica, so a slower one falls behind. If the faster ones
+died, every caller would have to wait until it has caught up. So a replica that is far behind is
+restored from a snapshot instead, but not too often. The `sequencer` acts on this view.
 """
 
 from dataclasses import dataclass, field
@@ -12,14 +12,14 @@ from fogft.ordering.orders import Op, Promise
 
 RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.5
-LAG_LIMIT = 256  # further behind, a replica is given a snapshot rather than every request since
+LAG_LIMIT = 256  # requests; further behind, a replica is restored from a snapshot instead
 RESTORE_FIRST_S = 2.0
 RESTORE_LONGEST_S = 16.0
 
 
 @dataclass(frozen=True)
 class Order:
-    """An order to a replica: an operation of this term, with its bytes."""
+    """An order to a replica: an operation in this term, with its payload."""
 
     replica: int
     op: Op
@@ -30,14 +30,14 @@ class Order:
 class Phase(Enum):
     """A replica's phase in this term."""
 
-    UNCLAIMED = "unclaimed"  # it is to be claimed, at once or after a pause
-    ASKED = "asked"  # an order is on its way that changes its phase
-    CLAIMED = "claimed"  # it obeys, and waits for a state that it can take
-    JOINED = "joined"  # it applies what is sent to it
+    UNCLAIMED = "unclaimed"  # to be claimed, at once or after a pause
+    ASKED = "asked"  # an order that will change its phase is in flight
+    CLAIMED = "claimed"  # it obeys, and waits for a state that it can start from
+    JOINED = "joined"  # it applies the requests that it is sent
 
 
 class Lag:
-    """How far a replica is behind. Snapshots pause the sender, so they become rarer."""
+    """Decides when a replica is too far behind. Snapshots pause the donor, so they become rarer."""
 
     def __init__(self) -> None:
         self._wait_s = RESTORE_FIRST_S
@@ -63,18 +63,18 @@ class Peer:
     phase: Phase = Phase.UNCLAIMED
     promise: Promise | None = None
     next: int = 0  # the number to send next
-    rewind: int | None = None  # go back to it once nothing is on its way
+    rewind: int | None = None  # resend from this number once no order is in flight
     open: set[int] = field(default_factory=set)
     acked: int = 0
-    member: bool = False  # it joined this term, and as far as is known its state is still there
+    member: bool = False  # it joined this term, and its state is not known to be lost
     won: int = 0
     wait_s: float = RETRY_FIRST_S / 2
     retry_at: float = 0.0
-    went_back: int = 0  # so often since it last acknowledged a number
+    went_back: int = 0  # how often since it last acknowledged a number
     checked_at: float = 0.0
     waits_since: float | None = None
     lag: Lag = field(default_factory=Lag)
-    lags: bool = False  # it is sent no more: a snapshot takes it further
+    lags: bool = False  # it is sent no requests until it is restored from a snapshot
 
     @property
     def joined(self) -> bool:

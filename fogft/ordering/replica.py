@@ -1,7 +1,7 @@
-"""A replica of a stateful service: apply by number, one at a time, and nothing else. Pure.
+"""A replica of a stateful service: apply requests strictly by number, one at a time. Pure.
 
-What happens comes in by methods; what to do comes out as effects, in their order. The service works
-on one thing at a time, under a serial number; what ends under an older one is of no interest.
+Events come in as method calls; actions are returned as effects, in order. The service runs one call
+at a time, identified by a serial number; the end of a call with an older one is ignored.
 
 Protocol: docs/design/state.md.
 """
@@ -36,7 +36,7 @@ class Refuse(Generic[T]):
 
 @dataclass(frozen=True)
 class Begin:
-    """Call the service (`APPLY`), or its state service; its end is reported by the serial."""
+    """Call the service (`APPLY`) or a state service; report its end by `done` with the serial."""
 
     op: Op
     serial: int
@@ -58,18 +58,18 @@ class _Work(Generic[T]):
 class OrderedReplica(Generic[T]):
     """One stateful service on one replica."""
 
-    queue_limit, queue_bytes = 512, 64 << 20  # requests that wait for their turn; more are refused
-    kept_limit, kept_bytes = 1024, 16 << 20  # answers kept for copies; the oldest go first
+    queue_limit, queue_bytes = 512, 64 << 20  # queued requests; more are refused
+    kept_limit, kept_bytes = 1024, 16 << 20  # answers kept for repeats; oldest dropped first
 
     def __init__(self) -> None:
         self.position = START
         self.sound, self.joined = True, False
-        self.serving = False  # whether the service and its two state services are there
-        self.promised, self.robot = 0, ""  # the term, and whose
-        self.goal = 0  # with this number it has caught up with the time when it joined
+        self.serving = False  # whether the service and its two state services are available
+        self.promised, self.robot = 0, ""  # the term that it obeys, and whose term it is
+        self.goal = 0  # the last number when it joined: it has caught up once that is applied
         self._serial = 0
         self._work: _Work[T] | None = None
-        # By number: the request, and whom to answer.
+        # By number: the request, and the senders to answer.
         self._queue: OrderedDict[int, tuple[bytes, list[T]]] = OrderedDict()
         self._queued_bytes = 0
         self._claims: list[T] = []
@@ -84,12 +84,12 @@ class OrderedReplica(Generic[T]):
         return self.joined and self.serving and self.position.index >= self.goal
 
     def works_on(self, serial: int) -> bool:
-        """Whether the call with this serial was begun last, and has not ended."""
+        """Whether the call with this serial is the current one."""
         return self._work is not None and self._work.serial == serial
 
     @property
     def in_flight(self) -> int:
-        """Requests that are held and not yet answered."""
+        """The number of requests that are held and not answered yet."""
         applying = self._work is not None and self._work.op is Op.APPLY
         return len(self._queue) + applying
 
@@ -107,7 +107,7 @@ class OrderedReplica(Generic[T]):
         self, op: Op, epoch: int, index: int, payload: bytes, *, robot: str, to: T
     ) -> list[Effect[T]]:
         """Take an order; `to` identifies the sender to answer."""
-        if self.robot not in ("", robot):  # whoever else knows the term
+        if self.robot not in ("", robot):  # another robot, even with the right term
             return [Refuse(to, Refusal.HELD, self.robot[:48])]
         if op is Op.CLAIM:
             return self._claim(epoch, robot, to)
@@ -155,14 +155,14 @@ class OrderedReplica(Generic[T]):
         return [self._has_joined(to)]
 
     def _is_behind(self, index: int) -> bool:
-        """Whether the state after this number has been left behind."""
+        """Whether it is already past the state after this number."""
         return self.joined and index < self._expected
 
     def _has_joined(self, to: T) -> Reply[T]:
         return Reply(to, orders.encode_index(self._expected))
 
     def _take_restore(self, index: int, payload: bytes, to: T) -> list[Effect[T]]:
-        if self._is_behind(index):  # a copy, or not needed
+        if self._is_behind(index):  # a repeat, or not needed
             return [self._has_joined(to)]
         goal, state = orders.decode_snapshot(payload)
         out: list[Effect[T]] = self._give_up(Refusal.NOT_JOINED) if self.joined else []
@@ -173,7 +173,7 @@ class OrderedReplica(Generic[T]):
         return [*out, *self._go_on()]
 
     def _recall(self, index: int, to: T) -> list[Effect[T]] | None:
-        """Answer a number that was taken before, now or when it is done; None for a new one."""
+        """Answer a number received before, now or once it is applied; None for a new number."""
         if not self.joined:
             return [Refuse(to, Refusal.NOT_JOINED)]
         if index <= self.position.index:
@@ -201,7 +201,7 @@ class OrderedReplica(Generic[T]):
         held_bytes = self._queued_bytes + len(payload)
         full = len(self._queue) >= self.queue_limit or held_bytes > self.queue_bytes
         if full and self._queue:
-            return [Refuse(to, Refusal.GAP, str(index))]  # send it again, a little later
+            return [Refuse(to, Refusal.GAP, str(index))]  # to be resent a little later
         self._queue[index] = payload, [to]
         self._queued_bytes += len(payload)
         return self._go_on()
@@ -209,7 +209,7 @@ class OrderedReplica(Generic[T]):
     # -- the service ----------------------------------------------------------------------
 
     def _go_on(self) -> list[Effect[T]]:
-        if self._work is not None:  # within its own term a claim asks only where we stand
+        if self._work is not None:  # a claim within our own term only asks for our position
             return self._tell() if self.joined else []
         out = self._tell()
         if self._restore is not None:
@@ -218,7 +218,7 @@ class OrderedReplica(Generic[T]):
             if self._is_behind(index):
                 out.append(self._has_joined(to))
             else:
-                # It may have joined by another restore since: what it was sent then is void.
+                # It may have joined by another restore meanwhile: orders since then are void.
                 out += self._give_up(Refusal.NOT_JOINED)
                 self.joined = self.sound = False
                 self._forget_answers()
@@ -245,9 +245,9 @@ class OrderedReplica(Generic[T]):
         return Begin(op, self._serial, payload)
 
     def done(self, serial: int, answer: bytes | None) -> list[Effect[T]]:
-        """Note that the call with this serial has ended; None if it failed.
+        """Note that the call with this serial has ended; `answer` is None if it failed.
 
-        A request that it could not read counts as applied: it is the same on every replica.
+        A request that could not be read counts as applied: the outcome is the same on all replicas.
         """
         work = self._work
         if work is None or work.serial != serial:
@@ -270,7 +270,7 @@ class OrderedReplica(Generic[T]):
         return [*out, *self._go_on()]
 
     def _restored(self, work: _Work[T], ok: bool) -> list[Effect[T]]:
-        if not ok:  # nobody knows what it has left
+        if not ok:  # the resulting state is unknown
             return [Refuse(to, Refusal.NOT_JOINED) for to in work.waiting]
         self.sound = True
         self.position = Position(work.epoch, work.index)
@@ -292,7 +292,7 @@ class OrderedReplica(Generic[T]):
         self.kept.clear()
         self._kept_size = 0
 
-    # -- what goes wrong ------------------------------------------------------------------
+    # -- failures -------------------------------------------------------------------------
 
     def lost(self) -> list[Effect[T]]:
         """Note that the service died with its state: it restarts from its initial state."""

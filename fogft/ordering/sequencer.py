@@ -1,9 +1,9 @@
-"""One term of a stateful service: claim replicas, have them join, take their answers. Pure.
+"""One term of a stateful service: claim replicas, make them join, take their answers. Pure.
 
-A term begins from the state of one replica, never from one before the mark. From then on it numbers
-requests, and the first answer counts. When most of the replicas that stay run another version, that
-takes over at one point of the order. The owner sends what `take` returns, and reports each order's
-end, once, by `replied`, `refused` or `declined`. Protocol and its argument: docs/design/state.md.
+A term begins from the state of one replica, never one before the mark. From then on it numbers
+requests, and the first answer counts. When more of the replicas that stay run another version, that
+takes over at one point in the order. The owner sends the orders from `take` and reports the end of
+each, once, by `replied`, `refused` or `declined`. Protocol and rationale: docs/design/state.md.
 """
 
 from collections.abc import Iterable, Mapping
@@ -17,23 +17,23 @@ from fogft.ordering.orders import START, Op, OrderError, Position, Promise
 from fogft.ordering.peer import RETRY_LIMIT_S, Peer, Phase
 
 CHECK_EVERY_S = 1.0
-_GOES_BACK = 8  # so often, without a number acknowledged: orders may overtake each other
+_GOES_BACK = 8  # times without an acknowledged number: orders may overtake each other
 
 
 @dataclass(frozen=True)
 class Handover:
-    """The start of a term with another active version: all earlier requests are applied."""
+    """The start of a term with another active version, once all earlier requests are applied."""
 
-    version: str  # the one that becomes active
+    version: str  # the version that becomes active
     at: Position  # the state that it takes over
     state: bytes
 
 
 class Sequencer:
-    """One term of a sequencer: `epoch`, above every earlier one.
+    """One term of a sequencer, numbered `epoch`, which exceeds every earlier one.
 
-    `mark` is the position of the last answer that was returned, in whatever term, and `holder` the
-    version that returned it, None where nobody knows. With `begin`, another version takes over.
+    `mark` is the position of the last answer that was returned, in any term, and `holder` the
+    version that returned it, None if unknown. With `begin`, another version takes over.
     """
 
     def __init__(
@@ -48,29 +48,29 @@ class Sequencer:
         self.mark = mark
         self.active = ActiveVersion(begin.version if begin else holder)
         self.deposed_by: int | None = None  # a later term that more replicas obey
-        self._fenced: dict[int, int] = {}  # who says that it obeys a later term, and which
-        self.held_by = ""  # another robot, whose order they obey
-        self.handover: Handover | None = None  # this term's end: the next begins from it
+        self._fenced: dict[int, int] = {}  # replica -> the later term that it says it obeys
+        self.held_by = ""  # another robot, whose orders replicas obey
+        self.handover: Handover | None = None  # ends this term: the next one begins from it
         self._versions: Mapping[int, str] = {}
         self._draining: frozenset[int] = frozenset()
-        self._change_to: str | None = None  # no number is given meanwhile
+        self._change_to: str | None = None  # the next version; no numbers are assigned meanwhile
         self._unanswered: dict[int, None] = {}
-        # Number -> replica -> how often its service died over it; 0 where it may have been applied.
+        # Number -> replica -> how often its service died over it; 0 if it may have applied it.
         self._deaths: dict[int, dict[int, int]] = {}
-        self._applied_to = 0  # by somebody: no request up to it may become one without effect
+        self._applied_to = 0  # by any replica: no request up to this number may be emptied
         self._replicas = CatchingUp(epoch, self._counts, handed_over=begin is not None)
         self._peers = self._replicas.peers
         self.log = self._replicas.log  # the numbered requests; empty until the term has begun
-        self.take = self._replicas.take  # the orders to send, in this order; they are forgotten
+        self.take = self._replicas.take  # removes and returns the orders to send, in order
         if begin is not None:
             self._replicas.begin_at(begin.at)
             self._replicas.take_checkpoint(begin.at.index, begin.state)
 
-    # -- what the owner asks --------------------------------------------------------------
+    # -- called by the owner --------------------------------------------------------------
 
     @property
     def ready(self) -> bool:
-        """Whether a number given now is sent at once to somebody whose answer counts."""
+        """Whether a request numbered now is sent at once to a replica whose answer counts."""
         return self._replicas.ready
 
     @property
@@ -91,7 +91,7 @@ class Sequencer:
         return ends or bool(self._replicas.out) or self._change_to is not None
 
     def submit(self, payload: bytes) -> int | None:
-        """Number a request and order it applied; None while the term has not begun or is full."""
+        """Number a request and order it applied; None if the term is not running or is full."""
         if self._change_to is not None or self.deposed_by is not None:
             return None
         index = self._replicas.append(payload)
@@ -100,7 +100,7 @@ class Sequencer:
         return index
 
     def abandon(self, index: int) -> None:
-        """Note that nobody waits for this number's answer any more. It is still applied."""
+        """Note that nobody awaits this number's answer any more. It is still applied."""
         self._unanswered.pop(index, None)
 
     def reach(
@@ -115,7 +115,7 @@ class Sequencer:
         wanted = set(replicas)
         self._versions, self._draining = versions or {}, frozenset(draining)
         for replica in [r for r in self._peers if r not in wanted]:
-            for index in self._peers.pop(replica).open:  # it may yet apply them
+            for index in self._peers.pop(replica).open:  # it may still apply them
                 self._deaths.setdefault(index, {})[replica] = 0
             self._fenced.pop(replica, None)
             self._gave_no_checkpoint(replica)
@@ -157,12 +157,12 @@ class Sequencer:
         self._replicas.order(replica, Op.CLAIM)
 
     def _waits_for_others(self, replica: int) -> bool:
-        """Whether it died, not alone, over what another works on: that shows whether it kills."""
+        """Whether it and others died over a request that one works on again: await its outcome."""
         over = [n for n, d in self._deaths.items() if 0 < d.get(replica, 0) < sum(d.values())]
         return any(n in one.open for n in over for one in self._peers.values())
 
     def _claim_again(self, replica: int, peer: Peer, now: float) -> None:
-        """Claim anew one that waits for long: it may have applied more since it was asked."""
+        """Claim a replica again that has waited long: it may have applied more since its claim."""
         if peer.phase is not Phase.CLAIMED:
             return
         if peer.waits_since is None:
@@ -171,17 +171,17 @@ class Sequencer:
             self._claim(replica, peer)
 
     def _check(self, replica: int, peer: Peer, now: float) -> None:
-        """Ask an idle replica where it stands: no request would tell that its service died."""
+        """Ask an idle replica for its position: no request would reveal that its service died."""
         if peer.joined and not peer.open and now - peer.checked_at > CHECK_EVERY_S:
             peer.checked_at = now
             self._replicas.order(replica, Op.CLAIM)
 
-    # -- what replicas say ----------------------------------------------------------------
+    # -- replies from replicas ------------------------------------------------------------
 
     def replied(self, replica: int, op: Op, index: int, payload: bytes) -> bool:
-        """Take a reply. Return whether it is the answer to a number: write down `mark`, return it.
+        """Take a reply; True if it answers a number: store `mark` before passing the answer on.
 
-        Raises OrderError: the bytes are not what this operation is answered with.
+        Raises OrderError: the payload is not a valid answer to this operation.
         """
         peer = self._peers.get(replica)
         if op in (Op.APPLY, Op.RECALL):
@@ -203,14 +203,14 @@ class Sequencer:
         return False
 
     def _applied(self, replica: int, index: int) -> bool:
-        """A replica says that it has applied a number. Return whether that answers it."""
+        """Note that a replica applied a number; return whether its reply is the answer to it."""
         self._applied_to = max(self._applied_to, index)
         for known in [n for n in self._deaths if n <= self._applied_to]:
             del self._deaths[known]
         first = index in self._unanswered and self._counts(replica)
         if first:
             del self._unanswered[index]
-            # Answers to later numbers imply all earlier ones; a mark never goes back.
+            # An answer to a later number implies all earlier ones; a mark never goes back.
             self.mark = max(self.mark, Position(self.epoch, index))
         return first
 
@@ -240,7 +240,7 @@ class Sequencer:
             self._lead(replica, promise)
 
     def _lead(self, replica: int, promise: Promise) -> None:
-        """Begin the term from the state of a claimed replica, if it may be."""
+        """Begin the term from the state of a claimed replica, if that is allowed."""
         if not promise.sound or promise.position < self.mark:
             return
         if self.active.may_lead(self._version(replica)):
@@ -259,19 +259,19 @@ class Sequencer:
         self._replicas.feed(replica, peer)
 
     def _recall(self, replica: int, before: int) -> None:
-        """Ask a replica for answers that never came: it has applied those, and keeps them."""
+        """Ask a replica for answers that never came: it has applied those requests."""
         for index in self._unanswered:
             if index < before:
                 self._replicas.recall(replica, index)
 
-    # -- what does not succeed ------------------------------------------------------------
+    # -- failed orders --------------------------------------------------------------------
 
     def refused(
         self, replica: int, op: Op, index: int, reason: Refusal, now: float, *, detail: str = ""
     ) -> bool:
-        """Take a refusal or the loss of an order, which the replica may have carried out.
+        """Take the refusal or loss of an order, which the replica may have executed.
 
-        Return whether every service has died over this number: from now on it is without effect.
+        Return whether every service has died over this number: it is now applied without effect.
         """
         epoch = orders.read_epoch(detail) if reason is Refusal.FENCED else None
         if epoch is not None and epoch > self.epoch:
@@ -299,13 +299,13 @@ class Sequencer:
                 peer.go_back(expected)
                 return False
             if expected is not None:
-                peer.wait_s = RETRY_LIMIT_S  # it may say so of all that it is ever sent
+                peer.wait_s = RETRY_LIMIT_S  # it may do so for every order
         peer.pause(now)
         self._look_whom_most_obey()
         return kills
 
     def _kills(self, replica: int, peer: Peer, index: int) -> bool:
-        """Empty a request over which every service has died, and not by chance once."""
+        """Empty a request over which every service has died, twice at least; return whether."""
         if index != peer.acked + 1 or index <= max(self.log.start, self._applied_to):
             return False
         deaths = self._deaths.setdefault(index, {})
@@ -313,12 +313,12 @@ class Sequencer:
         if not all(deaths.values()) or sum(deaths.values()) < 2 or self._peers.keys() - deaths:
             return False
         if any(index in other.open for other in self._peers.values() if other is not peer):
-            return False  # it is at work on it again
+            return False  # another replica is working on it
         self.log.empty(index)
         return True
 
     def _look_whom_most_obey(self) -> None:
-        """End the term where more replicas obey a later one, or as many before the first number."""
+        """End the term if more replicas obey a later one, or as many before it has begun."""
         others = [peer for replica, peer in self._peers.items() if replica not in self._fenced]
         silent = any(one.phase is Phase.ASKED and one.promise is None for one in others)
         if not self._fenced or silent:
@@ -343,7 +343,7 @@ class Sequencer:
     # -- versions -------------------------------------------------------------------------
 
     def _govern(self, now: float) -> None:
-        """Have a version take over: by a handover, or because the active one is gone."""
+        """Let a version take over: by a handover, or because the active one is gone."""
         joined = self.joined
         standing = [self._version(r) for r in joined]
         self.active.look(standing, now)
@@ -363,7 +363,7 @@ class Sequencer:
             self._prepare_handover(now)
 
     def _prepare_handover(self, now: float) -> None:
-        """Ask for the state after the last number, once that has been answered."""
+        """Request a snapshot after the last number, once all requests have been answered."""
         if self._change_to is None or self._unanswered:
             return
         donors = [

@@ -1,7 +1,7 @@
-"""The bytes of topics on the link: a message to a replica, a pull, and its answer. Pure.
+"""Wire format of topics: a message to a replica, a pull (poll), and its answer. Pure.
 
-They travel as the payloads of requests and answers, so all that holds for those holds for them.
-Whatever bytes come in, a decoder returns a value or raises `FrameError`.
+They are sent as the payloads of requests and answers, so the rules for those apply to them.
+For any input, a decoder returns a value or raises `FrameError`.
 """
 
 import struct
@@ -21,12 +21,12 @@ Batch = tuple[bytes, int, list[tuple[int, bytes]]]
 
 
 def encode_message(session: bytes, number: int, message: bytes) -> bytes:
-    """Encode a message of the robot: publisher (random at its start), number, CDR."""
+    """Encode a robot's message: publisher session (random at its start), number, CDR."""
     return _HEAD.pack(session, number) + message
 
 
 def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
-    """Decode a message of the robot. Raises FrameError."""
+    """Decode a robot's message. Raises FrameError."""
     if len(frame) < _HEAD.size:
         raise FrameError(f"a message of {len(frame)} bytes")
     session, number = _HEAD.unpack_from(frame)
@@ -35,7 +35,7 @@ def decode_message(frame: bytes) -> tuple[bytes, int, bytes]:
 
 
 def encode_pull(session: bytes, after: int) -> bytes:
-    """Encode a pull of messages after a number of a session; `NO_SESSION` asks where to begin."""
+    """Encode a pull of a session's messages after a number; `NO_SESSION` asks where to begin."""
     return _HEAD.pack(session, after)
 
 

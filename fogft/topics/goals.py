@@ -1,7 +1,7 @@
 """An action's goals: each sent by a client and executed by every replica. Pure.
 
-Everything about a goal is known by the id that its client gave it, the first 16 bytes of a
-request (CDR, after its header).
+A goal is identified by the id that its client gave it, the first 16 bytes of a request (CDR, after
+its header).
 
 Not here: sending (`fogft.proxy.robot.actions`), whole messages (`fogft.ros.messages`).
 """
@@ -19,12 +19,12 @@ _SUCCEEDED = 4
 _UNKNOWN = 0
 _CDR_HEADER = b"\x00\x01\x00\x00"
 _NO_TIME = bytes(8)
-RESULT_OF_NONE = _CDR_HEADER + bytes(16)  # a request that is answered at once
+RESULT_OF_NONE = _CDR_HEADER + bytes(16)  # a result request that is answered at once
 GOALS_KEPT = 4096
 BYTES_KEPT = 64 << 20
-_AGAIN_AFTER_S = 0.25  # and twice as long each time
+_AGAIN_AFTER_S = 0.25  # the first retry delay; it doubles each time
 _AGAIN_LIMIT_S = 8.0
-# Which of two statuses says more: done well, then the furthest of those under way, then an end.
+# Which status prevails: succeeded, then the most advanced one in progress, then another end.
 _RANK = {4: 9, 3: 8, 2: 7, 1: 6, 5: 5, 6: 4, 0: 0}
 
 
@@ -43,12 +43,12 @@ def is_success(part: Part, response: bytes) -> bool:
 
 
 def is_unknown(response: bytes) -> bool:
-    """Whether a result says that its replica does not know the goal."""
+    """Whether a result response says that its replica does not know the goal."""
     return response[4:5] == bytes([_UNKNOWN])
 
 
 def cancelled(response: bytes) -> list[bytes]:
-    """Return the goals in a response to a cancellation; a truncated one has fewer."""
+    """Return the goals in a response to a cancel request; a truncated one has fewer."""
     order = "little" if response[1:2] == b"\1" else "big"
     count = int.from_bytes(response[8:12], order)  # type: ignore[arg-type]
     found = [response[at : at + 16] for at in range(12, len(response), 24)]
@@ -61,17 +61,17 @@ def cancel_request(goal: bytes) -> bytes:
 
 
 def names_one(cancel: bytes) -> bool:
-    """Whether a request to cancel means one goal, not all, or all until a moment."""
+    """Whether a cancel request means one goal, rather than all, or all up to a time."""
     return any(goal_of(cancel)) and not any(cancel[20:28])
 
 
 @dataclass(frozen=True)
 class _Word:
-    """What a replica has said of a goal. Times on the caller's clock, seconds."""
+    """A replica's last response to a goal. Times in seconds on the caller's clock."""
 
-    until: float  # when to give it the goal again, if it says nothing more
-    since: float = math.inf  # from then on it has taken or refused it: to know nothing counts
-    again_s: float = 0.0  # for how long it was left alone when it did not look at it
+    until: float  # when to resend it the goal, if it does not respond before
+    since: float = math.inf  # when it accepted it (-inf: refused); a later "unknown" counts
+    again_s: float = 0.0  # the last retry delay, after the goal did not reach it
 
 
 @dataclass
@@ -79,26 +79,26 @@ class _Goal:
     id: bytes  # of its client's request
     request: bytes
     cancelled: bool = False
-    takers: set[int] = field(default_factory=set)  # replicas that ever took it
+    takers: set[int] = field(default_factory=set)  # replicas that ever accepted it
     words: dict[int, _Word] = field(default_factory=dict)  # by replica
-    ids: set[bytes] = field(default_factory=set)  # of all requests that gave it to somebody
+    ids: set[bytes] = field(default_factory=set)  # of all requests that sent it to a replica
 
 
 class Goals:
     """The goals of one action, from their request to their result.
 
-    Beyond 4 096 goals or 64 MiB of requests the oldest are forgotten, at first those that nobody
-    awaits.
+    Beyond 4 096 goals or 64 MiB of requests the oldest are forgotten, those that nobody awaits
+    first.
     """
 
     def __init__(self) -> None:
         self._goals: OrderedDict[bytes, _Goal] = OrderedDict()
         self._of_id: dict[bytes, bytes] = {}  # request id -> goal
         self._awaited: dict[bytes, _Goal] = {}
-        self.over: OrderedDict[bytes, bytes] = OrderedDict()  # the same, of goals that ended
+        self.over: OrderedDict[bytes, bytes] = OrderedDict()  # the same, for goals that ended
         self._bytes = 0
 
-    # -- giving ---------------------------------------------------------------------------
+    # -- sending --------------------------------------------------------------------------
 
     def made(self, request: bytes, id: bytes, replicas: Iterable[int], until: float) -> None:
         """Note a new goal: its request goes to these replicas, under one id."""
@@ -116,7 +116,7 @@ class Goals:
             self._drop(next(unwanted, oldest))
 
     def gave(self, goal: bytes, id: bytes, replica: int, until: float) -> None:
-        """Note that a replica is sent a goal; it is sent again if there is no answer `until`."""
+        """Note that a replica is sent a goal; it is resent at `until` if there is no answer."""
         known = self._goals.get(goal)
         if known is not None:
             word = known.words.get(replica)
@@ -130,10 +130,10 @@ class Goals:
     def took(
         self, id: bytes, replica: int, now: float, *, accepts: bool
     ) -> tuple[bytes | None, bool]:
-        """Note a replica's answer whether it accepts a goal. Unknown ids are ignored.
+        """Note whether a replica accepts a goal. Unknown ids are ignored.
 
-        Returns the goal, or None where the replica did not accept it, had it before, or it is not
-        known any more; and whether the goal is over, or cancelled.
+        Returns the goal, or None if the replica did not accept it, had it before, or it is no
+        longer known; and whether the goal is over or cancelled.
         """
         known = self._given_by(id)
         if known is None:
@@ -142,13 +142,13 @@ class Goals:
         if accepts:
             known.takers.add(replica)
         word = known.words.get(replica)
-        if word is not None and math.isfinite(word.since):  # it has taken it before
+        if word is not None and math.isfinite(word.since):  # it has accepted it before
             return None, False
         known.words[replica] = _Word(math.inf, now if accepts else -math.inf)
         return goal_of(known.request) if accepts else None, known.cancelled
 
     def failed(self, id: bytes, replica: int, now: float) -> None:
-        """Note that a goal did not reach a replica: it is sent again soon."""
+        """Note that a goal did not reach a replica: it is resent soon."""
         known = self._given_by(id)
         if known is None:
             return
@@ -165,13 +165,13 @@ class Goals:
         return self._goals.get(self._of_id.get(id, b""))
 
     def lost(self, goal: bytes, replica: int) -> None:
-        """Note that a replica may have lost a goal: it is sent again."""
+        """Note that a replica may have lost a goal: it is resent."""
         known = self._goals.get(goal)
         if known is not None:
             known.words.pop(replica, None)
 
     def left(self, replica: int) -> None:
-        """Note that a replica is gone; its successor may know nothing."""
+        """Note that a replica is gone; its successor may know none of the goals."""
         for known in self._goals.values():
             known.words.pop(replica, None)
 
@@ -191,7 +191,7 @@ class Goals:
             self._awaited[goal] = self._goals[goal]
 
     def cancelled(self, goal: bytes) -> None:
-        """Note a cancelled goal: it is not sent any more. Unknown goals are ignored."""
+        """Note a cancelled goal: it is no longer sent. Unknown goals are ignored."""
         known = self._goals.get(goal)
         if known is not None:
             known.cancelled = True
@@ -206,7 +206,7 @@ class Goals:
                 self.over.popitem(last=False)
 
     def _drop(self, goal: bytes) -> _Goal | None:
-        """Forget a goal, which may well go on."""
+        """Forget a goal, which may still be running."""
         self._awaited.pop(goal, None)
         known = self._goals.pop(goal, None)
         if known is not None:
@@ -240,14 +240,14 @@ class Goals:
         return known is not None and bool(known.takers)
 
     def lacked(self, goal: bytes, replica: int, asked_at: float) -> Refusal | None:
-        """Return why a replica that was asked for the result did not have the goal; None: it had.
+        """Return why a replica asked for the result does not know the goal; None if it had it.
 
-        It refused the goal (`FORGOTTEN`), or has said nothing of it yet (`NOT_READY`).
+        It refused the goal (`FORGOTTEN`), or has not responded to it yet (`NOT_READY`).
         """
         known = self._goals.get(goal)
         word = None if known is None else known.words.get(replica)
         if known is not None and known.cancelled:
-            return None  # it need not be given it any more
+            return None  # the goal need not be sent to it any more
         if word is None or asked_at < word.since:
             return Refusal.NOT_READY
         return None if math.isfinite(word.since) else Refusal.FORGOTTEN

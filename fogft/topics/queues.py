@@ -1,7 +1,7 @@
 """Queues of topic messages: at a replica for robots, on the robot for each replica. Pure.
 
-Messages are numbered by their publisher from 1. A robot asks for what comes after the last number
-that it has, so whatever is lost on the way is asked for again.
+Messages are numbered by their publisher from 1. A robot pulls the messages after the last number
+that it has, so messages lost in transit are pulled again.
 """
 
 from collections import deque
@@ -9,15 +9,15 @@ from collections.abc import Iterable
 from enum import Enum, auto
 
 Numbered = tuple[int, bytes]
-_SMALL_BYTES = 1 << 12  # of a message of which many may be under way
-_KNOWN = 64  # numbers of which it is known whether they were published
+_SMALL_BYTES = 1 << 12  # up to this size, many messages may be in flight
+_KNOWN = 64  # how many of the last numbers are remembered as published or not
 _MASK = (1 << _KNOWN) - 1
 
 
 class Ring:
     """The last messages that a replica's nodes published; `latched`: a new robot gets them."""
 
-    kept_bytes = 64 << 20  # of all together, at most; the newest is kept in any case
+    kept_bytes = 64 << 20  # the limit of their total; the newest is always kept
 
     def __init__(self, depth: int, *, latched: bool) -> None:
         self._depth = depth
@@ -27,7 +27,7 @@ class Ring:
         self.last = 0
 
     def put(self, message: bytes) -> None:
-        """Add a message; older ones are dropped for it."""
+        """Add a message, and drop old ones beyond the limits."""
         self.last += 1
         self._kept.append((self.last, message))
         self._bytes += len(message)
@@ -41,7 +41,7 @@ class Ring:
         return self._kept[0][0] - 1 if self._latched and self._kept else self.last
 
     def after(self, number: int, limit_bytes: int) -> list[Numbered]:
-        """Return messages after a number, oldest first: one, or up to a number of bytes."""
+        """Return messages after a number, oldest first: at least one, and up to `limit_bytes`."""
         found: list[Numbered] = []
         size = 0
         for one in tuple(self._kept):  # another thread may put one meanwhile
@@ -56,8 +56,8 @@ class Ring:
 class Outbox:
     """The messages of a robot's topic to send to one replica, in order; at most `depth` wait."""
 
-    window = 64  # messages under way at once; of large ones a quarter
-    kept_bytes = 64 << 20  # of those that wait, at most; the newest is kept in any case
+    window = 64  # messages in flight; a quarter of that for large ones
+    kept_bytes = 64 << 20  # the limit of the waiting messages' total; the newest is always kept
 
     def __init__(self, depth: int) -> None:
         self._waiting: deque[Numbered] = deque()
@@ -85,10 +85,10 @@ class Outbox:
         return gone
 
     def next(self) -> Numbered | None:
-        """Return the messages to send now; they count as under way.
+        """Return the next message to send, which counts as in flight; None if none may be sent.
 
-        Nothing while later ones than that are under way: they may have been lost with it, and
-        what overtakes a message makes it one that comes too late.
+        It waits while messages with higher numbers are in flight: they may have been lost with it,
+        and a message that is overtaken by a later one is too late.
         """
         if not self._waiting:
             return None
@@ -106,26 +106,26 @@ class Outbox:
         self._open.pop(number, None)
 
     def returned(self, numbers: Iterable[int]) -> None:
-        """Queue undelivered messages again, in order."""
+        """Requeue undelivered messages, in order."""
         back = [(number, self._open.pop(number)) for number in numbers if number in self._open]
         self._waiting = deque(sorted([*back, *self._waiting]))
 
 
 class Judgement(Enum):
-    """What becomes of a robot's message at a replica."""
+    """What a replica does with a robot's message."""
 
-    NEW = auto()  # to be published
-    KNOWN = auto()  # it was published
-    LATE = auto()  # a later one was published: it never will be
+    NEW = auto()  # it is to be published
+    KNOWN = auto()  # a duplicate: it was published
+    LATE = auto()  # a later one was published, so this one never will be
 
 
 class Seen:
-    """Judges the messages of one topic at a replica, by robot and its start."""
+    """Detects duplicate and late messages of one topic at a replica, per robot and session."""
 
-    robots, starts = 256, 4  # that are remembered; those longest silent are forgotten
+    robots, starts = 256, 4  # how many are remembered; those silent for longest are forgotten
 
     def __init__(self) -> None:
-        # Of each start the last number that was published, and a bit for each up to it.
+        # For each session: the last number published, and a bit for each number up to it.
         self._of: dict[str, dict[bytes, tuple[int, int]]] = {}
 
     def judge(self, robot: str, session: bytes, number: int) -> Judgement:

@@ -1,6 +1,6 @@
-"""Which replicas' messages the robot gets. Pure: time is an argument.
+"""Select which replicas' topic messages the robot gets. Pure: time is an argument.
 
-Replicas run the same nodes on the same input, so most of what they publish says the same. Not here:
+Replicas run the same nodes on the same input, so most of their messages are redundant. Not here:
 an action's status (`fogft.ros.messages`).
 """
 
@@ -8,17 +8,17 @@ from collections import OrderedDict
 
 from fogft.model.topic import Select
 
-# A leader loses its place by silence of twice its last gap, but within these bounds; of one that
-# has spoken only once no gap is known, and the longer one holds.
+# A leader may be replaced after a silence of twice its last gap, within these bounds. After its
+# first message no gap is known, and the upper bound applies.
 QUIET_S = 1.0
 QUIET_LIMIT_S = 10.0
-_KEPT = 1024  # stamps, and goals
+_KEPT = 1024  # stamps, and as many goals
 _STAMP = slice(4, 12)  # of a message whose first field is a std_msgs/Header
 _GOAL = slice(4, 20)  # of a feedback message: its goal's id
 
 
 class Leader:
-    """Passes one replica's messages; another's when that falls silent or leaves."""
+    """Passes the messages of one replica, or of another once that falls silent or leaves."""
 
     def __init__(self) -> None:
         self._leader: int | None = None
@@ -41,7 +41,7 @@ class Leader:
         return True
 
     def left(self, replica: int) -> None:
-        """Note that a replica is gone: the next one to publish leads."""
+        """Note that a replica is gone: the next replica to publish becomes the leader."""
         if replica == self._leader:
             self._leader = None
 

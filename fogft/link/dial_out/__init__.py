@@ -1,4 +1,4 @@
-"""Replicas that no robot can reach open the connection to the robot themselves.
+"""Reverse connections: a replica that robots cannot reach connects to the robot instead.
 
-Not here: what flows through it afterwards, which is a link as any other (`fogft.link.zenoh`).
+Not here: the link that runs over the connection, which is an ordinary one (`fogft.link.zenoh`).
 """

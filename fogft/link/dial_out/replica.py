@@ -1,7 +1,7 @@
-"""The replica's side of dial-out: it keeps two connections waiting at each robot's door.
+"""The replica's side of dial-out: keep two idle connections at each robot's dial-in port.
 
-One that is taken into use is joined with this replica's own listener, and another one takes its
-place. Not here: the door (`robot`), the listener (`listener`).
+When the robot uses one, it is joined with this replica's own listener, and a new one replaces it.
+Not here: the dial-in port, or door (`robot`), the listener (`listener`).
 """
 
 import logging
@@ -31,7 +31,7 @@ _CONNECT_TIMEOUT_S = 1.5
 
 
 class DialOut:
-    """Keeps connections from robots' dial-in ports to our listener, `local`: ``host:port``."""
+    """Connects robots' dial-in ports with our listener, `local` (``host:port``)."""
 
     def __init__(self, local: str, pool_uid: str, sign: Sign) -> None:
         host, port = host_and_port(local)
@@ -39,7 +39,7 @@ class DialOut:
         self._pool_uid = pool_uid
         self._sign = sign
         self._lock = threading.Lock()
-        self._targets: dict[str, threading.Event] = {}  # set when the door is not wanted any more
+        self._targets: dict[str, threading.Event] = {}  # set once the door is no longer followed
         self._details: dict[str, str] = {}  # each door's problem, empty while connected
         self._tunnels = Tunnels()
 
@@ -71,13 +71,13 @@ class DialOut:
                 self._greet(link)
                 self._say(door, "")
                 if self._wait(link, stop):
-                    # Of each door another host, for who keeps strangers out at our own port.
+                    # A source address per door: the listener limits connections by host.
                     ours = IPv4Address(0x7F000002 + crc32(door.encode()) % 0xFFFFFC)
                     source = (str(ours) if self._local[0] == "127.0.0.1" else "", 0)
                     own = socket.create_connection(self._local, _CONNECT_TIMEOUT_S, source)
                     self._tunnels.carry(link, own)
                     link = None
-                    continue  # at once: another one takes its place
+                    continue  # without a pause: open its replacement
             except (OSError, EOFError, ValueError, FogftError) as error:
                 self._say(door, str(error) or type(error).__name__)
             finally:
@@ -86,7 +86,7 @@ class DialOut:
             stop.wait(_BACKOFF_S)
 
     def _greet(self, link: socket.socket) -> None:
-        """Tell the door who we are."""
+        """Authenticate to the door."""
         keep_alive(link)
         nonce, _ = frames.read_challenge(tunnel.receive(link, 4 << 10))
         link.settimeout(GREETING_TIMEOUT_S)
@@ -94,7 +94,7 @@ class DialOut:
         link.sendall(frames.greeting(*self._sign(proof)))
 
     def _wait(self, link: socket.socket, stop: threading.Event) -> bool:
-        """Wait until the connection is taken into use; return False where we are to leave."""
+        """Wait until the robot uses the connection; return False once `stop` is set."""
         heard_at = time.monotonic()
         while not stop.is_set():
             if poll.is_ready(link, SIGN_EVERY_S):

@@ -1,8 +1,8 @@
 """The robot's side of dial-out: a port that replicas connect to if the robot cannot reach them.
 
-A replica dials the door, proves who it is, and waits. A link to that replica dials a port on this
-machine's loopback; the door then joins both connections. The robot is the TLS client, the replica
-the TLS server, end to end, so the door can neither read nor change what passes.
+A replica dials this port, the door, authenticates and waits. A link to that replica dials a port
+on this machine's loopback; the door then joins both connections. TLS runs end to end, with the
+robot as client and the replica as server, so the door can neither read nor change the traffic.
 """
 
 import contextlib
@@ -48,16 +48,16 @@ class _Waiting:
     def __init__(self, id: ReplicaId, link: socket.socket) -> None:
         self.id = id
         self.link = link
-        self.lock = threading.Lock()  # held by whoever talks on it; the taker keeps it
+        self.lock = threading.Lock()  # held while reading or writing `link`
         self.taken = False
 
 
 @dataclass(eq=False)
 class DialIn:
-    """The dial-in port of one robot or gateway, at ``host:port``; port 0 for any that is free.
+    """The dial-in port of a robot or gateway, at `listen` (``host:port``, port 0 for any free one).
 
-    Replicas of other pools, and `revoked` common names, are turned away. Raises WireError: the port
-    cannot be had.
+    Replicas of other pools, and `revoked` common names, are rejected. Raises WireError: the port
+    cannot be bound.
     """
 
     listen: str
@@ -80,7 +80,7 @@ class DialIn:
         self.endpoint = f"{host}:{port}"
         on_thread(self._accept, name="fogft-dial-in")
 
-    # -- replicas come in ---------------------------------------------------------------------
+    # -- connections from replicas ------------------------------------------------------------
 
     def _accept(self) -> None:
         while not self._closed:
@@ -150,12 +150,12 @@ class DialIn:
         why = self._tend(one)
         if why:
             log.info("replica_left_door replica=%s reason=%s", one.id.short, why)
-            with self._lock, contextlib.suppress(ValueError):  # it was taken just now
+            with self._lock, contextlib.suppress(ValueError):  # `_take` just took it
                 self._waiting.remove(one)
             hang_up(one.link)
 
     def _tend(self, one: _Waiting) -> str:
-        """Exchange signs of life; return why it ended, empty where it was taken into use."""
+        """Exchange keepalives; return why the connection ended, or "" once a link uses it."""
         began = heard_at = time.monotonic()
         signs = 0
         while True:
@@ -183,7 +183,7 @@ class DialIn:
             if time.monotonic() - heard_at > SILENCE_S:
                 return "it sends nothing"
 
-    # -- links go out -------------------------------------------------------------------------
+    # -- connections from our links -----------------------------------------------------------
 
     def local(self, id: ReplicaId) -> str:
         """Return the ``host:port`` on this machine through which a link reaches a replica."""
@@ -207,26 +207,26 @@ class DialIn:
                 link, _ = port.accept()
             except OSError as error:
                 if port.fileno() < 0:
-                    return  # given back
-                self._count("accept_failed", str(error))  # no descriptor, for a moment
+                    return  # closed by `keep`
+                self._count("accept_failed", str(error))  # e.g. out of file descriptors
                 time.sleep(0.1)
                 continue
             one = self._take(id)
             if one is None:
-                link.close()  # the link tries again soon
+                link.close()  # the link retries soon
                 continue
             self._tunnels.carry(link, one.link)
             self._counters.add("tunnels")
 
     def _take(self, id: ReplicaId) -> _Waiting | None:
-        """Take a replica's connection into use, after a moment's wait if need be."""
+        """Return a replica's connection for use, waiting briefly for one; None if none came."""
         until = time.monotonic() + _PATIENCE_S
         while True:
             with self._lock:
                 while not (found := [one for one in self._waiting if one.id == id]):
                     if not self._lock.wait(until - time.monotonic()) or self._closed:
                         return None
-                one = found[-1]  # the latest is the likeliest to live
+                one = found[-1]  # the newest is the most likely to be alive
                 self._waiting.remove(one)
             with one.lock, contextlib.suppress(OSError):
                 one.taken = True
@@ -258,7 +258,7 @@ class DialIn:
 
 
 def _drained(link: socket.socket) -> bool:
-    """Read signs of life away up to the replica's `GO`: behind it the TLS client speaks first."""
+    """Discard keepalives up to the replica's `GO`; after that, the TLS client sends first."""
     link.settimeout(SILENCE_S)
     while (data := link.recv(1)) == SIGN:
         pass

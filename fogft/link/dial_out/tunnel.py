@@ -1,6 +1,6 @@
-"""Join two TCP connections, and read the first message of whoever connects.
+"""Join two TCP connections, and read a new connection's first message.
 
-The kernel moves the bytes (`splice`), so a tunnel costs a robot two sleeping threads.
+The kernel moves the bytes (`splice`), so a tunnel costs a robot only two sleeping threads.
 """
 
 import contextlib
@@ -14,16 +14,16 @@ from fogft.process import on_thread
 from fogft.records import frames
 
 GREETING_TIMEOUT_S = 5.0
-_LEAST_S = 0.01  # a time-out of 0 would mean none
+_LEAST_S = 0.01  # a time-out of 0 would make the socket non-blocking
 
 
 def receive(
     link: socket.socket, limit_bytes: int, within_s: float = GREETING_TIMEOUT_S
 ) -> dict[str, Any]:
-    """Receive the first message, the whole of it within the time.
+    """Receive the first message, completely within `within_s`.
 
-    Raises OSError: it did not come in time, or the connection broke. EOFError: the other party
-    left before. RecordError: it is none.
+    Raises OSError: it did not arrive in time, or the connection broke. EOFError: the peer closed
+    the connection first. RecordError: it is not a valid message.
     """
     until = time.monotonic() + within_s
     unframer = frames.Unframer(limit=limit_bytes)
@@ -43,7 +43,7 @@ _CHUNK = 64 << 10
 
 
 def keep_alive(link: socket.socket) -> None:
-    """Have the kernel drop a connection within seconds once its peer is gone."""
+    """Make the kernel drop a connection within seconds once its peer is gone."""
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     link.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     link.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
@@ -53,24 +53,24 @@ def keep_alive(link: socket.socket) -> None:
 
 
 def hang_up(link: socket.socket) -> None:
-    """End a connection in any state, also for a thread that waits on it."""
+    """Close a connection in any state, waking a thread that waits on it."""
     shut_down(link)
     link.close()
 
 
 def shut_down(*links: socket.socket) -> None:
-    """End connections, which the threads that wait on them close."""
+    """Shut connections down; the threads that wait on them close the sockets."""
     for link in links:
         with contextlib.suppress(OSError):
             link.shutdown(socket.SHUT_RDWR)
 
 
 class Tunnels:
-    """Pairs of connections, the bytes of each carried to the other. Any thread."""
+    """Pairs of joined connections: bytes from each are forwarded to the other. Any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._open: set[socket.socket] = set()  # with both directions open, or one
+        self._open: set[socket.socket] = set()  # with at least one direction open
 
     def carry(self, one: socket.socket, other: socket.socket) -> None:
         """Join two connected sockets, and close both when both directions have ended."""
@@ -80,7 +80,7 @@ class Tunnels:
             link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         with self._lock:
             self._open.update(ends)
-        left = [other, one]  # directions that go on; list.pop is atomic
+        left = [other, one]  # one entry per open direction; list.pop is atomic
         for source, target in (ends, ends[::-1]):
             on_thread(self._carry, source, target, left, name="fogft-tunnel")
 
@@ -89,7 +89,7 @@ class Tunnels:
     ) -> None:
         try:
             _splice(source.fileno(), target.fileno())
-            target.shutdown(socket.SHUT_WR)  # the other direction may go on
+            target.shutdown(socket.SHUT_WR)  # the other direction may continue
         except (OSError, ValueError):
             shut_down(source, target)
         left.pop()
@@ -106,7 +106,7 @@ class Tunnels:
 
 
 def _splice(source: int, target: int) -> None:
-    """Carry bytes until the source ends. Raises OSError: one of both is broken."""
+    """Forward bytes until the source ends. Raises OSError: either connection is broken."""
     take, put = os.pipe()
     try:
         while count := os.splice(source, put, _CHUNK):

@@ -1,4 +1,4 @@
-"""Links over Zenoh: its settings and threads, and what both ends have in common.
+"""Links over Zenoh: its settings and threads, and code that both ends share.
 
 Not here: the two ends (`robot`, `replica`).
 """

@@ -1,9 +1,9 @@
-"""How long a link may take to open, and why it does not, in words. Zenoh says neither.
+"""Time limits for opening a link, and why one cannot be opened, in words. Zenoh reports neither.
 
-Asks the endpoint again with plain TCP and TLS, after a failure only.
+After a failure only, connects to the endpoint again with plain TCP and TLS.
 
-A certificate begins 24 hours before it was made. So one that is "not yet valid" was made by
-a clock a day ahead of the one that judges it, and TLS's word for it helps nobody.
+A certificate is valid from 24 hours before it was issued. So if one is "not yet valid", the
+issuer's clock is over a day ahead of the verifier's, which TLS's own message does not say.
 """
 
 import contextlib
@@ -21,7 +21,7 @@ from fogft.records.dialling import client_context
 
 # OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
 _OUT_OF_TIME = (9, 10)
-_TIMEOUT_S = 0.5  # of each step
+_TIMEOUT_S = 0.5  # for each step
 _ALERTS = {
     "unknown ca": "our certificate is from a different CA than the replica's",
     "decrypt error": "our certificate is from a different CA than the replica's",
@@ -68,8 +68,8 @@ def _after_handshake(link: ssl.SSLSocket, peer: Peer) -> str:
     found = subject.get("commonName")
     if found != peer.certificate_name:
         return wrong_name(found, peer)
-    # In TLS 1.3 our own certificate is judged after our side of the handshake: the verdict
-    # comes with the first read. No verdict in time means that it was accepted.
+    # In TLS 1.3 the peer verifies our certificate after our side of the handshake: a rejection
+    # comes with the first read. None in time means that it was accepted.
     link.settimeout(0.3)
     with contextlib.suppress(TimeoutError):
         link.recv(1)
@@ -77,12 +77,12 @@ def _after_handshake(link: ssl.SSLSocket, peer: Peer) -> str:
 
 
 def wrong_name(found: str | None, peer: Peer) -> str:
-    """Return the words for a peer whose certificate is another's."""
+    """Return the message for a peer that presents another name's certificate."""
     return f"`{peer.endpoint}` has the certificate of `{found}`, not of `{peer.certificate_name}`"
 
 
 def _clock_words(error: ssl.SSLError, peer: Peer, credentials: CredentialPaths) -> str:
-    """Return whose clock is wrong where a certificate was refused for its time, else nothing."""
+    """Return whose clock is wrong if a certificate was rejected for its dates, else ""."""
     now = datetime.datetime.now(datetime.timezone.utc)
     if isinstance(error, ssl.SSLCertVerificationError):
         if error.verify_code not in _OUT_OF_TIME:
@@ -100,7 +100,7 @@ def _clock_words(error: ssl.SSLError, peer: Peer, credentials: CredentialPaths) 
 
 
 def _certificate_of(peer: Peer, credentials: CredentialPaths) -> bytes:
-    """Return the certificate (PEM) that stands at an endpoint, whoever's it is; to look at only."""
+    """Return the certificate (PEM) that an endpoint presents, unverified: only to inspect it."""
     context = _context(credentials)
     context.verify_mode = ssl.CERT_NONE
     with contextlib.suppress(OSError, ValueError):
@@ -122,11 +122,11 @@ def _tls_words(error: ssl.SSLError) -> str:
     return f"TLS failed: {error.reason or error}"
 
 
-Validity = tuple[datetime.datetime, datetime.datetime]  # from when to when a certificate is good
+Validity = tuple[datetime.datetime, datetime.datetime]  # start and end of a certificate's validity
 
 
 def validity_of(certificate: bytes) -> Validity | None:
-    """Return when a certificate (PEM) is good; None where it cannot be read."""
+    """Return a certificate's (PEM) validity period; None if it cannot be read."""
     from cryptography import x509
 
     try:
@@ -137,7 +137,7 @@ def validity_of(certificate: bytes) -> Validity | None:
 
 
 def judged_here(validity: Validity, now: datetime.datetime) -> str:
-    """Return why we refuse a replica's certificate: ``now`` is this machine's clock."""
+    """Return why we reject a replica's certificate; ``now`` is this machine's clock."""
     begins, ends = validity
     if now < begins:
         return (
@@ -153,7 +153,7 @@ def judged_here(validity: Validity, now: datetime.datetime) -> str:
 
 
 def judged_there(validity: Validity, now: datetime.datetime) -> str:
-    """Return why a replica refuses our certificate for its time."""
+    """Return why a replica rejects our certificate for its dates."""
     begins, ends = validity
     valid = f"valid from {_utc(begins)} to {_utc(ends)}"
     clock = f"this machine's clock says {_utc(now)}"
@@ -171,16 +171,16 @@ def _utc(time: datetime.datetime) -> str:
 
 
 _EXPLAIN_EVERY_S = 5.0
-_NEARLY = 0.9  # of a time-out, as it is measured
+_NEARLY = 0.9  # an attempt that took this share of a time-out has timed out
 
 
 class Opening:
-    """The attempts to open one link's connection. Used by one thread."""
+    """Tracks the attempts to open one link's connection. Used by one thread."""
 
     def __init__(self, peer: Peer, settings: LinkSettings) -> None:
         self._peer = peer
         self._settings = settings
-        self._timed_out = 0  # tries in a row
+        self._timed_out = 0  # attempts in a row
         self._was_open = False
         self._explained_at = float("-inf")
 
@@ -196,7 +196,7 @@ class Opening:
         self._was_open = True
 
     def failed(self, took_s: float, now: float, credentials: CredentialPaths) -> str:
-        """Note that an attempt failed; return the reason, or nothing if it was looked up lately."""
+        """Note a failed attempt; return the reason, or "" if it was diagnosed recently."""
         self._timed_out = self._timed_out + 1 if took_s >= self.timeout_s * _NEARLY else 0
         interface = self._peer.interface
         if interface and interface not in {name for _, name in socket.if_nameindex()}:

@@ -1,6 +1,6 @@
-"""Watch what flows through one link's connection, and end it beneath Zenoh where nothing does.
+"""Watch the progress of one link's socket, and shut the socket down beneath Zenoh if it is stuck.
 
-Owns: a connection's socket. Not here: the judgement (`socket_progress`), when to look (`link`).
+Owns: a connection's socket. Not here: the decision (`socket_progress`), when to look (`link`).
 """
 
 import select
@@ -12,14 +12,14 @@ from fogft.link.socket_progress import BULK_BYTES, SocketProgress
 from fogft.link.zenoh import sockets
 from fogft.link.zenoh.sockets import Address, OwnSocket
 
-THIN_BYTES_PER_S = 2_000_000.0  # below, what is large is kept short in the kernel
-_END_WITHIN_S = 1.0  # so long a closed connection may still flow
+THIN_BYTES_PER_S = 2_000_000.0  # below this, the kernel's queue of unsent bytes is kept short
+_END_WITHIN_S = 1.0  # how long a connection that is being closed may still move data
 _LOOK_AGAIN_S = 0.002
-_QUIET_S = 0.05  # nothing came for so long: no large answer is on its way
+_QUIET_S = 0.05  # if nothing was received for this long, no large answer is in transit
 
 
 class FlowWatch:
-    """Watches one connection's socket. For one thread, but for `end_when_safe`."""
+    """Watches one connection's socket. For one thread, except `end_when_safe`."""
 
     def __init__(self, own: Address, peer: Address) -> None:
         self._socket = OwnSocket(own, peer)
@@ -28,12 +28,12 @@ class FlowWatch:
 
     @property
     def thin(self) -> bool:
-        """Whether it was seen to drain slowly."""
+        """Whether it was measured to be slow."""
         rate = self.progress.bytes_per_s
         return rate is not None and rate < THIN_BYTES_PER_S
 
     def look(self, now: float, sending_for_s: float = 0.0) -> float:
-        """Look once; return for how many of the last seconds large things moved."""
+        """Check the socket once; return for how many seconds since the last check data moved."""
         connection = self._socket.borrow()
         if connection is None:
             return 0.0
@@ -48,10 +48,10 @@ class FlowWatch:
         return moved_s
 
     def end_when_safe(self, sending: Callable[[], bool], asked: Callable[[], bool]) -> None:
-        """End the connection where something large may be on its way, either way; may block.
+        """End the connection if a large message may be in transit, in either direction; may block.
 
-        Zenoh's thread and a sender may wait for each other where an end meets a flow: see
-        `docs/design/links.md`. So what flows fast is let through, and what is stuck is ended.
+        If a connection ends while data flows, Zenoh's thread and a sender may deadlock: see
+        `docs/design/links.md`. So data that flows is let through, and a stuck send is cut off.
         """
         deadline = time.monotonic() + _END_WITHIN_S
         received, quiet_since = -1, 0.0
@@ -64,8 +64,8 @@ class FlowWatch:
                 if flow is None or not (sending() or asked()):
                     break
                 if sending():
-                    if not poll.is_ready(connection, event=select.POLLOUT):  # in the kernel
-                        sockets.end_sending(connection)  # at once: soon it may take more
+                    if not poll.is_ready(connection, event=select.POLLOUT):  # stuck in the kernel
+                        sockets.end_sending(connection)  # at once: it may accept more soon
                         return
                 elif flow.received != received:
                     received, quiet_since = flow.received, time.monotonic()

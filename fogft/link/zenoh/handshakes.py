@@ -1,8 +1,8 @@
 """Count the handshakes that Zenoh refuses, which it reports on standard output only.
 
-So in a process that serves a port, standard output is led into a file in memory, which is read now
-and then; a full pipe could block Zenoh. What the process itself prints, and its children, go where
-standard output went before.
+So in a process that serves a port, standard output is redirected to an in-memory file that is read
+periodically; a full pipe could block Zenoh. Output of the process itself and its children still
+goes to the original standard output.
 """
 
 import fcntl
@@ -58,7 +58,7 @@ class HandshakeLog:
             data += chunk
             self._read_to += len(chunk)
         if self._read_to > _LIMIT:
-            os.ftruncate(self._file, 0)  # it is appended to: the next line begins at 0
+            os.ftruncate(self._file, 0)  # opened with O_APPEND: the next line is at 0
             self._read_to = 0
         *lines, self._rest = data.split(b"\n")
         self._rest = self._rest[-4096:]

@@ -1,13 +1,13 @@
 """Zenoh's configuration for both ends of a link, with reasons.
 
 By default a message passes through three of Zenoh's thread pools, and each hop wakes another
-thread. Callbacks need Python's lock anyway, so all that reads, routes and calls back runs in *one*
+thread. Callbacks need Python's lock anyway, so reading, routing and callbacks all run in *one*
 thread: a round trip of 8 bytes over loopback took 168 us with one and 257 to 271 us by default
-(medians of 3000, on 2 cores). So a callback that blocked would stall every link of the process.
+(medians of 3000, on 2 cores). So a callback that blocks would stall every link of the process.
 
-Sending and closing have threads of their own. Whoever sends something large holds a lock of its
-link while he waits for room; when that link breaks, Zenoh's sending and closing wait for that lock,
-for up to `wait_before_close`: in the one thread, all other links would stand still as long.
+Sending and closing have their own threads. A thread that sends a large message holds a lock of its
+link while it waits for room; if that link breaks, Zenoh's sending and closing wait for that lock,
+for up to `wait_before_close`: on the one thread, that would stall all other links for as long.
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ _SIGN_OF_LIFE_EVERY_S = 2.0
 
 @dataclass(frozen=True)
 class LinkSettings:
-    """Times of a link, in seconds.
+    """Timeouts of a link, in seconds.
 
-    Zenoh's own two are long, because it cannot tell a thin uplink from a dead one; both ends see
-    to the connection themselves (`flow_watch`, `connection_reaper`).
+    Zenoh's own two are long, because it cannot tell a slow uplink from a dead one; both ends watch
+    the connection themselves (`flow_watch`, `connection_reaper`).
     """
 
-    lease_s: float = 150.0  # Zenoh ends a session whose peer sent nothing for so long
-    # Or where sending one message takes so long. Less than the lease, or healthy links stall.
+    lease_s: float = 150.0  # Zenoh ends a session whose peer sent nothing for this long
+    # Or if sending one message takes this long. Less than the lease, or healthy links stall.
     wait_before_close_s: float = 120.0
     open_timeout_s: float = 1.5
-    # For every third try in a row that takes so long: a full uplink or a busy machine needs more.
+    # For every third attempt in a row that times out: a full uplink or a busy machine needs more.
     long_open_timeout_s: float = 4.0
-    stall_after_s: float = 1.0  # or four round trips: a robot gives up where a queue stands still
-    stuck_after_s: float = 15.0  # a replica gives up later: a robot has long opened another link
+    stall_after_s: float = 1.0  # or four round trips: then a robot gives up on a stuck queue
+    stuck_after_s: float = 15.0  # when a replica does; the robot has long opened another link
 
 
 def robot_settings(
     peer: Peer, credentials: CredentialPaths, settings: LinkSettings
 ) -> dict[str, Any]:
-    """Return the settings of a robot's session towards one replica."""
+    """Return the settings of a robot's session to one replica."""
     keys = names.slot_key(peer.id.pool_uid, peer.id.slot, "**")
-    # Of an IPv6 address in brackets Zenoh makes a name for TLS that is none; without, it reads it.
+    # Zenoh makes an invalid TLS name of an IPv6 address in brackets; without them it parses it.
     endpoint = peer.endpoint.replace("[", "").replace("]", "")
     return {
         **_common(settings, "connect", credentials),
@@ -63,11 +63,11 @@ def robot_settings(
         "connect/endpoints": [
             f"tls/{endpoint}" + (f"#iface={peer.interface}" if peer.interface else "")
         ],
-        # One try: the link tries again, and knows when and why.
+        # One attempt: the link itself retries, and knows when and why.
         "connect/timeout_ms": 0,
         "connect/exit_on_failure": True,
         "listen/endpoints": [],
-        # To any other common name nothing at all goes out. Kept true by
+        # Nothing is sent to a peer with any other common name. Tested by
         # tests/link/zenoh/test_trust.py::test_nothing_is_sent_to_an_impostor_after_a_reconnect.
         "access_control": _access(
             keys, "egress", "ingress", {"cert_common_names": [peer.certificate_name]}
@@ -78,18 +78,18 @@ def robot_settings(
 def replica_settings(
     listen: str, id: ReplicaId, credentials: CredentialPaths, settings: LinkSettings
 ) -> dict[str, Any]:
-    """Return the settings of a replica's session, which listens at ``host:port``."""
+    """Return the settings of a replica's session, which listens on `listen` (``host:port``)."""
     keys = names.slot_key(id.pool_uid, id.slot, "**")
     return {
         **_common(settings, "listen", credentials),
-        # Not `router`: that would carry robots' messages to each other.
+        # Not `router`: that would forward messages between robots.
         "mode": "peer",
         "connect/endpoints": [],
         "listen/endpoints": [f"tls/{listen}"],
         "listen/exit_on_failure": True,
         "transport/unicast/max_sessions": SESSIONS_LIMIT,
         "transport/unicast/accept_pending": _HANDSHAKES_LIMIT,
-        # Whatever robots ask for: the threads that serve all of them may wait for none.
+        # Overrides what robots request: threads that serve all robots must not wait for one.
         "qos/network": [
             {
                 "id": key,
@@ -104,13 +104,13 @@ def replica_settings(
                 (names.slot_key(id.pool_uid, id.slot, names.ANSWERS), "data", "block"),
             )
         ],
-        # Any name: the handshake has proved that the CA made its holder a robot.
+        # Any name: the handshake has verified that the CA issued a robot's certificate.
         "access_control": _access(keys, "ingress", "egress", {}),
     }
 
 
 def to_zenoh(settings: dict[str, Any]) -> zenoh.Config:
-    """Convert settings for Zenoh; call it before the process's first session."""
+    """Convert settings to a Zenoh configuration; call it before the process's first session."""
     import zenoh
 
     ask_for_threads()
@@ -132,13 +132,13 @@ def _common(settings: LinkSettings, side: str, credentials: CredentialPaths) -> 
             f"{side}_certificate": str(credentials.certificate),
             f"{side}_private_key": str(credentials.key),
             "enable_mtls": True,
-            # Replicas have no names in the DNS: their common name is checked instead, by the
-            # connection after opening and by the access list whenever Zenoh reconnects by itself.
+            # Replicas have no DNS names. Instead, the connection checks their common name after
+            # opening, and the access list does whenever Zenoh reconnects by itself.
             "verify_name_on_connect": False,
             "close_link_on_expiration": True,
         },
         "transport/link/tx/lease": round(settings.lease_s * 1e3),
-        # So many in a lease: a peer that is out of reach leaves something unacknowledged.
+        # Keep-alives per lease: those to an unreachable peer show up as unacknowledged bytes.
         "transport/link/tx/keep_alive": max(4, round(settings.lease_s / _SIGN_OF_LIFE_EVERY_S)),
         "transport/link/tx/queue/congestion_control/block/wait_before_close": round(
             settings.wait_before_close_s * 1e6
@@ -157,7 +157,7 @@ def _common(settings: LinkSettings, side: str, credentials: CredentialPaths) -> 
 def _access(
     keys: str, requests: str, answers: str, subject: dict[str, list[str]]
 ) -> dict[str, Any]:
-    """Return an access control list: requests flow one way and answers the other, nothing else."""
+    """Return an access control list: only requests one way and answers the other way."""
     messages = {
         requests: ["query", "put"],
         answers: ["reply", "declare_queryable", "declare_subscriber"],
@@ -188,7 +188,7 @@ THREADS = (
 
 
 def ask_for_threads(environ: MutableMapping[str, str] = os.environ) -> None:
-    """Configure these threads, unless the user has configured others."""
+    """Set Zenoh's thread configuration, unless the user has set one."""
     environ.setdefault(VARIABLE, THREADS)
 
 

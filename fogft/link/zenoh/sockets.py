@@ -1,7 +1,7 @@
 """This process's TCP connections, inspected and closed behind Zenoh's back.
 
-Zenoh opens the sockets and tells nothing of them. The kernel does: it lists this process's
-descriptors and counts each connection's bytes. Where it does not (no Linux), nothing is found.
+Zenoh opens the sockets and does not expose them. But the kernel lists this process's descriptors
+and counts each connection's bytes. On systems other than Linux, nothing is found.
 """
 
 import contextlib
@@ -21,17 +21,17 @@ from fogft.link.socket_progress import Flow
 Address = tuple[str, int]
 
 _DESCRIPTORS = "/proc/self/fd"
-# Of struct tcp_info in linux/tcp.h: round trip and its variation (us), and bytes that were
+# From struct tcp_info in linux/tcp.h: round trip and its variation (us), and the bytes that were
 # acknowledged, received, and not sent yet.
 _INFO = struct.Struct("=68xII44xQQ8xI")
 _COUNT = struct.Struct("@i")
 _TCP_NOTSENT_LOWAT = 25
 _UNSENT_BYTES = 16 << 10
-_AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing waits for nothing, and resets
-_NOWHERE = bytes(16)  # struct sockaddr of AF_UNSPEC: to connect there resets a connection
+_AT_ONCE = struct.pack("@ii", 1, 0)  # struct linger: closing does not wait, and resets
+_NOWHERE = bytes(16)  # struct sockaddr of AF_UNSPEC: connecting to it resets a connection
 _libc = ctypes.CDLL(None)
 _LOOK_AGAIN_S = 0.01
-_others: set[int] = set()  # sockets that are no TCP connections, by their inodes
+_others: set[int] = set()  # inodes of sockets other than TCP connections
 _OTHERS_LIMIT = 1024
 
 
@@ -46,7 +46,7 @@ def _plain(host: str) -> str:
 
 
 def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
-    """Yield the connections at a local port: the peer, and a socket of ours to it."""
+    """Yield the connections at a local port: the peer's address, and a duplicate socket."""
     for connection in filter(None, map(_duplicate, _numbers())):
         ends = _ends(connection)
         if ends is None or ends[0][1] != port:
@@ -56,7 +56,7 @@ def connections(port: int) -> Iterator[tuple[Address, socket.socket]]:
 
 
 def listening(port: int) -> socket.socket | None:
-    """Return a socket that listens at a port; None if there is none."""
+    """Return a duplicate of the socket that listens on a port; None if there is none."""
     for connection in filter(None, map(_duplicate, _numbers())):
         with contextlib.suppress(OSError):
             listens = connection.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN)
@@ -67,14 +67,14 @@ def listening(port: int) -> socket.socket | None:
 
 
 def refuse(port: int) -> None:
-    """Listen at a port no longer: who comes is refused."""
+    """Stop listening on a port: new connections are refused."""
     if (listener := listening(port)) is not None:
         with listener:
             listener.shutdown(socket.SHUT_RDWR)
 
 
 class OwnSocket:
-    """One connection of this process. Looked up on each use and not kept open."""
+    """One connection of this process. Looked up on each use, not kept open."""
 
     def __init__(self, own: Address, peer: Address) -> None:
         self._own = own
@@ -82,7 +82,7 @@ class OwnSocket:
         self._number = -1
 
     def borrow(self) -> socket.socket | None:
-        """Return a duplicate of its socket, to be closed at once: it keeps the connection open."""
+        """Return a duplicate of its socket. Close it soon: it keeps the connection open."""
         for number in chain((self._number,), _numbers()):
             connection = _duplicate(number)
             if connection is None:
@@ -103,11 +103,11 @@ def _numbers() -> Iterator[int]:
     try:
         yield from map(int, os.listdir(_DESCRIPTORS))
     except OSError:
-        return  # no Linux: nothing can be seen to
+        return  # not Linux: nothing can be inspected
 
 
 def _duplicate(number: int) -> socket.socket | None:
-    """Return a socket of ours to a TCP connection, None where a descriptor is no such."""
+    """Return a duplicate of a TCP socket; None if the descriptor is something else."""
     try:
         status = os.fstat(number)
         if status.st_ino in _others or not stat.S_ISSOCK(status.st_mode):
@@ -155,7 +155,7 @@ def flow(connection: socket.socket) -> Flow | None:
 
 
 def keep_short(connection: socket.socket) -> None:
-    """Limit unsent bytes in the kernel, so that probes overtake large messages."""
+    """Limit the unsent bytes in the kernel, so that probes overtake large messages."""
     with contextlib.suppress(OSError):
         connection.setsockopt(socket.IPPROTO_TCP, _TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
 
@@ -163,9 +163,9 @@ def keep_short(connection: socket.socket) -> None:
 def end_sending(connection: socket.socket) -> None:
     """Shut down sending on a connection, whatever Zenoh is doing with it.
 
-    What its peer has not taken is dropped when the socket is closed: a thread of Zenoh's would wait
-    for that peer up to 10 s. Not both directions: where Zenoh hears of an end before it fails to
-    send, its thread and whoever waits for room to send wait for each other (docs/design/links.md).
+    Undelivered bytes are dropped when the socket is closed: else a Zenoh thread would wait for the
+    peer for up to 10 s. Receiving stays open: if Zenoh learned of the end before a send failed, its
+    thread and the thread that waits for room to send would deadlock (docs/design/links.md).
     """
     _drop_when_closed(connection)
     with contextlib.suppress(OSError):  # it ended by itself
@@ -173,7 +173,7 @@ def end_sending(connection: socket.socket) -> None:
 
 
 def abort(connection: socket.socket) -> None:
-    """Abort a connection at both ends; while data is being sent, see `end_sending`."""
+    """Reset a connection at both ends; while data is being sent, use `end_sending`."""
     _drop_when_closed(connection)
     _libc.connect(connection.fileno(), _NOWHERE, len(_NOWHERE))
 
@@ -184,7 +184,7 @@ def _drop_when_closed(connection: socket.socket) -> None:
 
 
 def abort_all(port: int, within_s: float) -> None:
-    """Abort the connections at a local port once they are idle or time is up."""
+    """Abort the connections at a local port once they are idle or the time is up."""
     deadline = time.monotonic() + within_s
     seen: list[Flow | None] = []
     while time.monotonic() < deadline:
@@ -210,7 +210,7 @@ def _received(flows: list[Flow | None]) -> list[int]:
 
 
 def end(connection: socket.socket) -> None:
-    """Close a connection at both ends at once. Under load, see `end_sending`."""
+    """Shut down both directions of a connection at once. Under load, see `end_sending`."""
     end_sending(connection)
     with contextlib.suppress(OSError):
         connection.shutdown(socket.SHUT_RD)

@@ -1,11 +1,11 @@
 """Zenoh's threads, and our threads inside Zenoh when the process exits.
 
-Zenoh's threads, which call our callbacks, must not send what might wait for room: only they can
-make room. Each keeps its Python thread state: else every callback makes one, and destroys it.
+Zenoh's threads, which call our callbacks, must not make a send that could wait for room: only they
+can make room. Each keeps its Python thread state, else every callback would create and destroy one.
 
 A daemon thread that returns from Zenoh while the interpreter shuts down aborts the process
-(SIGABRT: Rust does not allow to be unwound). So what closes a session is waited for at exit, though
-not for long: towards a frozen peer it takes ten seconds.
+(SIGABRT: Rust frames cannot be unwound). So the process waits at exit for threads that close a
+session, but not for long: with a frozen peer, closing takes ten seconds.
 """
 
 import atexit
@@ -24,7 +24,7 @@ idents: set[int] = set()  # Zenoh's threads, by `threading.get_ident`
 
 
 def note() -> None:
-    """Mark this thread as Zenoh's. Called by each callback of requests and answers."""
+    """Mark this thread as Zenoh's. Called by each callback for requests and answers."""
     ident = threading.get_ident()
     if ident not in idents:
         idents.add(ident)
@@ -33,19 +33,19 @@ def note() -> None:
 
 WAIT_S = 2.0
 _leaving: weakref.WeakSet[threading.Thread] = weakref.WeakSet()
-join_at_exit = _leaving.add  # have the process wait for a thread that is about to end
+join_at_exit = _leaving.add  # make the process wait for a thread that is about to end
 
 
 def close_session(session: Any) -> None:
     """Close a Zenoh session. May take 10 s, as Zenoh waits for a frozen peer."""
     try:
         session.close()
-    except zenoh.ZError as error:  # that peer has data in flight
+    except zenoh.ZError as error:  # the peer has data in flight
         log.debug("session_closed_late reason=%r", str(error))
 
 
 def close_aside(session: Any, name: str) -> threading.Thread:
-    """Close a Zenoh session on its own thread, which the process waits for at exit."""
+    """Close a Zenoh session on a new thread, which the process waits for at exit."""
     closer = threading.Thread(target=close_session, args=(session,), name=name, daemon=True)
     closer.start()
     join_at_exit(closer)

@@ -13,25 +13,25 @@ from fogft.counters import Counters
 
 log = logging.getLogger(__name__)
 
-LIMIT = 256  # jobs of one lane that wait; a robot has a few on the way
+LIMIT = 256  # jobs queued per lane; a robot has only a few in flight
 LANES_LIMIT = 256
 
 
 class WorkQueue:
-    """A thread that runs jobs: lanes take turns, each in its order. Only `join` blocks."""
+    """A thread that runs jobs: round-robin over lanes, in order within one. Only `join` blocks."""
 
     def __init__(self, name: str, counters: Counters) -> None:
         self._counters = counters
         self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self.add = self._queue.put  # take a job in any case; the collector of garbage may, too
+        self.add = self._queue.put  # queue a job unconditionally; the garbage collector may call it
         self._lock = threading.Lock()
         self._lanes: dict[bytes, deque[Callable[[], None]]] = {}  # none is empty
         self._closing = False
         self._thread = threading.Thread(target=self._work, name=name, daemon=True)
-        self.start = self._thread.start  # jobs queued earlier wait until then
+        self.start = self._thread.start  # jobs queued before it wait
 
     def offer(self, job: Callable[[], None], lane: bytes = b"", *, always: bool = False) -> bool:
-        """Queue a job; if its lane is full, or there are too many, count it and return False."""
+        """Queue a job; if its lane is full, or too many lanes exist, count it and return False."""
         with self._lock:
             waiting = self._lanes.get(lane)
             if waiting is not None and len(waiting) < LIMIT:
@@ -46,7 +46,7 @@ class WorkQueue:
         return False
 
     def _next(self, lane: bytes) -> None:
-        """Run a lane's oldest job; its next one waits for the other lanes' turns."""
+        """Run a lane's oldest job; its next one is queued behind those of other lanes."""
         with self._lock:
             waiting = self._lanes[lane]
             job = waiting.popleft()
@@ -68,12 +68,12 @@ class WorkQueue:
 
     def _work(self) -> None:
         while (job := self._queue.get()) is not None or self._lanes:
-            if job is None:  # after what waits
+            if job is None:  # end only after the jobs that wait
                 self._queue.put(None)
                 continue
             try:
                 job()
-            except zenoh.ZError as error:  # the session is closed, or who asked is gone
+            except zenoh.ZError as error:  # the session is closed, or the sender is gone
                 self._counters.add("failed")
                 log.debug("zenoh_refused reason=%r", str(error))
             except Exception:

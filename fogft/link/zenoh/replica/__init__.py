@@ -1,4 +1,4 @@
-"""The replica's end of a link: admit robots, take requests, send replies.
+"""The replica's end of a link: admit robots, receive requests, send replies.
 
 Not here: running requests (`fogft.proxy.replica`).
 """

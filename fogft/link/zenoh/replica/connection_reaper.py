@@ -1,11 +1,11 @@
 """Close connections at a replica's port that belong to no admitted robot or are stuck.
 
-Zenoh has room for 32 connections that do not say who they are, lets those stand for ever, and lets
-nobody else in meanwhile. So we look at this process's own sockets, now and then and whenever
-somebody comes: strangers are ended or kept out as `door` says, a link of a revoked holder is ended
-at once, as are those of one holder beyond `LINKS_LIMIT`, and one that delivers nothing of what it
-holds after a while. All are counted. Where strangers hold all descriptors that the process may
-have, all of them are ended. Who looks sees, too, which links are thin.
+Zenoh has room for 32 unauthenticated connections, keeps them for ever, and accepts nobody else
+meanwhile. So we check this process's own sockets, periodically and whenever somebody connects:
+strangers (unauthenticated connections) are closed or kept out as `door` decides. Links of a revoked
+holder, and those of one holder beyond `LINKS_LIMIT`, are closed at once; links that deliver none
+of their queued bytes are closed after a while. All are counted. If strangers hold all descriptors
+that the process may have, all of them are closed. Each check also finds out which links are slow.
 """
 
 import contextlib
@@ -29,19 +29,19 @@ from fogft.link.zenoh.sockets import Address
 log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.5
-_QUIET_EVERY_S = 1.0  # where nobody is a stranger
-_LOOK_AGAIN_S = 0.01  # while somebody comes, or is kept out
-RUSH_LIMIT = 2  # so many new ones since the last look
-# Of one holder, the newest: a robot has one an uplink, and another while it takes a new certificate
-# into use. Zenoh has room for 128 of all holders together.
+_QUIET_EVERY_S = 1.0  # while there are no strangers
+_LOOK_AGAIN_S = 0.01  # while somebody connects, or is kept out
+RUSH_LIMIT = 2  # new connections since the last look
+# Per holder; the newest are kept: a robot has one per uplink, and another while it switches to a
+# new certificate. Zenoh has room for 128 of all holders together.
 LINKS_LIMIT = 16
-# Descriptors held in reserve against floods. Without one, nothing tells whose the connections at
-# the port are, no preemption notice is read and no state is written.
+# Descriptors held in reserve against floods. With none left, the connections at the port cannot be
+# attributed, no preemption notice is read and no state is written.
 _RESERVE = 32
 
 
 def surplus(links: Mapping[Address, str]) -> list[Address]:
-    """Return those of links (to whom, oldest first) of which their holder has newer ones enough."""
+    """Return the links (peer -> holder, oldest first) beyond each holder's newest `LINKS_LIMIT`."""
     newer = Counter(links.values())
     found = []
     for peer, name in links.items():
@@ -53,11 +53,11 @@ def surplus(links: Mapping[Address, str]) -> list[Address]:
 
 @dataclass(eq=False)
 class ConnectionReaper:
-    """Watches one port until closed; has in `thin` the holders to whom a link is thin.
+    """Watches one port until closed; keeps in `thin` the holders with a slow link.
 
-    `links` are the peers' addresses of authenticated links, with their holders; those of who is
-    `revoked` are ended, as are those that have bytes to deliver and delivered none for
-    `stuck_after_s`. `also` is done at each look.
+    `links` returns the peers' addresses of authenticated links, with their holders. Links of
+    `revoked` holders are closed, as are those with queued bytes that delivered none for
+    `stuck_after_s`. `also` is called at each look.
     """
 
     port: int
@@ -101,7 +101,7 @@ class ConnectionReaper:
         self._release_reserve()
 
     def _fill_reserve(self) -> bool:
-        """Fill the reserve; return False if no further descriptor is left besides."""
+        """Fill the reserve; return False if no other descriptor is left."""
         try:
             while len(self._reserve) < _RESERVE:
                 self._reserve.append(_open())
@@ -115,13 +115,13 @@ class ConnectionReaper:
             os.close(self._reserve.pop())
 
     def _await_look(self) -> None:
-        """Wait until it is time to look: soon after somebody came, at once where many do."""
+        """Wait until it is time to look: soon after a connection came, at once in a rush."""
         began = time.monotonic()
         every_s = LOOK_EVERY_S if self._strange else _QUIET_EVERY_S
         until = began + (_LOOK_AGAIN_S if self._shut else every_s)
         while (left_s := until - time.monotonic()) > 0 and self._filter.wait(left_s):
             if sockets.count() >= self._descriptors + RUSH_LIMIT:
-                self._filter.drop(None)  # until it is known whose they are
+                self._filter.drop(None)  # until it is known whose the new ones are
                 return
             until = min(until, began + _LOOK_AGAIN_S)
             time.sleep(_LOOK_AGAIN_S / 50)
@@ -130,7 +130,7 @@ class ConnectionReaper:
         """Check once, and close the connections that must go."""
         short = not self._fill_reserve()
         if short:
-            self._filter.drop(None)  # first: what is given back is not for strangers
+            self._filter.drop(None)  # first: the released descriptors are not for strangers
             self._release_reserve()
             self.counters.warn(log, "descriptors_short", "descriptors_short port=%d", self.port)
         with contextlib.ExitStack() as stack:
@@ -138,7 +138,7 @@ class ConnectionReaper:
                 peer: stack.enter_context(connection)
                 for peer, connection in sockets.connections(self.port)
             }
-            links = self.links()  # after the sockets: who is in by now is no stranger
+            links = self.links()  # after the sockets: one admitted meanwhile is no stranger
             revoked = self.revoked()
             for peer, name in links.items():
                 if name in revoked and peer in found:
@@ -154,7 +154,7 @@ class ConnectionReaper:
             gone = self._door.look(strangers, links.keys(), now)
             for stranger in strangers if short else () if gone is None else (gone,):
                 self._end(found[stranger], stranger, "unauthenticated", "")
-            # Where nobody is left to be ended, it is not strangers who leave too few.
+            # If there are no strangers to close, something else uses up the descriptors.
             self._keep_out(None if short and strangers else self._door.kept_out)
         self._descriptors = sockets.count()
 
@@ -171,7 +171,7 @@ class ConnectionReaper:
     def _watch(
         self, links: Mapping[Address, str], found: Mapping[Address, socket.socket], now: float
     ) -> None:
-        """See how links drain: find the thin ones, and end those that stand still."""
+        """Measure the progress of links: find the slow ones, and close the stuck ones."""
         thin = set()
         progress = {
             peer: self._progress.get(peer) or SocketProgress() for peer in links if peer in found

@@ -1,7 +1,7 @@
 """Answer a robot's queries other than requests: greetings, probes, records, answer streams.
 
-Zenoh's threads only decode them and hand them over; the worker thread answers them, and their ends
-queue behind the replies of their robot. Requests and replies: `listener`, `reply_queue`.
+Zenoh's threads only decode queries and hand them over; the worker thread answers them. Ending a
+query is queued behind its robot's replies. Requests and replies: `listener`, `reply_queue`.
 """
 
 import logging
@@ -30,12 +30,12 @@ from fogft.records.record_set import RecordSet, Verdict
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-_STRANGERS = b""  # in place of a token: replies to whose connection is not known
+_STRANGERS = b""  # in place of a token: the reply queue of unknown connections
 
 
 @dataclass(eq=False)
 class ControlQueries:
-    """Answers the queries of robots; `records` is what the pool has signed, as known here."""
+    """Answers the queries of robots; `records` holds the pool's signed records known here."""
 
     _: KW_ONLY
     sessions: AuthenticatedSessions
@@ -46,7 +46,7 @@ class ControlQueries:
     counters: Counters
 
     def open_answers(self, asked: QueryEnd) -> None:
-        """Handle an admitted connection's query for its stream of answers."""
+        """Handle the query of an admitted connection that opens its stream of answers."""
         try:
             token = _greeting(asked.query).token
         except FrameError as error:
@@ -92,9 +92,9 @@ class ControlQueries:
         self.later(greeting, job, asked)
 
     def later(self, greeting: frame.Greeting, job: Callable[[], None], asked: QueryEnd) -> None:
-        """Run a job on the other thread; if its sender's queue is full, just end the query."""
+        """Run a job on the worker thread; if its sender's lane is full, just end the query."""
         known = self.sessions.of(greeting.token)
-        # A certificate may say that it is anybody.
+        # An unverified certificate may claim any name.
         lane = known.common_name.encode() if known else b"\0" + greeting.certificate
         if not self.work.offer(job, lane, always=known is not None):
             self._end_of_stranger(asked, "")
@@ -122,11 +122,11 @@ class ControlQueries:
         try:
             asked.query.reply(asked.query.key_expr, answer(), express=True)
         finally:
-            # In its robot's own thread: unlike the answer, the end queues behind replies.
+            # On its robot's own thread: unlike the answer, the end is queued behind replies.
             self.queues.end(greeting.token, "probe", asked)
 
     def take(self, offered: Sequence[SignedRecord]) -> list[SignedRecord]:
-        """Apply valid records; return what stands in place of those that are out of date."""
+        """Apply valid records; return our newer ones for those that are out of date."""
         newer: list[SignedRecord] = []
         for one in offered:
             verdict = self.records.offer(one)

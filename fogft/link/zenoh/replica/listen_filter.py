@@ -1,9 +1,8 @@
 """Drop new connections to a port in the kernel, from some hosts or from all.
 
-A filter on the listening socket (`SO_ATTACH_FILTER`, for which no privilege is needed) drops the
-first packet of a connection; who meant it well sends that again after a second, or tries anew.
-Links that are open are other sockets, and do not notice. Whose connections are dropped is decided
-in `door`.
+A filter on the listening socket (`SO_ATTACH_FILTER`, which needs no privilege) drops the first
+packet of a connection; a well-behaved peer resends it after a second, or reconnects. Open links
+have their own sockets and are not affected. `door` decides whose connections are dropped.
 """
 
 import contextlib
@@ -17,11 +16,11 @@ from collections.abc import Iterable
 from fogft import poll
 from fogft.link.zenoh import sockets
 
-HOSTS_LIMIT = 32  # where more are to be kept out, all are
-WAITING_LIMIT = 4  # connections that wait for Zenoh: it takes them at once, but for its rests
+HOSTS_LIMIT = 32  # if more are to be kept out, all hosts are
+WAITING_LIMIT = 4  # the listen backlog: Zenoh accepts at once, except during its pauses
 
 _ATTACH, _DETACH = 26, 27  # SO_ATTACH_FILTER and SO_DETACH_FILTER of asm-generic/socket.h
-# Classic BPF (linux/filter.h): the code, where to jump if true and if not, and a constant.
+# Classic BPF (linux/filter.h): the code, the jump offsets if true and if false, and a constant.
 _INSTRUCTION = struct.Struct("@HBBI")
 _LOAD_WORD, _LOAD_BYTE, _SHIFT_RIGHT, _JUMP_IF_EQUAL, _RETURN = 0x20, 0x30, 0x74, 0x15, 0x06
 _IP_HEADER = -0x100000 & 0xFFFFFFFF  # SKF_NET_OFF
@@ -52,14 +51,14 @@ class ListenFilter:
         if self._listening is None:
             return
         self._listening.setblocking(False)  # as it is for Zenoh
-        with contextlib.suppress(OSError):  # none waits any more
+        with contextlib.suppress(OSError):  # none is waiting any more
             while True:
                 connection, _ = self._listening.accept()
                 sockets.abort(connection)
                 connection.close()
 
     def drop(self, hosts: frozenset[str] | None) -> None:
-        """Drop new connections from exactly these hosts from now on; None for all hosts."""
+        """From now on, drop new connections from exactly these hosts; None for all hosts."""
         if hosts == self._dropped or self._listening is None:
             return
         hosts = None if hosts is not None and len(hosts) > HOSTS_LIMIT else hosts
@@ -74,7 +73,7 @@ class ListenFilter:
             self._dropped = hosts
 
     def close(self) -> None:
-        """Release the port: close our descriptors of it."""
+        """Release the port: close our duplicate of its socket."""
         if self._listening is not None:
             self._listening.close()
 
@@ -82,7 +81,7 @@ class ListenFilter:
 def instructions(hosts: Iterable[str] | None) -> list[Instruction]:
     """Return the BPF filter that drops packets from these hosts; None for all. Pure.
 
-    Of an IPv6 address the network counts, its first 64 bits: who has one address has them all.
+    An IPv6 address stands for its network, the first 64 bits: whoever has one address has all.
     """
     if hosts is None:
         return [(_RETURN, 0, 0, _DROP)]
@@ -104,7 +103,7 @@ def instructions(hosts: Iterable[str] | None) -> list[Instruction]:
             ]
     return [
         (_LOAD_BYTE, 0, 0, _IP_HEADER),
-        (_SHIFT_RIGHT, 0, 0, 4),  # the version
+        (_SHIFT_RIGHT, 0, 0, 4),  # the IP version
         (_JUMP_IF_EQUAL, len(v4) + 1, 0, 6),
         *v4,
         passed,

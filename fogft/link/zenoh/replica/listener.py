@@ -1,9 +1,9 @@
-"""A replica's end over Zenoh: receives requests and probes, and queues answers by robot.
+"""A replica's end of links over Zenoh: receives requests and probes, queues replies per connection.
 
-A connection's answers are the replies to one query of its own, which it asks once we have let it
-in, and which stays open. Zenoh's threads only decode and hand over. Replies leave through one
-thread for each connection, because replying to a frozen robot can block; probes are answered by one
-more thread, ahead of all replies.
+A connection's answers are the replies to one query, which it makes once it has been admitted and
+which stays open. Zenoh's threads only decode and hand over. Each connection has its own thread for
+replies, because replying to a frozen robot can block; another thread answers probes, ahead of all
+replies.
 """
 
 import logging
@@ -45,11 +45,11 @@ _CLOSE_WAIT_S = 1.0
 
 
 class ZenohListener:
-    """A replica's end: receives requests and probes of robots that its CA admits.
+    """A replica's end of all links: receives requests and probes of robots that its CA admits.
 
-    `listen` is ``host:port``, port 0 for any that is free. Raises WireError: it is not that.
-    `handshakes` tells those refused; None where they need not be counted. `certificate_name` is
-    the common name of its certificate, where that is not the replica's.
+    `listen` is ``host:port``, port 0 for any free one. Raises WireError: malformed or unavailable.
+    `handshakes` reports refused ones; None to not count them. `certificate_name` is the common
+    name of its certificate, if that is not the replica's.
     """
 
     def __init__(
@@ -77,17 +77,17 @@ class ZenohListener:
         self._counters = Counters()
         self.counters = self._counters.snapshot  # since the start, by event
         self._turn = 0  # counted first by Zenoh's thread
-        self.revoke = self._sessions.revoke  # let these holders in no more
+        self.revoke = self._sessions.revoke  # stop admitting these holders
         self._work_queue = WorkQueue("fogft-probes", self._counters)
         self._queues = ReplyQueues(self._counters, later=self._work_queue.add)
-        self.refusals = self._queues.refusals.snapshot  # of requests and messages, by their values
+        self.refusals = self._queues.refusals.snapshot  # by `Refusal` value
         self._unpacker = Unpacker()
         self._session: zenoh.Session | None = None
         self._declared: list[object] = []
-        self._thin: set[str] = set()  # the holders to whom a link is thin
+        self._thin: set[str] = set()  # the holders with a slow link
         self.streams = Streams(slow=self._thin.__contains__)
         self._records = RecordSet(id.pool_uid, Verifier(credentials.ca, lazy=True))
-        # The newest one of the manager that robots have passed on; None before the first.
+        # The manager's newest lease that robots have passed on; None before the first.
         self.lease = partial(self._records.get, RecordKind.LEASE)
         self._control = ControlQueries(
             sessions=self._sessions,
@@ -97,7 +97,7 @@ class ZenohListener:
             work=self._work_queue,
             counters=self._counters,
         )
-        # What the pool has signed: taken before `serve`, none of the revoked is ever let in.
+        # Takes the pool's signed records: given before `serve`, no revoked holder is ever admitted.
         self.take_records = self._control.take
         self._services: dict[str, str] = {}  # key -> service
         self._on_request: Callable[[Incoming], None]
@@ -111,9 +111,9 @@ class ZenohListener:
     ) -> None:
         """Start listening. Callbacks come from Zenoh's threads and must not block.
 
-        `on_cancel` takes the ids of requests whose answers are no longer wanted. It may block for a
-        moment, which holds up nothing but probes. Raises WireError: the port is taken, or the
-        credentials cannot be used.
+        `on_cancel` takes the ids of requests whose answers are no longer wanted. It may block
+        briefly, which delays only probes. Raises WireError: the port is taken, or the credentials
+        cannot be used.
         """
         try:
             session = self._session = zenoh.open(to_zenoh(self._config))
@@ -139,11 +139,11 @@ class ZenohListener:
         self._hear(session, key(names.CANCEL), partial(self._cancel, on_cancel))
         self._declare(session, key(names.ANSWERS), self._control.open_answers)
         self._declare(session, key(names.RECORDS), self._control.exchange)
-        # Last: who is told that this replica is ready finds every service.
+        # Last: a robot that learns that this replica is ready must find every service.
         self._declare(session, key(names.PROBE), partial(self._control.probe, on_probe))
 
     def add(self, services: Mapping[str, str]) -> None:
-        """Serve further services too (name -> key); only after `serve`."""
+        """Serve additional services (name -> key); only after `serve`."""
         self._services.update((key, name) for name, key in services.items())
 
     def _peers(self) -> dict[Address, str]:
@@ -171,7 +171,7 @@ class ZenohListener:
         self._declared.append(session.declare_subscriber(key, callback))
 
     def _callback(self, what: str, heard: Callable[[Any], None]) -> Any:
-        """Return what Zenoh's thread calls: nothing is raised there, where nobody would tell."""
+        """Return a callback for Zenoh's thread that never raises: nobody would report it there."""
 
         def guarded(one: Any) -> None:
             self._turn += 1
@@ -215,7 +215,7 @@ class ZenohListener:
         if service is None:
             self._refuse(stream, Refusal.NOT_READY, *requests)
             return
-        # A robot asks in its own name, whatever it says; a gateway in that of any.
+        # A robot sends in its own name, whatever the header says; a gateway in any robot's name.
         if holder.role is Role.ROBOT and holder.name != requests[0][0].robot:
             requests = [(one._replace(robot=holder.name), content) for one, content in requests]
         for header, payload in requests:
@@ -237,7 +237,7 @@ class ZenohListener:
         incoming = ZenohIncoming(service, header, request, stream, self._queues)
         try:
             self._on_request(incoming)
-        except Exception:  # the others that came with it go on
+        except Exception:  # continue with the others in its batch
             self._counters.add("failed")
             log.exception("request_not_taken service=%s", service)
             incoming.refuse(Refusal.LOST)
@@ -260,7 +260,7 @@ class ZenohListener:
     # -- the owner ------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Send what is queued, then stop. Repeatable; takes a second at most."""
+        """Send queued replies, then stop. Repeatable; takes a second at most."""
         session, self._session = self._session, None
         if session is None:
             return
@@ -270,11 +270,11 @@ class ZenohListener:
             self._reaper.close()
         self._queues.close(_CLOSE_WAIT_S / 2)
         self._count_handshakes()
-        sockets.refuse(self._port)  # else those aborted are back before the session is closed
+        sockets.refuse(self._port)  # else aborted peers reconnect before the session is closed
         sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
         self._work_queue.close()
         threads.close_aside(session, "fogft-close-listener").join(_CLOSE_WAIT_S / 2)
-        if self._handshakes:  # Zenoh took our refusal for some
+        if self._handshakes:  # discard those that Zenoh reports because of our shutdown
             self._handshakes.refusals()
 
 
@@ -284,6 +284,6 @@ def _with_port(listen: str) -> str:
         raise WireError(f"`{listen}` is not `host:port`", "for instance `0.0.0.0:7448`")
     if int(port) != 0:
         return listen
-    # Zenoh does not tell which port it was given, so we ask the kernel for a free one first.
+    # Zenoh does not report the port that it was given, so we ask the kernel for a free one first.
     with listening(listen) as probe:
         return f"{host}:{probe.getsockname()[1]}"

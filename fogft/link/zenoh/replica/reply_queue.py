@@ -1,10 +1,10 @@
 """Requests received over Zenoh until they are answered, and the queues of their replies.
 
-A request is answered once, or refused where it is forgotten. A reply to a frozen robot blocks until
-Zenoh gives that robot's session up, so each connection has its own queue and thread. What cannot
-block (`reply_streams`) leaves at once, from the thread that brings it, unless that is Zenoh's.
-Queries that are to be ended take the same way. What sends raises `zenoh.ZError` where the session
-is closed.
+A request is answered once, or refused if its owner forgets it. A reply to a frozen robot blocks
+until Zenoh gives up that robot's session, so each connection has its own queue and thread. Replies
+that cannot block (`reply_streams`) are sent at once by the calling thread, unless it is Zenoh's.
+Queries to end go through the same queues. Methods that send raise `zenoh.ZError` if the session is
+closed.
 """
 
 import logging
@@ -33,14 +33,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(slots=True, eq=False)
 class Reply:
-    """One answer: a refusal if that is not empty, else a payload."""
+    """One reply: a refusal if `refusal` is not empty, else a payload."""
 
     stream: Stream
     request_id: bytes
     payload: bytes
     refusal: str
-    load: bytes = frame.NO_LOAD  # what the replica has to do
-    may_pack: bool = False  # it may be compressed: its robot's link was seen to be thin
+    load: bytes = frame.NO_LOAD  # the replica's load
+    may_pack: bool = False  # it may be compressed: its robot's link was measured to be slow
 
     @property
     def joins(self) -> bool:
@@ -76,23 +76,23 @@ def send_together(replies: Sequence[Reply], stamp: bytes) -> None:
 
 REPLIES_LIMIT = 1024
 _HEAD_BYTES = 4096
-_REFUSALS_LIMIT = 4 * REPLIES_LIMIT  # with those that stand for dropped replies
+_REFUSALS_LIMIT = 4 * REPLIES_LIMIT  # including those that replace dropped replies
 BYTES_LIMIT = 64 << 20
-_END_LOOK_S = 1.0  # nobody waits for an end
+_END_LOOK_S = 1.0  # nobody waits for a query to end
 
 
 class ReplyQueue:
-    """The replies for one connection of a robot."""
+    """The queued replies for one connection of a robot."""
 
     def __init__(self) -> None:
         self.replies: SimpleQueue[Reply | QueryEnd | None] = SimpleQueue()
         self.waiting = 0
         self.large = ByteLimit(BYTES_LIMIT)  # of the waiting ones
-        self.thread: threading.Thread  # which begins before the queue is used
-        self._taken: list[Reply | QueryEnd | None] = []  # it did not fit to what was taken before
+        self.thread: threading.Thread  # started before the queue is used
+        self._taken: list[Reply | QueryEnd | None] = []  # one that did not fit into the last batch
 
     def next(self, timeout_s: float) -> list[Reply] | QueryEnd:
-        """Wait for replies to send together, or a query to end; none once closed. Raises Empty."""
+        """Wait for replies to send together, or a query to end; [] once closed. Raises Empty."""
         first = self._taken.pop() if self._taken else self.replies.get(timeout=timeout_s)
         if first is None:
             return []
@@ -119,10 +119,10 @@ class ReplyQueue:
 class ReplyQueues:
     """All reply queues of a listener.
 
-    `later` has something done by a thread that may block; the collector of garbage calls it.
+    `later` runs a job on a thread that may block; the garbage collector calls it.
     """
 
-    idle_s = 5.0  # a thread that had nothing to send for so long ends
+    idle_s = 5.0  # a thread with nothing to send for this long ends
 
     counters: Counters
     _: KW_ONLY
@@ -140,8 +140,8 @@ class ReplyQueues:
     def put(self, token: bytes, robot: str, reply: Reply, *, more: bool) -> None:
         """Send or queue a reply. Never blocks; if the queue is full, the reply is dropped.
 
-        Replies of one connection's `token` never wait for another's. With `more`, others will soon
-        follow, to leave in one message with it.
+        Replies for one connection (`token`) never wait for another's. With `more`, other replies
+        follow soon, so that they can share one message.
         """
         size, counted = len(reply.payload), "refused" if reply.refusal else "replies"
         small = size <= SMALL_BYTES and not reply.may_pack
@@ -185,7 +185,7 @@ class ReplyQueues:
         if queue is not None:
             return queue
         queue = ReplyQueue()
-        # Where that fails, the next reply tries it again.
+        # If that fails, the next reply tries again.
         queue.thread = on_thread(self._run, token, queue, name=f"fogft-reply-{robot}")
         self._queues[token] = queue
         return queue
@@ -271,7 +271,7 @@ class ZenohIncoming:
         self._queues = queues
 
     def reply(self, payload: bytes, *, load: Load | None = None, more: bool = False) -> None:
-        """Send the serialised response. Never blocks. With `more`, others will soon follow."""
+        """Send the serialised response. Never blocks. With `more`, other replies follow soon."""
         self._send(payload, "", load, more=more)
 
     def refuse(self, reason: Refusal, detail: str = "", *, load: Load | None = None) -> None:
@@ -294,7 +294,7 @@ class ZenohIncoming:
         self._queues.put(header.token, header.robot, reply, more=more or slow)
 
     def __del__(self) -> None:
-        """Refuse what its owner forgot, by a `SimpleQueue`: a lock of ours may be held now."""
+        """Refuse a forgotten request, via a `SimpleQueue`: one of our locks may be held now."""
         if self._streams:
             forgotten = Reply(self._streams.pop(), self._header.request_id, b"", Refusal.LOST)
             header = self._header

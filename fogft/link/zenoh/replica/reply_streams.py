@@ -1,15 +1,15 @@
 """The query that carries each connection's replies, and its unacknowledged bytes.
 
-Replying blocks only where the robot takes nothing and all buffers on the way are full. So who must
-not block may reply himself while no more is on the way than those surely hold. What has arrived is
-known by stamps: each reply carries a random one, and the robot's requests say the last that it has
-seen, so no robot can make others wait by saying what is not so.
+Replying blocks only if the robot reads nothing and all buffers on the path are full. So a thread
+that must not block may still reply while the bytes in flight surely fit into those buffers.
+Stamps acknowledge replies: each reply carries a random one, and the robot's requests repeat the
+last that it has seen, so no robot can make others wait by a false acknowledgement.
 
-All connections of a robot count together: they may share one socket. What was sent over another one
-counts for a minute after it was sent, since that one may be gone.
+All connections of a robot share one credit, as they may share one socket. Replies on another
+connection count for a minute after they were sent, since that connection may be gone.
 
-Whoever asks again under one token, or whose connection is the oldest of too many, has its former
-query ended, and opens another connection.
+If a token is used for a second query, or its connection is the oldest of too many, its former
+query is ended, and the robot opens another connection.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from fogft.link.frame import STAMP_BYTES
 if TYPE_CHECKING:
     import zenoh
 
-CREDIT_LIMIT = 4  # replies of 16 KiB: 64 KiB, for the same reason
+CREDIT_LIMIT = 4  # replies of 16 KiB: 64 KiB, which those buffers hold
 _OTHERS_COUNT_FOR_S = 60.0
 
 Send = Callable[[bytes], None]  # takes the stamp
@@ -37,8 +37,8 @@ Send = Callable[[bytes], None]  # takes the stamp
 
 class _Sent(NamedTuple):
     connection: object
-    at: float  # when that ended
-    may_block: bool  # it was sent by somebody who may
+    at: float  # when sending ended
+    may_block: bool  # it was sent by a thread that may block
 
 
 class ReplyCredit:
@@ -46,14 +46,14 @@ class ReplyCredit:
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._gate = threading.Lock()  # held by who sends at once, which does not take long
+        self._gate = threading.Lock()  # held while sending at once, which is short
         self._lock = threading.Lock()
-        self._blockable = 0  # senders under way who may block
+        self._blockable = 0  # sends in progress that may block
         self._outstanding: dict[bytes, _Sent] = {}  # by stamp, oldest first
 
     def seen(self, connection: object, stamp: bytes) -> None:
         """Note the last acknowledged stamp on a connection; unknown ones are ignored."""
-        if stamp not in self._outstanding:  # nothing new, as mostly
+        if stamp not in self._outstanding:  # nothing new, the usual case
             return
         with self._lock:
             last = self._outstanding.get(stamp)
@@ -74,7 +74,7 @@ class ReplyCredit:
             with self._lock:
                 if self._blockable or (self._outstanding and self._full(connection)):
                     return False
-                # `_Sent(...)` would be one more call of Python.
+                # `_Sent(...)` would cost one more Python call.
                 self._outstanding[stamp] = tuple.__new__(_Sent, (connection, self._clock(), False))
             send(stamp)
             return True
@@ -82,27 +82,27 @@ class ReplyCredit:
             self._gate.release()
 
     def _full(self, connection: object) -> bool:
-        """Whether all that buffers surely hold may be on the way. Under the lock."""
+        """Whether the bytes in flight may fill the buffers. Under the lock."""
         self._forget_old(connection)
         full = len(self._outstanding) >= CREDIT_LIMIT
         return full or any(sent.may_block for sent in self._outstanding.values())
 
     def _forget_old(self, connection: object) -> None:
-        """Forget what was sent on other connections long ago. Under the lock."""
+        """Forget replies sent on other connections long ago. Under the lock."""
         since = self._clock() - _OTHERS_COUNT_FOR_S
         for stamp, sent in list(self._outstanding.items()):
             if sent.connection is not connection and sent.at < since:
                 del self._outstanding[stamp]
 
     def send(self, connection: object, send: Send) -> None:
-        """Call `send`, which may block. Until it is acknowledged, nothing is sent at once."""
+        """Call `send`, which may block. `send_at_once` declines until it is acknowledged."""
         stamp = os.urandom(STAMP_BYTES)
         with self._gate, self._lock:
             self._blockable += 1
-            outstanding = self._outstanding.items()  # who sees this has seen those before it
+            outstanding = self._outstanding.items()  # acknowledging this one covers those before it
             self._outstanding = {s: o for s, o in outstanding if o.connection is not connection}
             self._forget_old(connection)
-            self._outstanding[stamp] = _Sent(connection, math.inf, may_block=True)  # it goes on
+            self._outstanding[stamp] = _Sent(connection, math.inf, may_block=True)  # in progress
         try:
             send(stamp)
         finally:
@@ -112,7 +112,7 @@ class ReplyCredit:
                     self._outstanding[stamp] = _Sent(connection, self._clock(), may_block=True)
 
 
-OF_ONE_LIMIT = 32  # of one holder: nobody's connections push out another's
+OF_ONE_LIMIT = 32  # streams per holder, so that no holder can evict another's
 
 
 class Stream:
@@ -123,23 +123,23 @@ class Stream:
     ) -> None:
         self.query = query
         self.holder = holder
-        self.slow = partial(slow, holder)  # whether it is known to read slowly
-        name = object()  # of this connection: it must not keep the query, which ends with us
+        self.slow = partial(slow, holder)  # whether its link is known to be slow
+        name = object()  # identifies this connection without keeping the query, which ends with us
         self.seen = partial(credit.seen, name)
         self.send = partial(credit.send, name)
         self.send_at_once = partial(credit.send_at_once, name)
 
 
 class Streams:
-    """The open queries for answers, by token. Known to read slowly is a holder who is `slow`."""
+    """The open queries for answers, by token. `slow` tells whether a holder has a slow link."""
 
-    limit = 1024  # a replica has 128 sessions; the others are those of connections that are gone
+    limit = 1024  # a replica has 128 sessions; the rest belong to connections that are gone
 
     def __init__(self, slow: Callable[[str], bool] = lambda _: False) -> None:
         self._slow = slow
         self._lock = threading.Lock()
         self._streams: OrderedDict[bytes, Stream] = OrderedDict()
-        self.of = self._streams.get  # by token, if it has asked one; for each request
+        self.of = self._streams.get  # by token; None if it has opened none. Called per request
         self._credit: WeakValueDictionary[str, ReplyCredit] = WeakValueDictionary()
 
     def opened(

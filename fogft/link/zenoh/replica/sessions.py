@@ -1,9 +1,9 @@
 """Which certificate holder a connection belongs to, and whether it is still admitted.
 
-TLS has let the connection in; but Zenoh does not tell a listener whose query it hands over.
+TLS has authenticated the connection, but Zenoh does not tell a listener whose query it delivers.
 So each connection greets: it sends its certificate, and a signature over its own random
-token and this replica's name. From then on the token, which only the two ends know, stands
-for the holder. Not here: signatures (`signing`), TLS (`settings`).
+token and this replica's name. From then on the token, which only the two ends know, identifies
+the holder. Not here: signatures (`signing`), TLS (`settings`).
 """
 
 import threading
@@ -19,8 +19,8 @@ from fogft.model.refusal import Refusal
 from fogft.records.record import RecordError, Verify
 
 HOLDERS_LIMIT = 256
-TOKENS_LIMIT = 64  # of one holder: nobody's connections push out another's
-TOKENS_WITHIN_S = 10.0  # who makes so many within this greets too often: each costs a thread
+TOKENS_LIMIT = 64  # connections per holder, so that no holder can evict another's
+TOKENS_WITHIN_S = 10.0  # more than that many within this are refused: each costs a thread
 _MAY_ASK = frozenset({Role.ROBOT, Role.GATEWAY})
 
 
@@ -34,7 +34,7 @@ class NotAdmittedError(Exception):
 
 @dataclass(eq=False)
 class AuthenticatedSessions:
-    """The connections that were authenticated, to the replica of this common name. Any thread."""
+    """The authenticated connections to the replica with this common name. Any thread."""
 
     pool_uid: str
     replica: str
@@ -44,13 +44,13 @@ class AuthenticatedSessions:
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
         self._tokens: dict[bytes, Holder] = {}
-        self.of = self._tokens.get  # whose connection has a token, if that is let in
-        # When each token was let in, oldest first, by holder.
+        self.of = self._tokens.get  # the holder of a token; None if it is not admitted
+        # When each token was admitted, oldest first, by holder.
         self._holders: OrderedDict[str, OrderedDict[bytes, float]] = OrderedDict()
-        self.revoked: frozenset[str] = frozenset()  # common names that are let in no more
+        self.revoked: frozenset[str] = frozenset()  # common names that are no longer admitted
 
     def greet(self, greeting: Greeting) -> None:
-        """Admit a connection. Raises NotAdmittedError: its holder may not ask here."""
+        """Admit a connection. Raises NotAdmittedError: its holder may not send requests here."""
         if not greeting.certificate:
             if greeting.token not in self._tokens:
                 raise NotAdmittedError("a connection that did not greet")
@@ -94,7 +94,7 @@ class AuthenticatedSessions:
             del self._tokens[token]
 
     def revoke(self, names: Collection[str]) -> None:
-        """Admit these holders no more. Earlier revocations stay in force."""
+        """Stop admitting these holders. Earlier revocations stay in force."""
         with self._lock:
             self.revoked |= frozenset(names)
             for name in self.revoked & self._holders.keys():

@@ -1,4 +1,4 @@
-"""The robot's end of a link: dial, probe, send attempts, take answers.
+"""The robot's end of a link: dial, probe, send attempts, receive answers.
 
-Not here: which replica is asked (`fogft.requests`).
+Not here: choosing which replica to ask (`fogft.requests`).
 """

@@ -1,8 +1,8 @@
 """The attempts open on one connection: accepted, sent and ended exactly once.
 
-A request is sent by whoever offers it where that cannot block (`credit`), else by a thread of its
-connection's own, so a peer that takes nothing costs nobody else. Not here: the session
-(`connection`), what becomes of requests (`fogft.proxy.robot.dispatcher`).
+The offering thread sends a request itself if that cannot block (`credit`), else the connection's
+own sender thread does, so a peer that reads nothing affects no other link. Not here: the session
+(`connection`), the outcome of requests (`fogft.proxy.robot.dispatcher`).
 """
 
 import time
@@ -31,19 +31,19 @@ from fogft.model.refusal import Refusal
 from fogft.process import on_thread
 from fogft.requests.load import Handling
 
-# Attempts that wait for the sender, forgotten ones included: those have freed their room in the
-# window, so without a bound of its own the queue of a sender that is stuck would grow.
+# Attempts that wait for the sender, forgotten ones included: those have left the window, so
+# without its own bound the queue of a stuck sender would grow.
 _QUEUE_LIMIT = 2 * ATTEMPTS_LIMIT
-# A `put` that took this long was stuck behind a full queue: see whether the session survived.
+# A `put` that took this long was stuck behind a full queue: check whether the session survived.
 _STUCK_S = 0.1
-# What Zenoh itself may hold of a large request once its sending has returned: two batches.
+# Bytes of a large request that Zenoh itself may still hold after `put` has returned: two batches.
 _ZENOH_HOLDS_BYTES = 2 * 65535
-# How long the link's thread looks often after the last large request began to leave.
+# How long the link's thread checks often after it began to send the last large request.
 _WATCH_S = 5.0
-# Whoever takes a larger answer looks at all of it for long: not in the thread of all links.
+# Processing a larger answer takes long, so it is kept off the thread that serves all links.
 _ASIDE_BYTES = 1 << 20
 
-# In the queue, in place of an attempt: tell the replica of what was forgotten.
+# In the queue, in place of an attempt: send the pending cancellations.
 _TELL = OpenAttempt("", b"", None, 0, 0.0, 0.0)
 
 
@@ -62,7 +62,7 @@ class Outlet(Protocol):
         """Whether the Zenoh session still has a link."""
 
     def lose(self, because: str) -> None:
-        """Note that the connection is lost. Any thread, perhaps more than once."""
+        """Note that the connection is lost. Any thread; may be called repeatedly."""
 
 
 @dataclass(frozen=True)
@@ -72,15 +72,15 @@ class Callbacks:
     answered: Callable[[Answer], None]
     late: Callable[[Answer], None]
     room: Callable[[], None]  # a window that was full has room again
-    wake: Callable[[], None]  # `Attempts.watched` was set, or the connection is lost; perhaps again
+    wake: Callable[[], None]  # `Attempts.watched` was set, or the connection was lost; may repeat
 
 
 @dataclass(eq=False)
 class Attempts:
     """The attempts of one connection.
 
-    `origin` is what the headers of all its requests say. With `tell_losers`, the replica is told
-    which are no longer wanted.
+    `origin` is part of the headers of all its requests. With `tell_losers`, the replica is told
+    which ones are no longer wanted.
     """
 
     outlet: Outlet
@@ -98,11 +98,11 @@ class Attempts:
         options, outlet = self.options, self.outlet
         self._cancellations = Cancellations()
         self.window = LinkWindow(standing=len(self.services))
-        self.watched = False  # something large was sent lately: the link's thread looks often
+        self.watched = False  # a large send was recent: the link's thread checks often
         self.round_trip_s = 0.0  # the shortest seen
         self._large_since = float("-inf")
         self._sending_since: float | None = None
-        self._held_by_zenoh = (0.0, 0)  # since when, so many bytes at most
+        self._held_by_zenoh = (0.0, 0)  # since when, and how many bytes at most
         self._seen = frame.NO_STAMP  # the stamp of the last answer
         self._telling = False
         self._unanswered = Unanswered()
@@ -139,7 +139,7 @@ class Attempts:
         attempt = OpenAttempt(
             service, request_id, payload, len(payload), now, now + remaining_s, handling
         )
-        knows_rate = self._progress.throughput.spans  # seldom: what is queued has shown it
+        knows_rate = self._progress.throughput.spans  # rarely: only after a queue was measured
         if knows_rate and not self._deadline.may_arrive(attempt, remaining_s, now, self._before):
             return False
         if not self.window.admit(attempt) and not self._displace(attempt):
@@ -150,7 +150,7 @@ class Attempts:
             attempt.mark = self._credit.queue(attempt.size)
             self._queue.put(attempt)
             return True
-        # It cannot block: the hop to another thread is saved.
+        # It cannot block, so the hop to another thread is avoided.
         attempt.mark = mark
         together = more or self._batch.attempts
         if together and attempt.size <= batch_frames.ENTRY_BYTES_LIMIT:
@@ -171,7 +171,7 @@ class Attempts:
             self._send_together(self._batch.take())
 
     def _send_together(self, attempts: Sequence[OpenAttempt]) -> None:
-        if len(attempts) < 2 or self._flow.thin:  # there, each is compressed
+        if len(attempts) < 2 or self._flow.thin:  # on a slow link, each is compressed
             for attempt in attempts:
                 self._send_or_lose(attempt)
             return
@@ -200,13 +200,13 @@ class Attempts:
         return [one for one in self.window.attempts() if one.payload is not None]
 
     def _left_bytes(self, now: float, bytes_per_s: float) -> float:
-        """Return what was sent and has not arrived: in the kernel, and in Zenoh above it."""
+        """Return the bytes sent that have not arrived: in the kernel, and in Zenoh above it."""
         since, held = self._held_by_zenoh
         left = max(0.0, held - bytes_per_s * (now - since))
         return left + self._progress.left_bytes(now, bytes_per_s)
 
     def _displace(self, attempt: OpenAttempt) -> bool:
-        """Let a newer attempt in for the stalest unsent one, where its service wants that."""
+        """Admit a newer attempt in place of the stalest unsent one, if its service allows that."""
         stale = self._queue.stalest(attempt)
         if stale is None:
             return False
@@ -237,7 +237,7 @@ class Attempts:
         self._close(attempt, Answer(attempt.request_id, refusal=refusal))
 
     def _close(self, attempt: OpenAttempt, answer: Answer) -> bool:
-        """Tell the end of an open attempt; False where it has ended before."""
+        """End an open attempt with an answer; False if it has already ended."""
         if not self.window.remove(attempt):
             return False
         attempt.payload = None
@@ -278,7 +278,7 @@ class Attempts:
             self._end(attempt, Refusal.LOST)
 
     def _skipped(self, attempt: OpenAttempt) -> None:
-        """Tell the end of an attempt that was forgotten while it waited: no answer will."""
+        """Report the end of an attempt that was forgotten before it was sent: no answer will."""
         if attempt.forgotten:
             self.tell.late(
                 Answer(attempt.request_id, refusal=Refusal.CANCELLED, service=attempt.service)
@@ -301,7 +301,7 @@ class Attempts:
         began = time.monotonic()
         if large:
             self._large_since = self._sending_since = began
-            if not self.watched:  # have the link's thread look whether it flows, for a while
+            if not self.watched:  # the link's thread checks its progress for a while
                 self.watched = True
                 self.tell.wake()
         try:
@@ -319,13 +319,13 @@ class Attempts:
             self.outlet.lose("it stopped reading, and Zenoh closed the session")
 
     def _left_there_s(self, remaining_s: float) -> float:
-        """Return how long the replica has: in an overload all that it ends it ends just in time."""
+        """Return the replica's time, less the round trip: under overload it ends just in time."""
         return remaining_s - min(self.round_trip_s, remaining_s / 2)
 
     def _publish(self, attempt: OpenAttempt, payload: bytes, remaining_s: float) -> None:
         compression, rate = self._compressions.get(attempt.service), self._progress.bytes_per_s
         packed = None
-        # Of a topic, one that is unpacked would be overtaken by the next.
+        # Not for topics: the next message would overtake one that is being decompressed.
         if compression and rate is not None and not attempt.service.startswith(topic.PREFIX):
             packed = compression.pack(payload, rate)
         reads_packed = attempt.reads_packed = compression is not None
@@ -343,14 +343,14 @@ class Attempts:
         content = payload if packed is None else packed
         self.outlet.publish(attempt.service, content, header)
 
-    # -- what came (Zenoh's threads) ------------------------------------------------------
+    # -- answers (Zenoh's threads) --------------------------------------------------------
 
     def heard(self, stamp: bytes, answers: Iterable[Answer], *, packed: bool = False) -> None:
         """Take answers and their stamp; `packed`: one answer, with a compressed payload."""
         self._seen = stamp
         for answer in answers:
             attempt = self._unanswered.answered(answer.request_id)
-            if attempt is None:  # it was answered before
+            if attempt is None:  # it has already been answered
                 if self._unanswered.owed < 0:
                     self.outlet.lose("it sends more answers than it received requests")
                 continue
@@ -363,7 +363,7 @@ class Attempts:
                 self._came_late(attempt, answer)
 
     def _take_aside(self, attempt: OpenAttempt, answer: Answer, *, packed: bool) -> None:
-        """Take an answer that is still wanted aside; decompress it, if it was asked to be."""
+        """Take an answer that is still wanted on another thread; decompress it if we allowed it."""
 
         def done(payload: bytes | None) -> None:
             refusal = Refusal.MALFORMED if payload is None else None
@@ -395,7 +395,7 @@ class Attempts:
         return len(self._unanswered) > 0
 
     def look(self, now: float) -> float:
-        """Track large sends; return for how long the current one has taken."""
+        """Track large sends; return how long the current one has taken so far."""
         if self.watched and now - self._large_since > _WATCH_S and not self._queue.qsize():
             self.watched = False
         since = self._sending_since
@@ -410,7 +410,7 @@ class Attempts:
         return self._unanswered.are_ignored(now)
 
     def close(self) -> None:
-        """Accept nothing more; open attempts end as lost. Returns at once; `end` must follow."""
+        """Accept nothing more and end open attempts as lost. Returns at once; `end` must follow."""
         ended = self.window.close()
         join_at_exit(self._thread)
         for attempt in ended:

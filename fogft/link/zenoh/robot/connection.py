@@ -1,11 +1,11 @@
 """One Zenoh session from a robot to one replica, used once and then discarded.
 
-A request is published at its service's key; all answers come as the replies to one query, which
-stays open for as long as the connection. A query for each request would cost a third more, and its
-time-out at the replica would be sent by the one thread that all else there needs, too.
+A request is published to its service's key; all answers come as the replies to one query, which
+stays open as long as the connection. A query per request would cost a third more, and at the
+replica its time-out would be sent by the one thread that everything else there needs too.
 
-What can block (`put`, `close`) is called by the sender thread of its attempts, so a peer that takes
-nothing costs nobody else. What sends raises `zenoh.ZError` where the session is closed.
+Calls that can block (`put`, `close`) are made by the sender thread of its attempts, so a peer that
+reads nothing affects no other link. Methods that send raise `zenoh.ZError` on a closed session.
 """
 
 import secrets
@@ -37,7 +37,7 @@ from fogft.records.signing import Signer
 
 @dataclass
 class Shared:
-    """What all links of one robot share. Written by the dialer, read by its links."""
+    """State that all links of one robot share. Written by the dialer, read by its links."""
 
     credentials: CredentialPaths
     robot: str
@@ -46,20 +46,20 @@ class Shared:
     tell_losers: bool
     options: SendOptions = field(default_factory=SendOptions)
     gate: LargeSendGate = field(default_factory=LargeSendGate)
-    records: bytes = b""  # signed, for every replica, packed; empty for none
-    newer: dict[int, bytes] = field(default_factory=dict)  # slot -> what its replica said instead
+    records: bytes = b""  # signed records for every replica, packed; empty for none
+    newer: dict[int, bytes] = field(default_factory=dict)  # slot -> newer ones from its replica
 
     @cached_property
     def signer(self) -> Signer:
-        """The robot's key. Raises CredentialError where it cannot be used."""
+        """Signs with the robot's key. Raises CredentialError: it cannot be used."""
         return Signer(self.credentials.certificate, self.credentials.key)
 
 
-# NONE, not the default: under AUTO (and LATEST) Zenoh holds the replies back until the
-# last replica has answered. Kept true by tests/link/zenoh/robot/test_first_reply_is_not_held_back.
+# NONE, not the default: with AUTO (and LATEST) Zenoh holds replies back until the
+# last replica has answered. Tested by tests/link/zenoh/robot/test_first_reply_is_not_held_back.
 _AT_ONCE = zenoh.ConsolidationMode.NONE
-_ANSWERS_TIMEOUT_S = 1e9  # for as long as the connection
-_PROBE_TIMEOUT_S = 60.0  # on a thin uplink a probe waits behind what is large
+_ANSWERS_TIMEOUT_S = 1e9  # as long as the connection lasts
+_PROBE_TIMEOUT_S = 60.0  # on a slow uplink a probe waits behind large messages
 _TELL_RECORDS_TIMEOUT_S = 5.0
 
 _REFUSED = {
@@ -70,10 +70,10 @@ _REFUSED = {
 
 
 class Connection:
-    """An open session whose peer has been verified; of no more use once `lost_because` says why.
+    """An open session whose peer has been verified; unusable once `lost_because` is set.
 
-    Raises zenoh.ZError: Nothing was reached. WireError: Somebody else was; nothing was sent to
-    them. CredentialError: Our own certificate (`certificate`, DER) or key cannot be used.
+    Raises zenoh.ZError: The peer was not reached. WireError: Another peer was; nothing was sent
+    to it. CredentialError: Our own certificate (`certificate`, DER) or key cannot be used.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class Connection:
         self.told, self.told_at = b"", 0.0  # the records that the replica has taken, and when
         self._session = zenoh.open(config)
         self._get = partial(self._session.get, target=zenoh.QueryTarget.ALL, consolidation=_AT_ONCE)
-        # The link's thread must not wait behind what is stuck: a lost probe is an unanswered one.
+        # The link's thread must not wait for a stuck peer: a dropped probe counts as unanswered.
         self._ask = partial(self._get, congestion_control=zenoh.CongestionControl.DROP)
         try:
             self._listener = self._session.info.declare_link_events_listener(
@@ -137,9 +137,9 @@ class Connection:
         return FlowWatch(address(links[0].src), address(links[0].dst))
 
     def begin(self) -> bool:
-        """Ask for the answers to come, once the replica has let us in; return whether it hears.
+        """Open the query for answers, once the replica has admitted us; return whether it is open.
 
-        What is published before Zenoh knows that it is heard there would be lost.
+        Before that, Zenoh must know of the replica's subscribers: earlier messages would be lost.
         """
         if self._begun:
             return True
@@ -152,7 +152,7 @@ class Connection:
         self._begun = True
         return True
 
-    # -- for its attempts -----------------------------------------------------------------
+    # -- called by its attempts -----------------------------------------------------------
 
     def publish(self, service: str, content: bytes, header: bytes) -> None:
         """Send a message to a service. May block while the peer does not read."""
@@ -167,7 +167,7 @@ class Connection:
         )
 
     def lose(self, because: str) -> None:
-        """Note that the connection is lost. Any thread, perhaps more than once."""
+        """Note that the connection is lost. Any thread; may be called repeatedly."""
         self.lost_because = self.lost_because or because
         self._wake()
 
@@ -189,7 +189,7 @@ class Connection:
     # -- the link's thread ----------------------------------------------------------------
 
     def alive(self) -> bool:
-        """Whether Zenoh still has a link beneath this session."""
+        """Whether Zenoh still has a link under this session."""
         try:
             return bool(self._session.info.links())
         except zenoh.ZError:
@@ -204,7 +204,7 @@ class Connection:
                 self.lose("it answers a probe twice")
             elif reply.ok is not None:
                 unanswered.clear()
-                self._greeting = self._bare  # we are known from now on
+                self._greeting = self._bare  # from now on the replica knows us
                 heard(reply.ok.payload.to_bytes())
             elif reply.err is not None:
                 self._probe_refused(reply.err.payload.to_bytes())
@@ -223,14 +223,14 @@ class Connection:
         try:
             _, _, said, _ = frame.decode_refusal(content)
         except FrameError:
-            return  # Zenoh's own: it timed out, and the link's thread counts the silence
+            return  # Zenoh's own error: a time-out; the link's thread measures the silence
         words = _REFUSED.get(
             refusal.read(said)[0], f"the replica refuses our probes: {as_line(said)}"
         )
         self.lose(words)
 
     def tell_records(self, key: str, records: bytes, newer: Callable[[bytes], object]) -> None:
-        """Send signed records; `newer` is given what stands in place of outdated ones."""
+        """Send signed records; `newer` gets the replica's records that replace outdated ones."""
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
@@ -244,14 +244,14 @@ class Connection:
             timeout=_TELL_RECORDS_TIMEOUT_S,
             payload=records,
             attachment=self._bare,
-            # Not that of the answers: its end at the replica must not wait for room among them.
+            # Not the answers' priority: its end at the replica must not wait for room among them.
             priority=zenoh.Priority.DATA_LOW,
         )
 
     def close(self) -> None:
         """Close it; open attempts are lost. Returns at once: the sender thread ends the session."""
         self.attempts.close()
-        # A large send that goes on is for nobody any more, and may block for minutes.
+        # A large send still in progress is wanted by nobody, and may block for minutes.
         threading.Thread(target=self._end_flow, name="fogft-end-link", daemon=True).start()
 
     def _end_flow(self) -> None:

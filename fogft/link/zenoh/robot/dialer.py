@@ -1,4 +1,4 @@
-"""Creates links over Zenoh, and holds what all links of a robot share."""
+"""Creates links over Zenoh, and holds the state that all links of a robot share."""
 
 import contextlib
 import time
@@ -44,7 +44,7 @@ class ZenohDialer:
         self._links: set[ZenohLink] = set()  # each of its methods is atomic
 
     def adopt(self, options: SendOptions) -> None:
-        """Set the options of services, from the next connection on."""
+        """Set the options of services, effective from the next connection."""
         self._shared.options = options
 
     def dial(self, peer: Peer, services: Mapping[str, str], events: LinkEvents) -> ZenohLink:
@@ -67,13 +67,13 @@ class ZenohDialer:
     def newer(self) -> list[SignedRecord]:
         """Return newer records that replicas sent in reply; nothing is verified."""
         said: list[SignedRecord] = []
-        for slot in list(self._shared.newer):  # judged once: a liar's are many, and large
+        for slot in list(self._shared.newer):  # each only once: a liar may send many, large ones
             with contextlib.suppress(RecordError):
                 said += frames.unpack(self._shared.newer.pop(slot))
         return said
 
     def certificate(self) -> str:
-        """Return the common name of the certificate that every open link uses, or nothing."""
+        """Return the common name of the certificate that every open link uses, else ""."""
         used = {link.certificate for link in list(self._links)} - {b""}
         try:
             signer = self._shared.signer
@@ -82,7 +82,7 @@ class ZenohDialer:
         return signer.common_name if used <= {signer.certificate} else ""
 
     def close(self) -> None:
-        """Close every link, and wait a little for their threads."""
+        """Close every link, and wait briefly for their threads."""
         links = list(self._links)
         for link in links:
             link.close()

@@ -1,7 +1,7 @@
 """Links over Zenoh: connect to a replica, probe it, and reconnect when it falls silent.
 
-A thread of each link (`fogft-keep-...`) replaces the connection when it is lost or when probes go
-unanswered: never because a service is slow.
+Each link has a thread (`fogft-keep-...`) that replaces the connection if it is lost or if probes go
+unanswered, but never because a service is slow.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ log = logging.getLogger(__name__)
 
 _PROBE_EVERY_S = 1.0
 _FIRST_PROBES_EVERY_S = 0.1
-_UNREADY_PROBES_EVERY_S = 0.25  # a replica that is there gets requests soon after it is ready
+_UNREADY_PROBES_EVERY_S = 0.25  # a reachable replica gets requests soon after it is ready
 _BACKOFF_S = (0.1, 0.2, 0.4, 0.5)
 _RENEW_AGAIN_S = 5.0
 _TELL_AGAIN_S = 10.0
-_LOOK_EVERY_S = 0.1  # while something large is sent
-_LOOK_AGAIN_S = 0.05  # at the earliest
+_LOOK_EVERY_S = 0.1  # while a large message is sent
+_LOOK_AGAIN_S = 0.05  # the shortest interval
 
 
 @dataclass(eq=False)
@@ -68,9 +68,9 @@ class ZenohLink:
         )
         # Written by the link's thread only; `_live` is set exactly while the state is UP.
         self._live: Connection | None = None
-        self.offer: Callable[..., bool] = _decline  # of its attempts, while there is one
+        self.offer: Callable[..., bool] = _decline  # that of the live connection, if any
         self._state = LinkState.CONNECTING
-        # Services that the last probe answer called ready; empty unless UP
+        # Services that the last probe answer reported ready; empty unless UP
         self.ready: frozenset[str] = frozenset()
         self._detail = "not reached yet"
         self._opening = Opening(peer, shared.settings)
@@ -78,7 +78,7 @@ class ZenohLink:
         self._ignores = False
         self._looked_at = 0.0
         self._renew_at = NEVER
-        self._retiring: list[Connection] = []  # succeeded, with requests under way
+        self._retiring: list[Connection] = []  # replaced, with requests in flight
         self._thread = on_thread(self._keep, name=f"fogft-keep-{peer.id.short}")
         self.join = self._thread.join  # once closed
 
@@ -97,7 +97,7 @@ class ZenohLink:
 
     @property
     def thin(self) -> bool:
-        """Whether its path was seen to drain slowly."""
+        """Whether its network path was measured to be slow."""
         live = self._live
         return live is not None and live.flow.thin
 
@@ -115,7 +115,7 @@ class ZenohLink:
 
     def send(self) -> None:
         """Flush requests that were offered with `more`. Never blocks."""
-        for connection in (self._live, *self._retiring):  # a moment ago it was the live one
+        for connection in (self._live, *self._retiring):  # one may have just been live
             if connection is not None:
                 connection.attempts.send()
 
@@ -126,7 +126,7 @@ class ZenohLink:
                 connection.attempts.forget(request_id)
 
     def flush(self) -> None:
-        """Send what waits to be sent, and cancellations for forgotten, unanswered requests."""
+        """Send requests offered with `more`, and cancellations of forgotten, unanswered ones."""
         for connection in (self._live, *self._retiring):
             if connection is not None:
                 connection.attempts.send()
@@ -171,14 +171,14 @@ class ZenohLink:
         while not self._closed:
             self._probing.nobody_to_ask(time.monotonic())
             failures = 0 if self._hold() else failures + 1
-            self._woke_at = time.monotonic()  # opening took time, and that is silence
+            self._woke_at = time.monotonic()  # the time spent on opening counts as silence
             self._let_go()
             if not self._closed:
                 self._pause(_BACKOFF_S[min(failures, len(_BACKOFF_S) - 1)])
         self._let_go()
 
     def _hold(self) -> bool:
-        """Open a connection and attend to it until it is lost; return whether it was up."""
+        """Open a connection and maintain it until it is lost; return whether it was up."""
         was_up = False
         connection = None
         try:
@@ -187,8 +187,8 @@ class ZenohLink:
                 was_up = self._attend(connection) or was_up
                 if connection is not self._live or self._closed or connection.lost_because:
                     break
-                connection = self._succeed(connection)  # it makes way for one with new credentials
-        except Exception as error:  # a mistake of ours must not end the link for good
+                connection = self._succeed(connection)  # replaced by one with new credentials
+        except Exception as error:  # a bug must not end the link for good
             log.exception("link_failed replica=%s", self.peer.id.short)
             if connection is not None:
                 connection.lost_because = f"{type(error).__name__}: {error}"
@@ -197,7 +197,7 @@ class ZenohLink:
         return was_up
 
     def _succeed(self, old: Connection) -> Connection:
-        """Open a connection beside one that is up; return it once it is up too, else the old."""
+        """Open a new connection while the old one is up; return it once it is up, else the old."""
         self._renew_at = NEVER
         new = self._open()
         if new is not None and self._attend(new, until_up=True) and new is self._live:
@@ -211,7 +211,7 @@ class ZenohLink:
         return old
 
     def _let_go(self) -> None:
-        """Close connections that were succeeded, once nothing is under way on them."""
+        """Close replaced connections once they have no requests in flight."""
         for connection in list(self._retiring):
             connection.attempts.sweep()
             if not len(connection.attempts.window) or connection.lost_because or self._closed:
@@ -240,7 +240,7 @@ class ZenohLink:
         return connection
 
     def _attend(self, connection: Connection, *, until_up: bool = False) -> bool:
-        """Probe a connection until it has to go, or is up (`until_up`); return whether it was."""
+        """Probe a connection until it must go, or is up (`until_up`); return whether it was up."""
         up = False
         self._woke_at = next_probe = time.monotonic()
         self._probing.another_connection()
@@ -253,7 +253,7 @@ class ZenohLink:
                 break
             try:
                 if now >= next_probe:
-                    said = self._probing.answer  # a service that hangs is started anew for that
+                    said = self._probing.answer  # a hanging service is restarted anyway
                     hangs = said is not None and bool(said.hanging)
                     self._ignores |= connection.attempts.sweep() and not hangs
                     self._probe(connection, now)
@@ -274,7 +274,7 @@ class ZenohLink:
         return up
 
     def _flows(self, connection: Connection, now: float) -> bool:
-        """See whether what is large moves: then nobody is silent. False where it stands still."""
+        """Check that large sends progress, which excuses silence; False if they are stuck."""
         if now - self._looked_at < _LOOK_AGAIN_S:
             return not connection.lost_because
         self._looked_at = now
@@ -286,7 +286,7 @@ class ZenohLink:
         return not connection.lost_because
 
     def _doubt(self, now: float) -> float:
-        """Tell the owner once that a probe's answer is late; return when to look, in s."""
+        """Notify the owner once if a probe's answer is late; return seconds to the next check."""
         late, left_s = self._probing.late(now)
         if late and self._live is not None:
             silent_s = self._probing.silent_s(now)
@@ -302,7 +302,7 @@ class ZenohLink:
         return min(self._probe_every_s, _UNREADY_PROBES_EVERY_S)
 
     def _tell_records(self, connection: Connection) -> None:
-        """Send what the replica has not taken, and all now and then: it may have newer."""
+        """Send records that the replica lacks, and all periodically, as it may have newer ones."""
         records, id = self.shared.records, self.peer.id
         again = bool(records) and time.monotonic() - connection.told_at > _TELL_AGAIN_S
         if again or records != connection.told:
@@ -312,14 +312,14 @@ class ZenohLink:
 
     def _probe(self, connection: Connection, now: float) -> None:
         known = self._probing.answer
-        # Its types are asked for once a connection: it may be another process at each.
+        # Its types are requested once per connection: each may be to another process.
         describe = self._live is not connection or known is None or not known.types
         self._probing.ask(connection, Probe(self.shared.robot, describe, __version__), now)
         if not connection.alive():
             connection.lost_because = "the connection was lost"
 
     def _listen(self, connection: Connection) -> bool:
-        """Take what was heard; return whether the link is up by it. Raises WireError."""
+        """Take answers to probes; return whether they bring the link up. Raises WireError."""
         up = False
         for heard in self._probing.heard(connection):
             if connection.begin():
@@ -331,14 +331,14 @@ class ZenohLink:
     def _answers(
         self, connection: Connection, known: ProbeAnswer | None, answer: ProbeAnswer
     ) -> None:
-        """A connection's replica has answered: from now on it is the live one."""
+        """Take an answer to a probe: its connection is the live one from now on."""
         news = self._live is not connection or answer != known
         attempts, rtt_s = connection.attempts, self._probing.rtt_s or 0.0
         attempts.round_trip_s = min(attempts.round_trip_s or rtt_s, rtt_s)
         self.ready = answer.ready
         old = self._live
         if old is not connection:
-            if old is not None:  # first: what is offered there is yet to be sent, or forgotten
+            if old is not None:  # first: its requests must still be sent, or forgotten
                 self._retiring.append(old)
             self._state = LinkState.UP
             self._detail = ""
@@ -353,10 +353,10 @@ class ZenohLink:
         self._live, self.offer, self.ready = None, _decline, frozenset()
 
     def _part(self, connection: Connection) -> None:
-        """Let go of a connection: nothing more is offered to it, what is open there is lost."""
+        """Drop a connection: nothing more is offered to it, and its open attempts are lost."""
         was_up = self._live is not None
         self._nothing_live()
-        self._renew_at = NEVER  # the next one begins with what there is now
+        self._renew_at = NEVER  # the next one uses the current credentials anyway
         if was_up:
             self._state = LinkState.SUSPECT
             log.warning("link_lost replica=%s reason=%r", self.peer.id.short,
@@ -369,7 +369,7 @@ class ZenohLink:
             self._changed()
 
     def _pause(self, wanted_s: float) -> None:
-        """Wait, or until something happens. Time in which we did not run is not silence."""
+        """Wait for `wanted_s` or until woken. Time when this process did not run is not silence."""
         wanted_s = max(wanted_s, 0.0)
         self._wake.wait(wanted_s)
         self._wake.clear()
@@ -388,7 +388,7 @@ class ZenohLink:
     def _answered(self, answer: Answer) -> None:
         try:
             self.events.answered(self, answer)
-        except Exception:  # in Zenoh's thread nobody else would tell of it
+        except Exception:  # on Zenoh's thread nothing else would report it
             log.exception("answer_not_taken request=%s", answer.request_id.hex())
 
     def _late(self, answer: Answer) -> None:

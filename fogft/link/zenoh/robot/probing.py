@@ -1,7 +1,7 @@
 """The probes of a link: the replica's answers, and for how long it has been silent.
 
-There are two silences: that of the replica over all connections, which people see, and that of the
-present connection, by which it is given up. When to probe is `link`'s to say.
+Two silences are measured: the replica's over all connections, which is shown to users, and the
+current connection's, which decides when to give it up. `link` decides when to probe.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ class Silence:
         return 0.0 if self.since is None else max(0.0, now - self.since)
 
 
-# Over which connection an answer came, its bytes, when its probe was sent, and when it came.
+# The connection of an answer, its bytes, when its probe was sent, and when the answer came.
 Heard = tuple["Connection", bytes, float, float]
 
 
 class Probing:
     """Probes to one replica. For the link's thread; any thread may read the attributes.
 
-    `came` is called, from any thread, when an answer came.
+    `came` is called, on any thread, when an answer has come.
     """
 
     def __init__(self, peer: Peer, came: Callable[[], None]) -> None:
@@ -63,16 +63,16 @@ class Probing:
         self._key = names.slot_key(peer.id.pool_uid, peer.id.slot, names.PROBE)
         self._queue: deque[Heard] = deque()  # filled by Zenoh's thread
         self._of_replica = Silence()
-        self.silent_s = self._of_replica.for_s  # for how long the replica has been
-        self.nobody_to_ask = self._of_replica.began  # it is not reached: silent from now on
+        self.silent_s = self._of_replica.for_s  # how long the replica has been silent
+        self.nobody_to_ask = self._of_replica.began  # it is unreachable: silent from now on
         self._of_connection = Silence()
         self.unheard_s = self._of_connection.for_s
-        self.another_connection = self._of_connection.ended  # probes go over another from now on
+        self.another_connection = self._of_connection.ended  # from now on probes use another one
         self._doubted = False
-        self._content = b""  # of the last answer: what is idle says the same again and again
+        self._content = b""  # of the last answer: an idle replica repeats the same one
         self.answer: ProbeAnswer | None = None  # the last one
-        self.heard_at: float | None = None  # when that came, monotonic seconds
-        self.rtt_s: float | None = None  # what that took
+        self.heard_at: float | None = None  # when it came, monotonic seconds
+        self.rtt_s: float | None = None  # its round-trip time
 
     def ask(self, connection: Connection, probe: Probe, now: float) -> None:
         """Send a probe. Raises zenoh.ZError: it could not be sent."""
@@ -128,7 +128,7 @@ class Probing:
     def late(self, now: float) -> tuple[bool, float]:
         """Return whether an answer is late (true once per silence), and the time left until then.
 
-        Infinite once it is late, and while none is awaited.
+        The time is infinite once it is late, and while none is awaited.
         """
         if self._of_replica.since is None:
             self._doubted = False
