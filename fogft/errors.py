@@ -82,6 +82,10 @@ class FrameError(ValueError):
     """Bytes from a peer are not a frame of this version. Sent to the peer, not shown to users."""
 
 
+class LinkVersionError(FrameError):
+    """They are one of another version: says which side to upgrade."""
+
+
 def told(error: FogftError) -> str:
     """Return an error and its hint in one sentence."""
     return f"{error.message}; {error.hint}" if error.hint else error.message

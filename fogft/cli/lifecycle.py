@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Iterable
@@ -210,6 +211,7 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     def told(what: str) -> None:
         output.say(f"ended {what}")
 
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)  # half a `down` leaves machines without a manager
     try:
         shutdown.end(store, composition.cloud_of, told=told, warned=output.warn)
     except KeyboardInterrupt:

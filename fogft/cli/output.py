@@ -63,8 +63,9 @@ def printable(text: str) -> str:
 
 
 def say(text: str) -> None:
-    """Write a message to stderr, flushed."""
-    print(printable(text), file=sys.stderr, flush=True)
+    """Write a message to stderr, flushed. If nobody reads it, the command goes on."""
+    with contextlib.suppress(OSError):
+        print(printable(text), file=sys.stderr, flush=True)
 
 
 def done(text: str) -> None:
@@ -169,7 +170,8 @@ def _tagged(tag: str, style: str, text: str) -> None:
     from rich.text import Text
 
     told = Text.assemble((tag, style), " ", printable(text))  # not wrapped: users copy commands
-    show(told, stream=sys.stderr, folds=False)
+    with contextlib.suppress(OSError):
+        show(told, stream=sys.stderr, folds=False)
 
 
 def _console(stream: IO[str], **options: Any) -> Console:

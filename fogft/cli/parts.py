@@ -197,7 +197,7 @@ def install(
         output.warn(f"systemd did not start: {'; '.join(refused)}")
         return
     if paths is not None:
-        units.hand_over(where, paths, wanted)
+        units.hand_over(paths)
     output.done("systemd starts them at boot, and restarts any that die")
     if not system:
         output.hint("`loginctl enable-linger` starts them before you log in")
@@ -229,5 +229,6 @@ def remove(
     else:
         names = [unit.name for unit in _units(pool, gateway, rendezvous, system=system)]
     found = units.installed(where, names)
-    units.remove(where, found)
+    if refused := units.remove(where, found):
+        output.warn(f"systemd did not stop them: {refused}")
     output.done(f"removed {', '.join(found)}" if found else "nothing was installed")

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from fogft import __version__, logfile
@@ -104,9 +105,12 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
     from fogft.pool.commands.outcome import Outcome
 
     managed_at = time.monotonic()
-    deadline = managed_at + timeout_s
+    deadline, ahead_s = managed_at + timeout_s, time.time() - managed_at
     with _shown() as show:
         while True:
+            before_s, ahead_s = ahead_s, time.time() - time.monotonic()
+            if ahead_s < before_s:  # the clock was set back: what comes now is told by that
+                awaited = replace(awaited, since=awaited.since + ahead_s - before_s)
             seen = status.read(paths, time.time())
             if seen.manager_alive:
                 managed_at = time.monotonic()

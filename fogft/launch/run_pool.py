@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_LOGS_AGAIN_S = 5
 READY = "fogft_pool_ready"  # a line of stdout, for the launch file
 
 
@@ -67,7 +69,11 @@ def _run(asked: argparse.Namespace) -> int:
     if status != 0:
         return status
     print(READY, flush=True)
-    return _wait(_fogft("logs", "--follow", "--lines", "0", "--pool", asked.pool))
+    launch = os.getppid()
+    while os.getppid() == launch and _is_ours(asked):  # both go on if `logs` is killed
+        _wait(_fogft("logs", "--follow", "--lines", "0", "--pool", asked.pool))
+        time.sleep(_LOGS_AGAIN_S)
+    return 0
 
 
 def _fogft(*words: str) -> subprocess.Popen[bytes]:

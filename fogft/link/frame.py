@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
-from fogft.errors import FrameError
+from fogft.errors import FrameError, LinkVersionError
 from fogft.model.keys import LONGEST_S
 from fogft.model.names import REQUEST_ID_BYTES, ROBOT_BYTES_LIMIT
 from fogft.requests.load import Handling, Load
@@ -242,10 +242,10 @@ def decode_cancel(frame: bytes) -> list[bytes]:
 
 
 def check_version(version: Any) -> None:
-    """Check the link version of a frame. Raises FrameError: it differs from ours."""
+    """Check the link version of a frame. Raises LinkVersionError: it differs from ours."""
     if version is True or version != VERSION:
         older = isinstance(version, int) and version < VERSION
-        raise FrameError(
+        raise LinkVersionError(
             f"link version {version!r:.20} there and {VERSION} here: upgrade fogft "
             + ("there" if older else "here")
         )

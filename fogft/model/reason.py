@@ -121,6 +121,10 @@ class Cause(str, Enum):
     OUTVOTED = "outvoted"  # at most half of the replicas offer a service
     TROUBLE = "trouble"  # an error, in its own words
 
+    @classmethod
+    def _missing_(cls, value: object) -> Cause | None:
+        return cls.TROUBLE if isinstance(value, str) else None  # of a newer fogft
+
 
 @dataclass(frozen=True)
 class Reason:

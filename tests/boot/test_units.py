@@ -250,7 +250,7 @@ def test_a_pool_goes_on_whatever_dies_and_after_each_boot(robot: Robot) -> None:
 
     robot.service("remove")
     assert robot.systemctl("list-unit-files", "--no-legend", "fogft*") == ""
-    assert "service.env" not in robot.machine.run("ls", f"{STATE}/pools/e2e")
+    assert "service.env" not in robot.machine.run("ls", STATE)
     robot.fogft("up", f"{HOME}/pool.yaml", "--yes")
     robot.whole()
     robot.fogft("down", "--yes")

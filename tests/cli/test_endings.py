@@ -210,3 +210,13 @@ def run_by_hand() -> str:
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     assert ended.returncode == 1, ended.stderr
     return ended.stderr
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch, capsys):
+    """In a container a user often has no name, and without HOME no home."""
+    for name in ("HOME", "FOGFT_HOME", "XDG_STATE_HOME", "XDG_CONFIG_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", {}.__getitem__)
+    for words in (["list"], ["service", "status"]):
+        assert main.run(words) == 1
+        assert "error: this user has no home folder\n\nhint: set HOME" in capsys.readouterr().err

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
+
+import pytest
 
 from fogft import disk
 from tests.fakes.pools import STATUS, alive, lay_down
+from tests.fakes.waiting import wait_for
 
 
 @contextmanager
@@ -27,6 +32,13 @@ def going_on(*arguments: str) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.kill()
+
+
+def ignores_hang_up(pid: int) -> bool:
+    """Return whether a process ignores SIGHUP."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    [ignored] = re.findall(r"^SigIgn:\s*(\w+)$", status, re.MULTILINE)
+    return bool(int(ignored, 16) & 1 << signal.SIGHUP - 1)
 
 
 def interrupted(process: subprocess.Popen[str]) -> bool:
@@ -71,6 +83,28 @@ def test_a_watch_ends_with_its_pool(home):
         _, stderr = process.communicate(timeout=100)
     assert stderr.startswith("error: there is no pool `planner`")
     assert process.returncode == 1
+
+
+@pytest.mark.parametrize("hangs_up", [False, True])
+def test_a_pool_is_shut_down_though_nobody_reads_it(home, hangs_up):
+    """A terminal that is gone must not leave machines without a manager."""
+    paths = lay_down(home)
+    holds = "import fcntl, signal, sys; f = open(sys.argv[1], 'w'); fcntl.flock(f, 2);"
+    holds += "signal.signal(15, lambda *_: (sys.stdin.read(), sys.exit())); print(flush=True);"
+    holds += "signal.pause()"
+    command = [sys.executable, "-c", holds, str(paths.manager_lock)]
+    with subprocess.Popen(command, stdin=-1, stdout=-1) as manager, going_on("down") as process:
+        assert manager.stdout is not None
+        assert manager.stdin is not None
+        manager.stdout.readline()
+        assert process.stderr is not None
+        if hangs_up:
+            wait_for(lambda: ignores_hang_up(process.pid), 20)
+            process.send_signal(signal.SIGHUP)
+        process.stderr.close()
+        manager.stdin.close()
+        assert process.wait(30) == 0
+    assert not paths.folder.exists()
 
 
 def test_a_reader_that_leaves_ends_it_without_a_trace(home):

@@ -94,8 +94,10 @@ def test_a_dead_manager_is_told_twice(home, capsys):
     )
 
 
-def test_a_manager_that_hangs_is_told(home, capsys):
-    paths = lay_down(home, age_s=40)
+@pytest.mark.parametrize("age_s", [40, -70])
+def test_a_manager_that_hangs_is_told(home, capsys, age_s):
+    """What it saw may lie ahead, where the clock was set back since."""
+    paths = lay_down(home, age_s=age_s)
     with alive(paths):
         main.run(["status"])
     assert re.search(

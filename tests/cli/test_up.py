@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from itertools import chain, repeat
 from pathlib import Path
@@ -75,6 +76,21 @@ def test_it_says_what_it_will_do_each_change_and_how_it_ended(file, looks, capsy
         "0.1  ready",
         "done: `planner` answers, with 1 of 3 replicas ready; 2 more starting, see `fogft status`",
     ]
+
+
+def test_a_clock_that_is_set_back_meanwhile_hides_no_answer(file, looks, monkeypatch):
+    """What the manager saw after that has an earlier date than the file."""
+    looks()
+    clock, ahead_s = time.time, [3600.0]
+    monkeypatch.setattr(time, "time", lambda: clock() + ahead_s[0])
+
+    def look(*_: object) -> Seen:
+        seen = Seen(replace(UP, observed_at=0.0 if ahead_s[0] else time.time()), 0.1, True)
+        ahead_s[0] = 0.0
+        return seen
+
+    monkeypatch.setattr("fogft.pool.commands.status.read", look)
+    assert main.run(["up", str(file), "--timeout", "2"]) == 0
 
 
 def test_a_replica_that_is_lost_meanwhile_is_told(file, looks, capsys):

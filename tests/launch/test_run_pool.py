@@ -25,7 +25,7 @@ if sys.argv[1] == "up":
         signal.pause()
     sys.exit(int(os.environ["FAKE_UP"]))
 if sys.argv[1] == "logs":
-    print("0.1 a line", flush=True)
+    print(f"0.1 a line, pid {os.getpid()}", flush=True)
     signal.pause()
 """
 
@@ -70,13 +70,25 @@ def trace(folder: Path) -> list[str]:
 def test_up_then_one_line_then_the_logs(run_pool, tmp_path: Path) -> None:
     child = run_pool("--cloud", "local", "--timeout", "9")
     assert child.stdout.readline() == f"{READY}\n"
-    assert child.stdout.readline() == "0.1 a line\n"
+    assert child.stdout.readline().startswith("0.1 a line")
     child.send_signal(signal.SIGINT)
     assert child.wait(20) == 0
     assert trace(tmp_path) == [
         "up f.yaml --yes --cloud local --timeout 9",
         "logs --follow --lines 0 --pool p",
     ]
+
+
+def test_the_pool_goes_on_without_its_logs(run_pool, tmp_path: Path) -> None:
+    """Who shows them may be killed: that is no reason to end a launch, and the robot's nodes."""
+    child = run_pool("--down")
+    assert child.stdout.readline() == f"{READY}\n"
+    os.kill(int(child.stdout.readline().split()[-1]), signal.SIGKILL)
+    assert child.stdout.readline().startswith("0.1 a line"), "they are shown again"
+    assert "down p --yes" not in trace(tmp_path)
+    child.send_signal(signal.SIGINT)
+    assert child.wait(20) == 0
+    assert trace(tmp_path)[-1] == "down p --yes"
 
 
 def test_a_pool_that_another_file_has_started_goes_on(run_pool, tmp_path: Path) -> None:

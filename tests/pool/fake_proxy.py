@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from fogft import disk
+from fogft import __version__, disk
 from fogft.model import membership
 from fogft.pool.folder.paths import PoolPaths
 
@@ -35,6 +35,8 @@ def main(folder: str) -> None:
             for m in members
         ]
         report = {"pid": os.getpid(), "written_at": time.time(), "links": links, "services": {}}
+        version = paths.folder / "version"
+        report["version"] = version.read_text() if version.exists() else __version__
         heard = paths.folder / "heard"
         report["manager_epoch"] = int(heard.read_text()) if heard.exists() else 0
         partial = paths.folder / ".proxy-status"

@@ -11,7 +11,7 @@ from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import OF_NO_REPLICA, Event, EventKind
 from tests.nightly import by_day
 from tests.simulation.test_pools import FAULTS, PLACES, kill_the_manager, make_world, recover
-from tests.simulation.world import UID, World
+from tests.simulation.world import START, UID, World
 
 DAY_S = 86_400.0
 JUMPS_S = (-400 * DAY_S, -DAY_S, -3600.0, -61.0, -6.0, 6.0, 61.0, 3600.0, DAY_S, 400 * DAY_S)
@@ -111,3 +111,53 @@ def test_the_next_manager_counts_from_what_was_moved() -> None:
         Event(set_at[0].at, EventKind.CLOCK, 0, 0, "", set_at[0].reason, by_s=-3600.0)
     ]
     assert set_at[0].reason == Reason(Cause.CLOCK_SET, seconds=-3600.0)
+
+
+BOOTS_WITH_S = (0.0, -3600.0, -400 * DAY_S, 1.0 - START)
+"""How far the clock is ahead as a robot boots, until it hears the time: in 1970 at worst."""
+
+
+def rebooted(world: World, ahead_s: float) -> None:
+    """Have the next manager start with a clock that is wrong, and set right soon after."""
+    world.clock_ahead_s = ahead_s
+    world.store.reopen()
+    world.manager = world.new_manager(2)
+    for _ in range(3):
+        world.tick()
+        world.step(1.0)
+    world.clock_ahead_s = 0.0
+
+
+@pytest.mark.parametrize("ahead_s", BOOTS_WITH_S)
+@pytest.mark.parametrize("slow", ["boots", "starts"])
+def test_a_launch_that_hangs_is_late_although_the_robot_boots_with_an_old_clock(slow, ahead_s):
+    """What was remembered by the right time is not of decades ahead once that is known again."""
+    world = World(1, replace(make_world(0).spec, replicas=1, max_usd_per_hour=None), PLACES)
+    for zone in world.cloud.zones.values():
+        zone.boot_s = (9_999.0, 9_999.0) if slow == "boots" else zone.boot_s
+    world.start_s = 9_999.0
+    for second in range(126):
+        if second == 10:
+            rebooted(world, ahead_s)
+        world.tick()
+        world.step(1.0)
+    assert launched(world) >= 2
+
+
+@pytest.mark.parametrize("ahead_s", BOOTS_WITH_S)
+def test_a_full_location_rests_although_the_robot_booted_with_an_old_clock(ahead_s: float) -> None:
+    """A location proves itself now or earlier, and not in decades."""
+    world = World(1, replace(make_world(0).spec, replicas=1, max_usd_per_hour=None), PLACES[:1])
+    for _ in range(60):
+        world.tick()
+        world.step(1.0)
+    rebooted(world, ahead_s)
+    world.tick()
+    for zone in world.cloud.zones.values():
+        zone.capacity = 0
+    [ours] = [machine.id for machine in world.truth() if machine.id.pool_uid == UID]
+    world.cloud.preempt(ours, notice_s=0.0)
+    for _ in range(300):
+        world.tick()
+        world.step(1.0)
+    assert 1 <= sum(e.kind is EventKind.REFUSED for e in world.store.events) <= 8

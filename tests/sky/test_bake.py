@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 from pathlib import Path
@@ -23,7 +24,7 @@ from tests.sky.test_task import (  # noqa: F401 - two fixtures
 
 TASK: dict[str, Any] = {
     "setup": "set -e\necho baked $GREETING >> ~/setups\npip install -q userlib==1.0",
-    "envs": {"GREETING": "it's"},
+    "envs": {"GREETING": "it's\nlong"},
     "run": "serve",
 }
 FILE = """\
@@ -79,7 +80,7 @@ def test_a_machine_takes_from_an_image_what_fits_and_makes_the_rest(
         carry(image, version)
         done = on_skypilot(image, f"export GREETING=\n{task.setup_of(TASK, task.read())}")
         assert done.returncode == 0, done.stdout + done.stderr
-        assert (image / "setups").read_text().splitlines() == ["baked it's", "baked"]
+        assert (image / "setups").read_text().splitlines() == ["baked it's long", "baked"]
         assert (installed(image)["fogft"], installed(image)["userlib"]) == (version, "1.0")
         assert (image / ".fogft/venv/baked").exists() == (version == "0.1.0")
 
@@ -126,6 +127,22 @@ def test_an_image_is_built_on_the_files_own_but_never_on_itself(
     (call,) = (docker / "calls").read_text().splitlines()
     assert call.startswith(f"build --tag {tag} ")
     assert not Path(call.split()[-1]).exists(), "the context is left behind"
+
+
+def test_what_no_vm_gets_no_image_has(docker: Path):
+    """SkyPilot leaves it out of a workdir, too; an image is pushed to where others can load it."""
+    lines = "# keys\n*.pem\n/secrets/\n\n!ours.pem\n"
+    (docker / "lab/.gitignore").write_text("other\n")
+    (docker / "lab/.skyignore").write_text(lines)
+    commands.bake(docker / "lab/pool.yaml", "lab/baked:1", None, push=False)
+    ignored = (docker / "context/.dockerignore").read_text()
+    assert ignored == "workdir/**/*.pem\nworkdir/secrets/\n!workdir/**/ours.pem\n"
+
+
+def test_a_workdir_that_cannot_be_copied_is_told(docker: Path):
+    os.mkfifo(docker / "lab/fifo")
+    with pytest.raises(SpecError, match="workdir: cannot be copied: `"):
+        commands.bake(docker / "lab/pool.yaml", "lab/baked:1", None, push=False)
 
 
 def test_what_docker_cannot_do_is_told(docker: Path, monkeypatch: pytest.MonkeyPatch):

@@ -24,7 +24,7 @@ SHELL ["/bin/bash", "-c"]
 RUN apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends {needed} && rm -rf /var/lib/apt/lists/*
 COPY fogft /root/.fogft
 {workdir}WORKDIR /root/sky_workdir
-RUN export HOME=/root && {exports}bash /root/.fogft/setup.sh && rm -rf /root/.fogft/setup.sh /root/.fogft/wheel /root/.fogft/replica
+RUN export HOME=/root && bash /root/.fogft/setup.sh && rm -rf /root/.fogft/setup.sh /root/.fogft/wheel /root/.fogft/replica
 """  # noqa: E501
 
 
@@ -45,16 +45,33 @@ def write(
     shutil.copytree(wheel, ours / "wheel")
     for name, content in lock.items():
         write_whole(ours / "replica" / name, content)
-    write_whole(ours / "setup.sh", task.setup_of(asked, task.read()))
     exports = "".join(
-        f"export {name}={shlex.quote(str(value))} && "
+        f"export {name}={shlex.quote(str(value))}\n"
         for name, value in (asked.get("envs") or {}).items()
     )
+    write_whole(ours / "setup.sh", exports + task.setup_of(asked, task.read()))
     carried = isinstance(asked.get("workdir"), str)
     if carried:
-        shutil.copytree(asked["workdir"], folder / "workdir", symlinks=True)
+        try:
+            shutil.copytree(asked["workdir"], folder / "workdir", symlinks=True)
+        except shutil.Error as error:  # a pipe, or what another user has
+            raise SpecError.of_key("workdir", f"cannot be copied: {error.args[0][0][2]}") from error
+        write_whole(folder / ".dockerignore", _ignored(Path(asked["workdir"])))
     text = _DOCKERFILE.format(
-        image=image, needed=" ".join(_NEEDED), exports=exports,
+        image=image, needed=" ".join(_NEEDED),
         workdir="COPY workdir /root/sky_workdir\n" if carried else "",
     )  # fmt: skip
     write_whole(folder / "Dockerfile", text)
+
+
+def _ignored(workdir: Path) -> str:
+    """Return a `.dockerignore` for the folder above, of the files that SkyPilot does not upload."""
+    found = [one for name in (".skyignore", ".gitignore") if (one := workdir / name).is_file()]
+    lines = found[0].read_text(errors="replace").splitlines() if found else []
+    text = ""
+    for line in lines:
+        path = line.strip().removeprefix("!")
+        if path and not path.startswith("#"):
+            under = "workdir" if path.startswith("/") else "workdir/**/"
+            text += ("!" if line.startswith("!") else "") + under + path + "\n"
+    return text

@@ -43,6 +43,14 @@ class Jump:
         return Reason(Cause.CLOCK_SET, seconds=self.set_s, because=(slept,) if self.slept_s else ())
 
 
+def moved(at: float, by_s: float, now: float) -> float:
+    """Return a remembered time after the clock gained `by_s`; it is `now`.
+
+    What is later than the clock was then, a better one wrote before a reboot: that stays.
+    """
+    return at + by_s if at <= now - by_s else at
+
+
 class Watch:
     """Compares the readings of one process. Call `look` at every tick."""
 

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
 from operator import itemgetter
 from typing import ClassVar, NamedTuple
 
@@ -22,6 +23,7 @@ from fogft.model.choices import MAX_REPLICAS
 from fogft.model.plain import Moment
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import supply
+from fogft.planning.observed.clock_jumps import moved
 
 _AT = itemgetter(0)
 
@@ -70,6 +72,7 @@ class Event:
 
 
 _NO_FAULT = Reason(Cause.ERROR)
+_TIMES = ("launched_at", "closed_at", "first_ready_at", "unready_since", "draining_since")
 OWN_FAULTS = frozenset({Cause.SETUP, Cause.NOT_SET_UP, Cause.NOT_READY})
 LAUNCHES_KEPT_S = 3600.0
 # A loss counts against the location where the replica was never ready for so long.
@@ -97,17 +100,6 @@ class Record:
     on_demand: bool = False
     version: str = ""
     fault: Reason = _NO_FAULT
-
-    def move(self, by_s: float) -> None:
-        """Shift all times, because the clock was set."""
-        self.launched_at += by_s
-        self.closed_at += by_s
-        if self.first_ready_at is not None:
-            self.first_ready_at += by_s
-        if self.unready_since is not None:
-            self.unready_since += by_s
-        if self.draining_since is not None:
-            self.draining_since += by_s
 
     @property
     def supply(self) -> str:
@@ -187,17 +179,19 @@ class History:
 
     def _move(self, event: Event) -> None:
         """Let all that is remembered be later, so that durations stay what they were."""
-        by_s = event.by_s
         if event.kind is EventKind.CLOCK:
-            self._set.append((event.at - by_s, by_s))
+            self._set.append((event.at - event.by_s, event.by_s))
+        later = partial(moved, by_s=event.by_s, now=event.at)
         for record in self._records.values():
-            record.move(by_s)
+            for name in _TIMES:
+                if (at := getattr(record, name)) is not None:
+                    setattr(record, name, later(at))
         self.failures = {
-            supply: [Failure(f.at + by_s, f.cause) for f in failures]
+            supply: sorted((Failure(later(f.at), f.cause) for f in failures), key=_AT)
             for supply, failures in self.failures.items()
         }
-        self.losses = {p: [at + by_s for at in losses] for p, losses in self.losses.items()}
-        self._proven_at = {supply: at + by_s for supply, at in self._proven_at.items()}
+        self.losses = {p: sorted(map(later, losses)) for p, losses in self.losses.items()}
+        self._proven_at = {supply: later(at) for supply, at in self._proven_at.items()}
         self.rates = {}
 
     def by_clock(self, instant: float) -> float:

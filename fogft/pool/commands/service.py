@@ -9,7 +9,6 @@ Not here: what the processes tell systemd (`fogft.process`).
 
 import contextlib
 import os
-import pwd
 import re
 import shutil
 import signal
@@ -22,7 +21,7 @@ from pathlib import Path
 
 from fogft import disk, template_files
 from fogft.errors import FogftError, StateError
-from fogft.pool.folder.paths import PoolPaths, home
+from fogft.pool.folder.paths import PoolPaths, home, own_folder
 from fogft.pool.manager import process_control
 
 SYSTEM_FOLDER = Path("/etc/systemd/system")
@@ -67,12 +66,11 @@ class Services:
             raise FogftError("this machine has no systemd", "start each process yourself") from None
 
 
-def services(*, system: bool, environ: Mapping[str, str] = os.environ) -> Services:
+def services(*, system: bool) -> Services:
     """Return where this user's units go, or the machine's."""
     if system:
         return Services(True, SYSTEM_FOLDER)
-    config = environ.get("XDG_CONFIG_HOME") or str(Path(environ.get("HOME", "~"), ".config"))
-    return Services(False, Path(config).expanduser() / "systemd" / "user")
+    return Services(False, own_folder("XDG_CONFIG_HOME", "~/.config") / "systemd" / "user")
 
 
 def names_of(pool: str) -> dict[str, str]:
@@ -85,7 +83,8 @@ def names_of(pool: str) -> dict[str, str]:
 
 def of_pool(paths: PoolPaths, *, system: bool) -> list[Unit]:
     """Return the units of a pool's manager and client proxies."""
-    pool, environment = paths.folder.name, paths.folder.resolve() / "service.env"
+    pool, root = paths.folder.name, paths.folder.parent.parent.resolve()
+    environment = root / f"{pool}.service.env"  # a pool of that name may come after this one
     manager = ("manager", "--no-proxy", pool)
     proxy = ("proxy", "--spare", "--config", str(paths.proxy_config))
     return [
@@ -104,20 +103,19 @@ def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
         raise StateError(f"there is no `{config}`", "`fogft join` writes it")
     words = (command, "--config", str(config))
     environment = config.with_suffix(".env")
-    name = f"fogft-{command}-{config.stem}.service"
+    name = f"fogft-{command}-{re.sub('[^A-Za-z0-9_.-]', '_', config.stem)}.service"
     return [_unit(name, words, config, environment, system=system)]
 
 
 def _unit(name: str, words: Sequence[str], needs: Path, environment: Path, *, system: bool) -> Unit:
     command = " ".join(_quoted(word) for word in (sys.executable, "-m", "fogft", *words))
-    owner = pwd.getpwuid(needs.stat().st_uid).pw_name
     text = template_files.read_text("systemd.service").format(
         mark=MARK,
         what=name.removeprefix("fogft-").removesuffix(".service"),
         needs=str(needs).replace("%", "%%"),
         command=command,
         environment=str(environment).replace("%", "%%"),
-        user=f"User={owner}\n" if system else "",
+        user=f"User={needs.stat().st_uid}\n" if system else "",
         watchdog_s=120 if words[0] == "manager" else 30,  # a manager waits for its cloud
         wanted_by="multi-user.target" if system else "default.target",
     )
@@ -152,7 +150,7 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
     """
     if not where.folder.is_dir():
         disk.make_folder(where.folder)
-    needs = f"EnvironmentFile={units[0].environment}\n".replace("%", "%%").encode()
+    needs = re.findall("^ConditionPathExists=.*\n", units[0].text, re.MULTILINE)[0].encode()
     there = disk.read_bytes(where.folder / units[0].name)
     if there is not None and needs not in there:
         told = f"`{units[0].name}` runs something else"
@@ -171,10 +169,11 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
     return [one.stderr.strip() for one in said if one.returncode]
 
 
-def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
+def hand_over(paths: PoolPaths) -> None:
     """Have the client proxy not started by systemd hand over to one that was.
 
     Told to end, it hands over to whoever stands by: that one is waited for, so no request is lost.
+    systemd starts those again that have found no place until then.
     """
     old = disk.holder(paths.proxy_lock)
     if old is None:
@@ -185,10 +184,6 @@ def hand_over(where: Services, paths: PoolPaths, units: Sequence[Unit]) -> None:
         with contextlib.suppress(ProcessLookupError):
             os.kill(old, signal.SIGTERM)
         gone.wait(HANDOVER_LIMIT_S)
-    # Others found no place before, and may have given up.
-    names = [unit.name for unit in units]
-    where.systemctl("reset-failed", *names)
-    where.systemctl("start", "--no-block", *names)
 
 
 def installed(where: Services, names: Sequence[str] = ()) -> list[str]:
@@ -207,11 +202,12 @@ def states(where: Services, names: Sequence[str]) -> dict[str, str]:
     return {name: where.systemctl("is-active", name).stdout.strip() or "unknown" for name in names}
 
 
-def remove(where: Services, names: Sequence[str]) -> None:
-    """Stop units, and delete them and their environment."""
-    runs = shutil.which("systemctl") is not None
+def remove(where: Services, names: Sequence[str]) -> str:
+    """Stop units, and delete them and their environment; return what systemd said against it."""
+    runs, refused = shutil.which("systemctl") is not None, ""
     if runs and names:
-        where.systemctl("disable", "--now", *names)
+        done = where.systemctl("disable", "--now", *names)
+        refused = done.stderr.strip().rpartition("\n")[2] if done.returncode else ""
     for unit in (where.folder / name for name in names):
         text = unit.read_text()
         unit.unlink()  # first: it may not be ours to remove
@@ -220,3 +216,4 @@ def remove(where: Services, names: Sequence[str]) -> None:
     if runs and names:
         where.systemctl("daemon-reload")
         where.systemctl("reset-failed", *names)
+    return refused

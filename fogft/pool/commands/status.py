@@ -90,7 +90,7 @@ def current(
     links = fresh.links if fresh is not None else None
     if fresh is not None and heard_since is not None:
         links = tuple(_heard(k, fresh.written_at, heard_since) for k in fresh.links)
-    age_s = max(0.0, now - status.observed_at) if status.observed_at else None
+    age_s = abs(now - status.observed_at) if status.observed_at else None
     seen = Seen(
         status,
         age_s,

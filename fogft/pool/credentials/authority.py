@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from fogft import disk
 from fogft.errors import CredentialError
-from fogft.model.credentials import Role
+from fogft.model.credentials import Role, holder_of
 from fogft.records.signing import attribute
 
 if TYPE_CHECKING:
@@ -100,9 +100,11 @@ def is_good(path: Path, now: datetime.datetime, revoked: frozenset[str] = frozen
     """Whether a certificate exists, is not revoked, and is valid for two more months."""
     try:
         said = describe(path)
-    except CredentialError:
-        return False  # there is none yet, or it is damaged
-    return said.common_name not in revoked and not said.problem(now + RENEW_BEFORE)
+        holder_of(said.common_name)
+    except (CredentialError, ValueError):
+        return False  # there is none yet, it is damaged, or of another form
+    problem = said.problem(now) or said.problem(now + RENEW_BEFORE)
+    return said.common_name not in revoked and not problem
 
 
 def describe_pem(pem: bytes) -> Description:

@@ -148,13 +148,13 @@ class Ledger:
         return found
 
     def _kept(self, entries: Iterable[Entry]) -> list[Entry]:
-        """Return what must be remembered: what is valid, and each name's last generation."""
+        """Return what must be remembered: valid or revoked, and each name's last generation."""
         now = self._clock()
         last = {(e.holder.role, e.holder.name): e for e in entries}
         return [
             e
             for e in entries
-            if now < e.not_after + _DAY_S or last[(e.holder.role, e.holder.name)] is e
+            if e.revoked_at or now < e.not_after + _DAY_S or last[e.holder.role, e.holder.name] is e
         ]
 
     def _write(self, entries: Iterable[Entry]) -> None:

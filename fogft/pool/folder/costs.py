@@ -18,6 +18,7 @@ from fogft.errors import StateError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause
 from fogft.model.replica import Machine, Offer, Placement
+from fogft.planning.observed.clock_jumps import moved
 
 log = logging.getLogger(__name__)
 
@@ -96,10 +97,11 @@ class CostBook:
             StateError: It cannot be written; it is kept, and tried again.
         """
         if by_s := set_s - self._set_s:
-            moved = {
-                name: replace(one, until=one.until + by_s) for name, one in self._running.items()
+            self._running = {
+                name: replace(one, until=moved(one.until, by_s, now))
+                for name, one in self._running.items()
             }
-            self._running, self._set_s = moved, set_s
+            self._set_s = set_s
         same = self._running.keys() == {machine.id.short for machine in machines}
         if same and 0 <= now - self._looked_at < LOOK_EVERY_S:
             return
@@ -121,7 +123,9 @@ class CostBook:
                     self._days = {key: one for key, one in self._days.items() if key[1] != name}
                 continue
             price = prices.get(place, machine.usd_per_hour)
-            begun = last.until if last is not None else machine.launched_at or now
+            begun = machine.launched_at or now
+            if last is not None:  # a manager whose clock was slow may have told a time before it
+                begun = last.until if begun > now else max(begun, last.until)
             self._charge(name, place, begun, now, price)
             seen[name] = Running(now, price, place)
         for name, last in gone.items():

@@ -33,6 +33,7 @@ class Discovery:
     def look(self, spec: PoolSpec, observed: Observed, wanted: int) -> bool:
         """Add the services that most replicas offer; return whether that changed the file."""
         self.notes = []
+        self._doubted = {} if observed.doubt_s else self._doubted  # no time for a set clock
         if spec.services:
             return False
         told = claims(

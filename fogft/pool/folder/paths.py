@@ -12,14 +12,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fogft import disk
+from fogft.errors import StateError
 
 
 def home(environ: Mapping[str, str] = os.environ) -> Path:
     """Return the folder that holds all of fogft's state for this user."""
     if environ.get("FOGFT_HOME"):
         return Path(environ["FOGFT_HOME"])
-    state = environ.get("XDG_STATE_HOME")
-    return (Path(state) if state else Path.home() / ".local" / "state") / "fogft"
+    return own_folder("XDG_STATE_HOME", "~/.local/state", environ) / "fogft"
+
+
+def own_folder(variable: str, default: str, environ: Mapping[str, str] = os.environ) -> Path:
+    """Return a folder of this user's. Raises StateError: it has no home, as in a container."""
+    found = environ.get(variable) or os.path.expanduser(default)
+    if found.startswith("~"):
+        raise StateError("this user has no home folder", "set HOME to a folder of its own")
+    return Path(found)
 
 
 def latency_file() -> Path:

@@ -5,6 +5,7 @@ Not here: reading them (`fogft.proxy.config`) and signing (`credentials`).
 """
 
 import datetime
+import os
 import re
 import socket
 from collections.abc import Mapping
@@ -269,7 +270,7 @@ def absolute(task: Mapping[str, Any], base: Path) -> dict[str, Any]:
 
 
 def _absolute(path: str, base: Path) -> str:
-    return path if "://" in path else str((base / Path(path).expanduser()).resolve())
+    return path if "://" in path else str((base / os.path.expanduser(path)).resolve())
 
 
 def with_build(task: Mapping[str, Any]) -> dict[str, Any]:

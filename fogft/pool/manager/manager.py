@@ -287,9 +287,8 @@ class Manager:
         over = lifetime.is_over(self.store.spec(), self._begun_at(), time.time())
         if self.keeps_proxy and not self.store.intent().stopping and not over:
             report = self._fresh_report(time.time())
-            version = "" if report is None else report.version
             before = self._proxy.replacements
-            self._proxy.look(outdated=version not in ("", __version__))
+            self._proxy.look(outdated=report is not None and report.version != __version__)
             if self._proxy.replacements != before:
                 self.store.append(Event(now, EventKind.PROXY_REPLACED, 0, 0))
 

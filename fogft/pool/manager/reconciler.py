@@ -34,7 +34,7 @@ from fogft.model.replica import (
 from fogft.model.spec import PoolSpec
 from fogft.model.topology import certified
 from fogft.planning import lifetime, standbys
-from fogft.planning.observed.clock_jumps import Reading
+from fogft.planning.observed.clock_jumps import LEAST_S, Reading
 from fogft.planning.observed.health import judge
 from fogft.planning.observed.history import EventKind, History, fault_of
 from fogft.planning.observed.refresh import Silent
@@ -160,7 +160,7 @@ class Reconciler:
             health = None
         begun_at = lifetime.begun_at(intent, identity.created_at, history)
         trouble += lifetime.notes(spec, begun_at, observed.now)
-        if observed.doubt_s:
+        if abs(observed.doubt_s) >= LEAST_S:
             trouble.append(Reason(Cause.CLOCK_DOUBTED, seconds=observed.doubt_s))
         over = lifetime.is_over(spec, begun_at, observed.now)
         if over:

@@ -44,7 +44,7 @@ class Timekeeping:
             kind, by_s, reason = self._unwritten[0]
             self._store.append(Event(self.now, kind, 0, 0, reason=reason, by_s=by_s))
             del self._unwritten[0]
-            self._updating.move(by_s)
+            self._updating.move(by_s, self.now)
         return jumped
 
 

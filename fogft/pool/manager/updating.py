@@ -12,6 +12,7 @@ from dataclasses import replace
 from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
 from fogft.planning import rollout
+from fogft.planning.observed.clock_jumps import moved
 from fogft.planning.observed.health import Health, judge
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.rollout import Trial, Update
@@ -49,11 +50,11 @@ class Updating:
         store.append(Event(observed.now, EventKind.UPDATE_STOPPED, 0, 0, reason=fault))
         return store.spec(), trial
 
-    def move(self, by_s: float) -> None:
+    def move(self, by_s: float, now: float) -> None:
         """Shift stored times, because the clock was set."""
         trial = self._store.trial()
         if trial.began_at:
-            self._store.write_trial(replace(trial, began_at=trial.began_at + by_s))
+            self._store.write_trial(replace(trial, began_at=moved(trial.began_at, by_s, now)))
 
     def settle(
         self, spec: PoolSpec, trial: Trial, health: Health, *, wanted: int, now: float

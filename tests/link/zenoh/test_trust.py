@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from fogft.link.probe_frames import encode_probe
 from fogft.link.zenoh import settings as config
 from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
@@ -76,6 +77,22 @@ def test_a_replica_of_another_ca_is_refused(
     replica = start_replica(files=stranger.replica())
     _refused(dial(replica.endpoint), "certificate is refused")
     assert _heard_nothing(replica)
+
+
+@pytest.mark.parametrize(("ours", "side"), [(99, "there"), (1, "here")])
+def test_a_link_of_another_version_says_which_side_to_upgrade(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    monkeypatch: pytest.MonkeyPatch,
+    request: pytest.FixtureRequest,
+    ours: int,
+    side: str,
+) -> None:
+    replica = start_replica()
+    request.addfinalizer(encode_probe.cache_clear)
+    for module in ("frame", "probe_frames"):
+        monkeypatch.setattr(f"fogft.link.{module}.VERSION", ours)
+    _refused(dial(replica.endpoint), f"{ours} here: upgrade fogft {side}")
 
 
 def test_a_replicas_certificate_cannot_ask(

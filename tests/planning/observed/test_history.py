@@ -47,6 +47,14 @@ def test_what_is_no_event_is_an_error(junk: object) -> None:
         from_plain(Event, junk)
 
 
+def test_an_event_whose_cause_only_a_newer_fogft_knows_is_kept() -> None:
+    """Without a launch its generation would be used again."""
+    told = {"at": 1, "kind": "launch", "slot": 0, "generation": 7, "reason": {"cause": "new"}}
+    assert from_plain(Event, told).reason == Reason(Cause.TROUBLE)
+    with pytest.raises(ValueError):
+        from_plain(Event, {**told, "reason": {"cause": 3}})
+
+
 @given(events)
 def test_generations_never_go_back(found: list[Event]) -> None:
     """The highest generation of a slot only grows as events come in."""

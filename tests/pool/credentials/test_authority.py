@@ -56,6 +56,15 @@ def test_validity_begins_a_day_back_and_lasts_a_year(authority: Path) -> None:
     assert "not valid before" in said.problem(now - 25 * HOUR)
 
 
+def test_what_is_not_valid_yet_or_names_no_holder_is_issued_anew(authority: Path) -> None:
+    """It was made while the clock was days ahead, or by a fogft before 0.2.0."""
+    now = datetime.datetime.now(datetime.timezone.utc)
+    made = _write(authority, ROBOT, Role.ROBOT)
+    assert credentials.is_good(made, now)
+    assert not credentials.is_good(made, now - 240 * HOUR)
+    assert not credentials.is_good(_write(authority, f"robot.ada.{UID}", Role.ROBOT), now)
+
+
 def test_the_authority_lasts_ten_years_and_is_kept(authority: Path) -> None:
     """Asking for a CA again, as each `up` does, changes nothing."""
     before = [(p.name, p.read_bytes()) for p in sorted(authority.iterdir())]

@@ -96,6 +96,16 @@ def test_what_expired_is_forgotten_but_never_a_names_last_generation(
     assert [e.holder.short for e in ledger.entries()] == ["ada.3", "0.1", "ada.4"]
 
 
+def test_a_clock_that_is_years_ahead_lets_nobody_in_again(ledger: Ledger, clock: Clock) -> None:
+    holder, _ = ledger.issue_next(Role.ROBOT, "eve", UID, days=1)
+    ledger.revoke([holder])
+    ledger.issue_next(Role.ROBOT, "eve", UID, days=1)
+    clock.now += 800 * DAY_S
+    ledger.issue_next(Role.ROBOT, "ada", UID, days=1)
+    clock.now -= 800 * DAY_S
+    assert ledger.revoked() == {holder.common_name}
+
+
 @pytest.mark.parametrize("name", ["", "a b", "x" * 29, "ada.1", "../ada", "-ada"])
 def test_a_name_that_fits_no_certificate_is_refused(ledger: Ledger, name: str) -> None:
     with pytest.raises(CredentialError, match="cannot be named"):

@@ -104,3 +104,11 @@ def test_a_clock_that_is_set_is_no_time_in_which_machines_ran(tmp_path: Path, se
     assert kept.usd == pytest.approx(0.3 + 600 / 3600 * 0.1)
     kept.look(NOON + 10_800 + set_s, [machine(0)], [], 600.0, set_s)
     assert kept.usd == pytest.approx(0.4 + 600 / 3600 * 0.1)
+
+
+def test_no_machine_is_charged_for_time_before_its_launch(tmp_path: Path):
+    """The last manager's clock was slow, in 1970, and was not set while it ran."""
+    book(tmp_path).look(60.0, [machine(0)], [], 600.0)
+    kept = book(tmp_path)
+    kept.look(NOON + 3600, [machine(0)], [], 600.0)
+    assert kept.usd == pytest.approx(0.1)

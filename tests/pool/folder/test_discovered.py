@@ -33,3 +33,14 @@ def test_what_a_replica_claimed_while_it_was_alone_goes_once_most_deny_it(tmp_pa
         discovery.look(spec, Observed(later * ROUND_S, tuple(machines), (link(0, LIE),)), 3)
     assert dict(discovery.known.services) == dict([A])
     assert Discovery(tmp_path / "discovered.json").known == discovery.known
+
+
+def test_a_clock_that_is_set_takes_no_service_back(tmp_path: Path) -> None:
+    """Of three replicas that start, two have not come to offer it for a second."""
+    spec = replace(SPEC, rmw=Middleware(robot=Speaks.ZENOH))
+    discovery = Discovery(tmp_path / "discovered.json")
+    discovery.look(spec, Observed(0.0, (machine(0),), (link(0, A, LIE),)), 1)
+    machines, links = tuple(map(machine, range(3))), (link(0, A, LIE), link(1, A), link(2, A))
+    for now, doubt_s in ((1.0, 0.0), (3602.0, 3600.0), (3603.0, 3600.0), (3663.0, 0.0)):
+        discovery.look(spec, Observed(now, machines, links, doubt_s=doubt_s), 3)
+    assert LIE[0] in discovery.known.services

@@ -134,6 +134,8 @@ def test_relative_paths_are_relative_to_the_pool_file() -> None:
     }
     git = {"workdir": {"url": "https://example.org/x.git"}}
     assert configuration.absolute(git, Path("/src")) == git
+    nobody = configuration.absolute({"file_mounts": {"/data": "~no-such-user/d"}}, Path("/src"))
+    assert nobody == {"file_mounts": {"/data": "/src/~no-such-user/d"}}
 
 
 def test_the_robots_certificate_is_made_once_and_renewed_in_time(paths: PoolPaths) -> None:

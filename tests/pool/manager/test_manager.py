@@ -106,6 +106,19 @@ def test_scale_and_file_change_reach_a_running_manager(scene: Scene) -> None:
     scene.wait(lambda: "timeout_s: 7.0" in scene.paths.proxy_config.read_text())
 
 
+def test_a_client_proxy_that_tells_no_version_is_replaced(scene: Scene) -> None:
+    """It is of a fogft before 0.2.0: what is written for it now it may not read."""
+    scene.write(replicas=1)
+    (scene.paths.folder / "version").write_text("")
+    first = scene.start_manager()
+    scene.wait(lambda: scene.whole(1))
+    proxy = scene.status()["proxy_pid"]
+    first.send_signal(signal.SIGKILL)
+    first.wait()
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(1) and scene.status()["proxy_pid"] not in (None, proxy))
+
+
 def test_dead_proxy_is_started_again(scene: Scene) -> None:
     """The client proxy comes back under a new pid, and no replica is touched for it."""
     scene.write(replicas=1)

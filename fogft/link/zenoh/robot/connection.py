@@ -18,7 +18,7 @@ from functools import cached_property, partial
 import zenoh
 from zenoh import handlers
 
-from fogft.errors import FrameError, WireError
+from fogft.errors import FrameError, LinkVersionError, WireError
 from fogft.link import batch_frames, frame
 from fogft.link.credit import LargeSendGate
 from fogft.link.port import Answer, Peer, SendOptions
@@ -222,6 +222,9 @@ class Connection:
     def _probe_refused(self, content: bytes) -> None:
         try:
             _, _, said, _ = frame.decode_refusal(content)
+        except LinkVersionError as error:
+            self.lose(str(error))
+            return
         except FrameError:
             return  # Zenoh's own error: a time-out; the link's thread measures the silence
         words = _REFUSED.get(
