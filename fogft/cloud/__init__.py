@@ -1,1 +1,1 @@
-"""Where replicas run, and preemption notices. Not here: what is bought (`fogft.planning`)."""
+"""Clouds that run replicas, and preemption notices. Not here: what to buy (`fogft.planning`)."""

@@ -1,7 +1,7 @@
 """Watch for the preemption notice of the machine that this process runs on.
 
-A thread asks the cloud's metadata server (AWS, GCP, Azure) or looks at a file. A source yields the
-notices in force again each time it is asked; where it does not answer, that is no news.
+A thread polls the cloud's metadata server (AWS, GCP, Azure) or a file. At each poll a source yields
+all notices in force; a poll without an answer has no effect.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ _METADATA = "169.254.169.254"
 
 
 class Watch:
-    """A watch on a thread of its own, which calls `on_notice` once for each kind of notice.
+    """Polls for notices on its own thread and calls `on_notice` once for each kind of notice.
 
     `source` is ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers;
-    `metadata` is ``host[:port]`` of the metadata server, None for where the environment says.
+    `metadata` is ``host[:port]`` of the metadata server; None: the environment's, or the default.
     """
 
     def __init__(
@@ -50,12 +50,12 @@ class Watch:
         self._told: set[NoticeKind] = set()
         self._source: _Source | None = None
         self._closed = threading.Event()
-        self.close = self._closed.set  # then no call is made, but one under way; repeatable
+        self.close = self._closed.set  # no new call after this, but one may still run; idempotent
         threading.Thread(target=self._run, name="notice", daemon=True).start()
 
     @property
     def silent(self) -> bool:
-        """Whether no source exists on this machine, as far as is known."""
+        """Whether no notice source has been found on this machine so far."""
         return self._source is None
 
     def _run(self) -> None:
@@ -93,7 +93,7 @@ def _sources(source: str, metadata: str | None) -> list[_Source]:
             f"unknown source of preemption notices `{source}`",
             f"`file:PATH`, {', '.join(f'`{name}`' for name in NOTICE_SOURCES)}",
         )
-    # The variables are those that the clouds' own clients know. Azure's have none.
+    # The environment variables are those of the clouds' own clients. Azure's clients have none.
     known: dict[str, _Source] = {
         "aws": _Aws(metadata or _address("AWS_EC2_METADATA_SERVICE_ENDPOINT")),
         "gcp": _Gcp(metadata or _address("GCE_METADATA_HOST"), **{"Metadata-Flavor": "Google"}),
@@ -157,7 +157,7 @@ class _Server:
 
 
 class _Aws(_Server):
-    """Instance metadata version 2: with a token, which is renewed when it is refused."""
+    """IMDSv2: requests carry a token, which is renewed when the server rejects it."""
 
     def is_here(self) -> bool:
         self._headers = {"X-aws-ec2-metadata-token-ttl-seconds": "21600"}
@@ -176,7 +176,7 @@ class _Aws(_Server):
                 status, body, _ = self._get(f"/latest/meta-data/{path}")
             if status == 200:
                 yield read(body)
-            elif status != 404:  # which says that there is nothing
+            elif status != 404:  # 404 means that there is no notice
                 raise OSError(f"the metadata server answers {status}")
 
 
@@ -198,7 +198,7 @@ class _Azure(_Server):
         return bool(self._machine)
 
     def ask(self) -> Iterator[Notice | None]:
-        # The first question of all can take two minutes, while Azure begins to schedule.
+        # The very first request can take two minutes, while Azure enables scheduled events.
         path = "/metadata/scheduledevents?api-version=2020-07-01"
         yield notice_formats.azure_events(self._read(path), self._machine)
 

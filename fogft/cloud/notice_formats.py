@@ -1,8 +1,8 @@
-"""Preemption notices of different clouds, read into one form. Pure. By the clouds' own pages.
+"""Parse the preemption notices of each cloud into one form, by the clouds' documentation. Pure.
 
-| cloud | what is asked | how long before |
+| cloud | metadata path | time until preemption |
 |---|---|---|
-| AWS | ``spot/instance-action``, ``events/recommendations/rebalance`` | 2 min; earlier, or not |
+| AWS | ``spot/instance-action``, ``events/recommendations/rebalance`` | 2 min; earlier or never |
 | GCP | ``instance/preempted`` | 30 s at most |
 | Azure | ``scheduledevents``, of type ``Preempt`` or ``Terminate`` | 30 s at least |
 """
@@ -16,10 +16,10 @@ from typing import Any
 
 
 class NoticeKind(str, Enum):
-    """The kinds of notices."""
+    """The kind of a notice."""
 
-    REBALANCE = "rebalance"  # a hint: it is more likely than before to be taken
-    PREEMPTION = "preemption"  # it will be taken
+    REBALANCE = "rebalance"  # a hint: preemption has become more likely
+    PREEMPTION = "preemption"  # the machine will be preempted
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class Notice:
     """A notice that a machine may be preempted, or will be."""
 
     kind: NoticeKind
-    at: float | None  # when it ends, in seconds since the epoch; None when that was not said
-    source: str  # who said so: ``aws``, ``gcp``, ``azure``, ``file`` or ``signal``
-    detail: str = ""  # the words, for the log
+    at: float | None  # when the machine ends, in seconds since the epoch; None if not given
+    source: str  # who sent it: ``aws``, ``gcp``, ``azure``, ``file`` or ``signal``
+    detail: str = ""  # human-readable, for the log
 
 
 def aws_action(body: str) -> Notice | None:
-    """Read ``spot/instance-action``: that it exists is the news, whether or not it can be read."""
+    """Parse ``spot/instance-action``. Its existence is the notice, even if it cannot be parsed."""
     value = _map(body)
     action = value.get("action", "unknown")
     if action == "none":
@@ -43,7 +43,7 @@ def aws_action(body: str) -> Notice | None:
 
 
 def aws_rebalance(body: str) -> Notice | None:
-    """Read ``events/recommendations/rebalance``. Its time is that of the notice, not of an end."""
+    """Parse ``events/recommendations/rebalance``. Its time is that of the notice, not of an end."""
     value = _map(body)
     if "noticeTime" not in value:
         return None
@@ -51,14 +51,14 @@ def aws_rebalance(body: str) -> Notice | None:
 
 
 def gcp_preempted(body: str) -> Notice | None:
-    """Read ``instance/preempted``: ``TRUE`` or ``FALSE``."""
+    """Parse ``instance/preempted``: ``TRUE`` or ``FALSE``."""
     if body.strip().upper() != "TRUE":
         return None
     return Notice(NoticeKind.PREEMPTION, None, "gcp", "instance preempted")
 
 
 def azure_events(body: str, machine: str) -> Notice | None:
-    """Read ``scheduledevents``: the events of all machines of a group, of which one is ours."""
+    """Parse ``scheduledevents``: the events of all VMs in a group; `machine` is our VM's name."""
     events = _map(body).get("Events")
     for event in events if isinstance(events, list) else ():
         if not isinstance(event, dict) or event.get("EventType") not in ("Preempt", "Terminate"):
@@ -73,7 +73,7 @@ def azure_events(body: str, machine: str) -> Notice | None:
 
 
 def file_notice(content: str) -> Notice:
-    """Read a notice file: ``{"action": "terminate" | "rebalance", "at": s}``; it may be empty."""
+    """Parse a notice file: ``{"action": "terminate" | "rebalance", "at": s}``; it may be empty."""
     value = _map(content)
     at = value.get("at")
     kind = NoticeKind.REBALANCE if value.get("action") == "rebalance" else NoticeKind.PREEMPTION
@@ -89,7 +89,7 @@ def _map(body: str) -> dict[str, Any]:
 
 
 def moment(text: Any) -> float | None:
-    """Return a time of AWS's in seconds since the epoch; None for what is none."""
+    """Return an AWS timestamp in seconds since the epoch; None if it is not a timestamp."""
     try:
         read = datetime.fromisoformat(str(text).replace("UTC", "+00:00").replace("Z", "+00:00"))
     except ValueError:

@@ -1,10 +1,10 @@
-"""The port to a cloud. Every implementation passes `tests/contract`.
+"""The interface to a cloud. Every implementation passes `tests/contract`.
 
-The cloud's own list is the record: machines carry the pool's uid, slot and generation,
-and nothing that lacks the uid is ever touched.
+The cloud's own list of machines is the source of truth. Each machine is labelled with the pool's
+uid, its slot and its generation; a machine without the uid is never touched.
 
-Errors: `CloudUnreachable` when the cloud cannot tell, `NoCapacity` and `QuotaExceeded`
-where they are known at once; a launch that fails later is listed as FAILED.
+Errors: `CloudUnreachable` if the cloud's answer is unknown; `NoCapacity` and `QuotaExceeded` if
+they are known at once. A launch that fails later is listed as FAILED.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,21 +27,20 @@ class Launch:
     spec_hash: str
     # The SkyPilot task of the pool file, without its `fogft` section; paths are absolute.
     task: Mapping[str, Any] = field(default_factory=dict)
-    # What the machine needs to serve: file name -> content. Holds ``replica.yaml``,
-    # ``ca.crt``, ``replica.crt`` and ``replica.key``; the configuration names the others
-    # relative to its own folder. Kept 0600.
+    # The server proxy's files: name -> content. The configuration ``replica.yaml`` names
+    # ``ca.crt``, ``replica.crt`` and ``replica.key`` relative to its own folder. Mode 0600.
     files: Mapping[str, bytes] = field(default_factory=dict)
-    # Where the server proxy listens, on a cloud whose machines have addresses of their own.
+    # The port that the server proxy listens on, if each machine has an address of its own.
     link_port: int = LINK_PORT
-    # A machine of another type in the same place may cost so much at most; None for no limit.
+    # The maximum price of another machine type in the same place; None for no limit.
     limit_usd_per_hour: float | None = None
-    # Its machine exists and is stopped (`RealCloud.stop`): it is started under its id.
+    # The machine exists and is stopped (`RealCloud.stop`): start it under the same id.
     is_there: bool = False
-    # Others that are opened beside it.
+    # Further ports to open.
     more_ports: tuple[int, ...] = ()
-    # The replica dials its robots: nobody reaches it, so no port need be open.
+    # The replica dials its robots, so it needs no open port.
     dials_out: bool = False
-    # The networks that may connect to it, where the cloud can hold that; none for all.
+    # The networks that may connect, if the cloud can enforce it; empty for all.
     allow_from: tuple[str, ...] = ()
 
 
@@ -49,32 +48,32 @@ class Seller(Protocol):
     """A source of offers: a cloud, or a price table."""
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """List what can be bought for a task's `resources`.
+        """List the offers that satisfy a task's `resources`.
 
-        They hold ``ports: []`` where the machines need to be reached by nobody. Raises
-        `CloudUnreachable` where prices cannot be had now, `SpecError` for what can never be met.
+        `resources` has ``ports: []`` if nobody connects to the machines. Raises
+        `CloudUnreachable` if prices are unavailable now, `SpecError` if no offer can ever match.
         """
 
 
 class Cloud(Seller, Protocol):
-    """Where replicas run."""
+    """A cloud that runs replicas."""
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
-        """List this pool's machines in any phase, by id. CloudUnreachable: conclude nothing."""
+        """List a pool's machines in any phase, sorted by id. CloudUnreachable: conclude nothing."""
 
     def launch(self, order: Launch) -> None:
-        """Order a machine; return before it runs. Repeating an id does nothing.
+        """Launch a machine; return before it runs. Does nothing if the id was launched before.
 
-        Once this has returned the machine is listed, though the caller may be killed.
+        Once this returns, the machine is listed, even if the caller is killed afterwards.
 
         Raises:
             NoCapacity: The placement is full. Nothing was launched.
-            QuotaExceeded: The account may not have more. Nothing was launched.
-            CloudUnreachable: Unknown whether it was launched: look at `machines`.
+            QuotaExceeded: The account's quota is used up. Nothing was launched.
+            CloudUnreachable: It is unknown whether it was launched: check `machines`.
         """
 
     def terminate(self, id: ReplicaId) -> None:
-        """End a machine; return when it is gone. Repeatable. CloudUnreachable: it may run on."""
+        """Terminate a machine; return when it is gone. Idempotent. CloudUnreachable: it may run."""
 
     def log(self, id: ReplicaId) -> str | None:
         """Return the path of the machine's log on this computer, if it is kept here."""
@@ -85,41 +84,41 @@ class RealCloud(Protocol):
     """A cloud that costs money and needs credentials for each provider behind it."""
 
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
-        """Test credentials, of all clouds if none is named: cloud -> empty, or what to fix."""
+        """Test the credentials of these clouds (all if empty): cloud -> empty, or what to fix."""
 
     def check_task(self, task: Mapping[str, Any]) -> None:
-        """Raise `SpecError` for what cannot be honoured on these clouds, before it is ordered."""
+        """Raise `SpecError` if these clouds cannot honour the task. Called before a launch."""
 
     def left_out(self) -> Sequence[str]:
         """Return, in sentences, what was left out of the offers because it cannot be launched."""
 
     def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
-        """Return what each cloud lacks for machines of a pool; empty where it lacks nothing."""
+        """Return the features that each cloud lacks for a pool's machines; empty if none."""
 
     def credentials_end_at(self) -> float | None:
         """Return when the first credentials expire, in seconds since the epoch; None: unknown."""
 
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
-        """Return, in sentences, what may make launches fail until a time; None for no limit."""
+        """Return, in sentences, what may make launches fail before `until` (None: no limit)."""
 
     def exposures(
         self, clouds: Sequence[str], *, open_port: int | None, allow_from: Sequence[str] = ()
     ) -> Sequence[str]:
         """Return, in sentences, unneeded credentials and open ports of machines there.
 
-        `open_port`: the link's, None where replicas dial out. CloudError: it cannot be told now.
+        `open_port`: the link's port; None if replicas dial out. Raises CloudError: unknown now.
         """
 
     def unverified(self, cloud: str) -> str:
         """Return why a cloud's machines cannot be listed directly; empty when they can."""
 
     def stop(self, order: Launch) -> None:
-        """Stop a machine; return when it is listed as that. Raises `CloudError`: it may run on."""
+        """Stop a machine; return when it is listed as stopped. Raises `CloudError`: it may run."""
 
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
         """Write the build context of an image with a replica's environment into an empty folder.
 
-        `task` has absolute paths; `image` is the base. SpecError: an image cannot have that.
+        `task` has absolute paths; `image` is the base. SpecError: an image cannot hold part of it.
         """
 
 
@@ -128,8 +127,8 @@ class Audit:
     """The machines that exist, looked up without any cache."""
 
     machines: tuple[Machine, ...]  # in any phase, ordered by id
-    # Clouds (as in `Placement.cloud`) whose own list was read. Of all others it is what was
-    # remembered, or what somebody else says.
+    # Clouds (as in `Placement.cloud`) whose own list was read. Machines on all other clouds are
+    # listed from memory, or as a third party reports them.
     asked: frozenset[str]
 
 
@@ -138,7 +137,7 @@ class Auditing(Protocol):
     """A cloud that can list all machines that exist, even those fogft forgot."""
 
     def audit(self, pool_uid: str = "") -> Audit:
-        """List the machines of a pool, or all of this user's. CloudUnreachable: it cannot tell."""
+        """List the machines of a pool, or all of this user's. Raises CloudUnreachable: unknown."""
 
 
 @runtime_checkable

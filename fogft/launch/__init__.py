@@ -1,7 +1,7 @@
-"""Launch files with nodes in the cloud: `FogPool` and `CloudNode`, in Python, XML and YAML.
+"""Launch actions for nodes in the cloud: `FogPool` and `CloudNode`, in Python, XML and YAML.
 
-Needs ROS 2's `launch` and `launch_ros`, which are loaded when a name is first used.
-Not here: what starting and ending a pool means (`fogft.pool.commands`).
+Needs ROS 2's `launch` and `launch_ros`, which are imported when a name is first used.
+Not here: starting and ending a pool (`fogft.pool.commands`).
 """
 
 from typing import Any

@@ -1,7 +1,7 @@
 """The launch actions `fog_pool` and `cloud_node`, for ROS 2's launch files in any format.
 
-``cloud:=false`` on the command line of ``ros2 launch`` runs everything here; ``cloud:=NAME``
-picks a cloud.
+``cloud:=false`` on the command line of ``ros2 launch`` runs everything on this machine;
+``cloud:=NAME`` selects a cloud.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from fogft.launch.run_pool import READY
 from fogft.pool.folder.paths import home
 from fogft.pool.manager.configuration import absolute
 
-_END_LIMIT_S = 900  # how long launch waits for `fogft down` before it kills
-# What a node on another machine cannot do, and what to do instead.
+_END_LIMIT_S = 900  # how long launch waits for `fogft down` before it kills it
+# Arguments that do not work for a node on another machine, and what to do instead.
 _NOT_CARRIED = {
     "prefix": "a debugger or wrapper runs on the replica; put it into the pool file's `run`",
     "env": "a replica has its own environment; use `additional_env` to add to it",
@@ -53,9 +53,9 @@ _POOL_KEYS = (*_TEXTS, "replicas", "resources", "services", "fogft", "timeout")
 class CloudNode(Node):  # type: ignore[misc]
     """A node that runs on every replica of the fog pool that contains it.
 
-    Takes what `launch_ros.actions.Node` takes, or raises FogftError for what another machine
-    cannot do; `output` and `respawn` have no effect: replicas' logs are always shown, and their
-    nodes always restarted.
+    Takes the arguments of `launch_ros.actions.Node`, and raises FogftError for those that do not
+    work on another machine. `output` and `respawn` have no effect: replicas' logs are always shown
+    and their nodes always restarted.
     """
 
     def __init__(self, **arguments: Any) -> None:
@@ -67,7 +67,7 @@ class CloudNode(Node):  # type: ignore[misc]
         super().__init__(**arguments)
 
     def command(self, context: LaunchContext) -> NodeCommand:
-        """Return how the node is started, all substitutions made."""
+        """Return the command that starts the node, with all substitutions performed."""
         self._perform_substitutions(context)
         name, namespace = self.node_name.rpartition("/")[2], self.expanded_node_namespace
         specific = {"name": f"__node:={name}"} if "unspecified" not in name else {}
@@ -93,7 +93,7 @@ class CloudNode(Node):  # type: ignore[misc]
         )
 
     def execute(self, context: LaunchContext) -> Any:
-        """Run it on this machine, in a fog pool that stays here."""
+        """Run the node on this machine, if its pool does not go to the cloud (``cloud:=false``)."""
         if _cloud(context) != "false":
             raise FogftError(
                 "a cloud node is outside any fog pool", "put it into a `FogPool` (`fog_pool`)"
@@ -103,18 +103,18 @@ class CloudNode(Node):  # type: ignore[misc]
 
 @expose_action("fog_pool")
 class FogPool(Action):  # type: ignore[misc]
-    """A pool whose replicas run its cloud nodes; its other actions start when they answer.
+    """A pool whose replicas run its cloud nodes; its other actions start once these answer.
 
-    Texts may be substitutions; what is a list or a mapping may be given as YAML text.
+    Strings may be substitutions; lists and mappings may be given as YAML text.
 
     Args:
-        actions: Cloud nodes, and whatever starts here once their services answer.
+        actions: Cloud nodes, and actions that start on this machine once their services answer.
         file: A pool file without `run` that supplies the rest.
-        services: As in a pool file; without them, those that the nodes offer.
-        setup: Shell text that prepares a replica.
+        services: As in a pool file; default: those that the nodes offer.
+        setup: Shell commands that prepare a replica.
         workdir: A folder that is copied to the replicas.
         fogft: More keys of the pool file's `fogft` section.
-        cloud: Where; by default what `resources` name, else this machine.
+        cloud: The cloud to use; default: the one that `resources` names, else this machine.
         on_exit: ``leave`` the pool running when the launch ends, or take it ``down``.
         timeout: Seconds to wait for the services.
     """
@@ -126,7 +126,7 @@ class FogPool(Action):  # type: ignore[misc]
 
     @classmethod
     def parse(cls, entity: Entity, parser: Parser) -> tuple[type[FogPool], dict[str, Any]]:
-        """Read it from an XML or YAML launch file."""
+        """Parse the action from an XML or YAML launch file."""
         _, arguments = super().parse(entity, parser)
         for key in _POOL_KEYS:
             value = entity.get_attr(key, optional=True)
@@ -153,7 +153,7 @@ class FogPool(Action):  # type: ignore[misc]
         chosen = [n for n in nodes if n.condition is None or n.condition.evaluate(context)]
         tree = _tree(asked, [node.command(context) for node in chosen])
         cloud = asked["cloud"] if cloud in ("", "true") else cloud
-        scope = dict(context.launch_configurations)  # of the groups around it, which end before
+        scope = dict(context.launch_configurations)  # of enclosing groups, which end earlier
         enter = OpaqueFunction(function=lambda later: later.launch_configurations.update(scope))
         local = [PushLaunchConfigurations(), enter, *local, PopLaunchConfigurations()]
         return _running(_written(tree), tree["name"], asked, cloud, local)
@@ -184,7 +184,7 @@ def _written(tree: Mapping[str, Any]) -> Path:
 
 
 class _Blocks(yaml.SafeDumper):
-    """A dumper of our own: PyYAML's is shared with the rest of the launch."""
+    """A separate dumper, because PyYAML's is shared with the rest of the launch."""
 
     def represent_str(self, text: str) -> yaml.ScalarNode:
         style = "|" if "\n" in text else None
@@ -233,7 +233,7 @@ def _cloud(context: LaunchContext) -> str:
 
 
 def _evaluated(context: LaunchContext, value: Any) -> Any:
-    """Return a value with its substitutions made, and YAML text parsed."""
+    """Perform a value's substitutions, and parse YAML text."""
     if isinstance(value, (int, float, Mapping)):
         return value
     if isinstance(value, (list, tuple)) and any(isinstance(item, Mapping) for item in value):

@@ -13,7 +13,7 @@ FILE_LIMIT_BYTES = 256 << 10
 
 @dataclass(frozen=True)
 class NodeCommand:
-    """How a node is started, all substitutions made.
+    """The command that starts a node, with all substitutions performed.
 
     `package` is empty when `executable` is a path or a program's name; `files` holds the contents
     of parameter files, by the argument that names each.
@@ -27,10 +27,10 @@ class NodeCommand:
 
 
 def run_text(nodes: Sequence[NodeCommand]) -> str:
-    """Return the shell text that runs these nodes on a replica, for bash.
+    """Return the bash script that runs these nodes on a replica.
 
-    One node replaces the shell. Of several, the end of one ends all, so that they are
-    started again together.
+    A single node replaces the shell. With several nodes, the exit of one ends all, so that they
+    are restarted together.
     """
     if not nodes:
         raise FogftError("a fog pool contains no cloud node", "move a node into it as a cloud node")

@@ -1,7 +1,7 @@
 """``python -m fogft.launch.run_pool FILE``: the process that a launch file starts for a pool.
 
-Starts the pool, prints a line that the launch file waits for, then shows the replicas' logs. On a
-signal it ends, and with `--down` it ends the pool first.
+Starts the pool, prints a line that the launch file waits for, then shows the replicas' logs. Exits
+on a signal; with `--down` it shuts the pool down first.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from fogft.pool.folder.store import read_identity
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LOGS_AGAIN_S = 5
-READY = "fogft_pool_ready"  # a line of stdout, for the launch file
+READY = "fogft_pool_ready"  # a line on stdout for the launch file
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -43,14 +43,14 @@ def main(arguments: Sequence[str]) -> int:
         pass
     finally:
         for number in _ENDING:
-            signal.signal(number, signal.SIG_IGN)  # launch repeats itself; `down` takes its time
+            signal.signal(number, signal.SIG_IGN)  # launch resends it while `down` runs
         if asked.down and _is_ours(asked):
             status = _fogft("down", asked.pool, "--yes").wait()
     return status
 
 
 def _is_ours(asked: argparse.Namespace) -> bool:
-    """Whether the pool was started from this file: else its `up` was refused, and it goes on."""
+    """Whether the pool was started from this file. If not, `up` was refused: leave it running."""
     try:
         return read_identity(PoolPaths.of(asked.pool)).file == str(Path(asked.file).resolve())
     except StateError:
@@ -77,7 +77,7 @@ def _run(asked: argparse.Namespace) -> int:
 
 
 def _fogft(*words: str) -> subprocess.Popen[bytes]:
-    """Start a command in a session of its own: a terminal's Ctrl-C is ours to pass on."""
+    """Start a command in its own session, because we forward a terminal's Ctrl-C ourselves."""
     return subprocess.Popen(
         tied([sys.executable, "-m", "fogft", *words]),
         stdin=subprocess.DEVNULL,

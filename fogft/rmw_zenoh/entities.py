@@ -1,9 +1,9 @@
 """A service server and a client over `rmw_zenoh`: bytes in and out, no type loaded.
 
-Each has one thread that does what may block in Zenoh: asking, answering, declaring. Callbacks
-come from Zenoh's threads.
+Each has one thread for Zenoh calls that may block: querying, replying, declaring. Callbacks run
+on Zenoh's threads.
 
-Owns: queries under way, on either side. Not here: the session and the graph (`node`).
+Owns: queries in progress, on either side. Not here: the session and the graph (`node`).
 """
 
 import logging
@@ -26,7 +26,7 @@ from fogft.ros.pacing.pacer import NodeProbes, Pacer
 
 log = logging.getLogger(__name__)
 
-# `rmw_zenoh` waits for ever; nobody who asks here waits longer than a request may take.
+# `rmw_zenoh` waits forever; callers here wait no longer than a request may take.
 _TIMEOUT_S = 1e6
 _CLOSE_LIMIT_S = 10.0
 _CLIENTS_KEPT = 64
@@ -39,9 +39,9 @@ class _Handle(NamedTuple):
 
 
 class Server:
-    """A service that is offered (`fogft.ros.port.RosServer`).
+    """A service server (`fogft.ros.port.RosServer`).
 
-    It is offered under each hash that clients may have of its type: in `rmw_zenoh` the hash is
+    It is offered under each type hash that clients may have, because in `rmw_zenoh` the hash is
     part of the key.
     """
 
@@ -68,7 +68,7 @@ class Server:
         self._worker.add(partial(self._declare, hash))
 
     def move(self, hash: str) -> bool:
-        """Offer it under another hash, unless that may be the same; return whether it is moved."""
+        """Offer it under another hash, unless that may be the same; return whether it moves."""
         if all(naming.may_be_same(hash, known) for known in list(self._faces)):
             return False
         self._worker.add(self._undeclare)
@@ -90,25 +90,25 @@ class Server:
         token = self._token(hash)
         key = naming.service_key(token.domain, token.service, token.type, hash)
         heard = handlers.Callback(self._heard, indirect=False)
-        # `complete`: clients ask those that can answer for the whole key, and no others.
+        # `complete`: clients query only servers that can answer for the whole key.
         queryable = self._session.declare_queryable(key, heard, complete=True)
         self._faces[hash] = (queryable, self._session.liveliness().declare_token(str(token)))
 
     def _heard(self, query: Any) -> None:
         if not self.is_open or query.payload is None or query.attachment is None:
-            return  # dropped: who asks is told that no answer comes
+            return  # dropped: the client is told that no answer comes
         try:
             attachment = query.attachment.to_bytes()
             client, sent_ns = naming.sent_by(attachment)
             handle = _Handle(query, attachment, client)
-            # One that was sent before the last answer cannot follow from it: it is of a burst.
+            # A request sent before the last answer cannot be a reaction to it: it is in a burst.
             self._pacer.requested(handle, together=sent_ns < self._answered_ns.get(client, 0))
             self._on_request(query.payload.to_bytes(), handle)
         except Exception:
             log.exception("%s: a request was lost", self.name)
 
     def respond(self, handle: Any, payload: bytes) -> None:
-        """Send the serialised response. Nothing happens once the service is withdrawn."""
+        """Send the serialised response; does nothing once the service is withdrawn."""
         _check(self._fault(payload), payload)
         if self.is_open:
             self._pacer.respond(handle, payload)
@@ -133,7 +133,7 @@ class Server:
             query.drop()
 
     def close(self) -> None:
-        """Withdraw the service. Repeatable."""
+        """Withdraw the service. Idempotent."""
         if self.is_open:
             self.is_open = False
             self._pacer.close()
@@ -169,7 +169,7 @@ class Client:
         self._waiting: dict[int, _Waiting] = {}
         self._asked = 0
         self._counters = Counters()
-        self.is_open = True  # whether it may still be called with
+        self.is_open = True  # whether calls are accepted
         self._lock = threading.Lock()
         self._worker = _worker(self._name, self._counters)
 
@@ -178,15 +178,15 @@ class Client:
         return self.servers() > 0
 
     def is_known(self) -> bool:
-        """Return True: a reply goes where its query came from."""
+        """Return True: a reply always goes back to where its query came from."""
         return True
 
     def mismatch(self) -> str:
-        """Return nothing: only nodes of one middleware are in Zenoh's graph."""
+        """Return an empty string: Zenoh's graph has nodes of one middleware only."""
         return ""
 
     def servers(self) -> int:
-        """Count the nodes that offer it."""
+        """Count the nodes that offer the service."""
         return len(self._hashes()) if self.is_open else 0
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
@@ -217,14 +217,14 @@ class Client:
             attachment=naming.request_attachment(ticket, time.time_ns(), token.gid),
             encoding=zenoh.Encoding.APPLICATION_CDR,
             target=zenoh.QueryTarget.ALL_COMPLETE,
-            # NONE: under the default Zenoh keeps the first reply back until the last one.
+            # NONE: by default Zenoh holds back the first reply until the last one.
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=_TIMEOUT_S,
             cancellation_token=waiting.cancellation,
         )  # fmt: skip
 
     def _tell(self, hash: str) -> naming.Token:
-        """Be seen in the graph, with the type as the server has it."""
+        """Declare this client in the graph, with the server's type hash."""
         if self._told is not None and self._told[0].hash == hash:
             return self._told[0]
         token = self._token(hash)
@@ -255,7 +255,7 @@ class Client:
             self._worker.add(waiting.cancellation.cancel)
 
     def close(self) -> None:
-        """Withdraw the client. Repeatable."""
+        """Withdraw the client. Idempotent."""
         with self._lock:
             if not self.is_open:
                 return

@@ -1,10 +1,10 @@
 """`rmw_zenoh`'s key expressions, liveliness tokens and attachments. Pure.
 
-A service is a queryable at ``domain/name/type/hash``. Who offers and who calls is told by
-liveliness tokens ``@ros2_lv/domain/session/node/entity/kind/enclave/namespace/node name``, and
-for all but nodes ``/name/type/hash/QoS``, with ``%`` for each slash within a part. With a
-request and its response go the client's sequence number, the time of sending and the client's
-identifier (GID), by which the client knows its own response.
+A service is a queryable at ``domain/name/type/hash``. Servers and clients are announced by
+liveliness tokens ``@ros2_lv/domain/session/node/entity/kind/enclave/namespace/node name``, plus
+``/name/type/hash/QoS`` for all but nodes, with ``%`` for each slash within a part. A request and
+its response carry the client's sequence number, the time of sending and the client's identifier
+(GID), by which the client recognises its own response.
 
 Source: the design document and `attachment_helpers.cpp` of ros2/rmw_zenoh.
 """
@@ -24,7 +24,7 @@ NO_HASH = "TypeHashNotSupported"  # what a distribution without type hashes (Hum
 _NODE_PARTS, _SERVICE_PARTS = 9, 13
 _GID_BYTES = 16
 _STAMP = slice(8, 16)  # of the attachment: between sequence number and GID
-_ATTACHMENT_BYTES = (32, 33)  # without, and with, a byte that says how long the GID is
+_ATTACHMENT_BYTES = (32, 33)  # without and with a byte for the GID's length
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Token:
     kind: str  # `NODE`, `SERVER` or `CLIENT`
     node: str
     namespace: str = "/"
-    service: str = ""  # this and what follows: empty for a node
+    service: str = ""  # this and the following fields: empty for a node
     type: str = ""  # ``package/srv/Name``
     hash: str = ""
     quality: str = KEEP_ALL  # as `rmw_zenoh` writes it
@@ -52,7 +52,7 @@ class Token:
 
     @property
     def gid(self) -> bytes:
-        """16 bytes that no other entity has. `rmw_zenoh` hashes otherwise, and never compares."""
+        """16 unique bytes. `rmw_zenoh` computes other ones, but never compares them."""
         return hashlib.md5(str(self).encode(), usedforsecurity=False).digest()
 
 
@@ -88,7 +88,7 @@ def dds_type(type_name: str) -> str:
 
 
 def ros_type(dds_name: str) -> str:
-    """Return ``package/srv/Name`` for ``package::srv::dds_::Name_``; empty where it is none."""
+    """Return ``package/srv/Name`` for ``package::srv::dds_::Name_``; empty for other names."""
     parts = dds_name.split("::")
     if len(parts) != 4 or parts[2] != "dds_" or not parts[3].endswith("_"):
         return ""
@@ -96,14 +96,14 @@ def ros_type(dds_name: str) -> str:
 
 
 def request_attachment(sequence: int, sent_ns: int, gid: bytes) -> bytes:
-    """Return the attachment of a client's n-th request, with its time in ns since 1970."""
+    """Return a request's attachment: sequence number, time of sending (ns since 1970), GID."""
     return struct.pack("<qqB", sequence, sent_ns, _GID_BYTES) + gid
 
 
 def response_attachment(of_request: bytes, sent_ns: int) -> bytes:
     """Return the attachment of a response: the request's number and GID, with a new time.
 
-    A form that is not known goes back as it came, so that the client finds its number in it.
+    An unknown form is returned unchanged, so that the client finds its number in it.
     """
     if len(of_request) not in _ATTACHMENT_BYTES:
         return of_request
@@ -112,14 +112,14 @@ def response_attachment(of_request: bytes, sent_ns: int) -> bytes:
 
 
 def sent_by(of_request: bytes) -> tuple[bytes, int]:
-    """Return who sent a request (GID) and when (ns since 1970); nothing and 0 if not known."""
+    """Return who sent a request (GID) and when (ns since 1970); empty and 0 if unknown."""
     if len(of_request) not in _ATTACHMENT_BYTES:
         return b"", 0
     return of_request[-_GID_BYTES:], struct.unpack("<q", of_request[_STAMP])[0]
 
 
 def may_be_same(one: str, other: str) -> bool:
-    """Whether two hashes may be of one definition: equal, or not comparable."""
+    """Whether two hashes may be of the same definition: equal, or not comparable."""
     return one == other or one.partition("_")[0] != other.partition("_")[0]
 
 
@@ -158,9 +158,9 @@ class Graph:
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
         """Return the full name of the service `what` of the node that calls a service.
 
-        None while no client is discovered, empty where it has none, and where the clients are of
-        several nodes: `client` (a GID) does not tell which, it is a hash of the token in a way of
-        `rmw_zenoh`'s own.
+        None while no client is discovered. Empty if its node has no such service, or if clients
+        are on several nodes: `client` (a GID) does not tell which, because `rmw_zenoh` hashes the
+        token in its own way.
         """
         tokens = self._all()
         nodes = {(t.node, t.namespace) for t in tokens if (t.kind, t.service) == (CLIENT, service)}

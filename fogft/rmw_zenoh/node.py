@@ -1,8 +1,8 @@
-"""A ROS node that speaks `rmw_zenoh` with no ROS installed (`fogft.ros.port.RosNode`).
+"""A ROS node that speaks `rmw_zenoh` without a ROS installation (`fogft.ros.port.RosNode`).
 
-Its session is configured as theirs are: a peer that finds the others by the router of its machine.
-``ZENOH_SESSION_CONFIG_URI`` (a file) takes the place of all settings, ``ZENOH_CONFIG_OVERRIDE``
-(``key=value;key=value``) of some. Design: docs/design/serialised-services.md.
+Its session is configured like those of other nodes: a peer that finds others through its machine's
+router. ``ZENOH_SESSION_CONFIG_URI`` (a file) replaces all settings, ``ZENOH_CONFIG_OVERRIDE``
+(``key=value;key=value``) some of them. Design: docs/design/serialised-services.md.
 """
 
 import functools
@@ -35,11 +35,11 @@ FaultOf = Callable[[str, str], Callable[[bytes], str]]
 class RmwZenohNode:
     """Serialised services and clients among the `rmw_zenoh` nodes of one ROS domain.
 
-    Without a `domain_id` it is ``ROS_DOMAIN_ID``, else 0. `hashes_of` returns the hashes of a
-    service type that are told elsewhere, each as often as somebody tells it: the one told most
-    counts, of equal ones that which a client has. `fault_of` returns what says why bytes are no
-    request, or response, of a type; no others are passed on. Zenoh's thread calls `noticed`, which
-    must not block, when a client has come. Raises RosError: the variables cannot be followed.
+    `domain_id` defaults to ``ROS_DOMAIN_ID``, else 0. `hashes_of` returns the hashes of a service
+    type that others report, once for each report: the most reported one is used, on a tie one that
+    a client has. `fault_of` returns a function that says why bytes are not a request, or response,
+    of a type; such bytes are not passed on. Zenoh's thread calls `noticed`, which must not block,
+    when a client appears. Raises RosError: the environment variables are unusable.
     """
 
     def __init__(
@@ -106,7 +106,7 @@ class RmwZenohNode:
         on_request: Callable[[bytes, Any], None],
         on_burst: Callable[[bool], None] | None = None,
     ) -> Server:
-        """Offer a service. A first request may come before this returns.
+        """Offer a service. The first request may arrive before this returns.
 
         Raises RosError: The type's hash is not known yet, or the node is closed.
         """
@@ -128,7 +128,7 @@ class RmwZenohNode:
         return server
 
     def _hash(self, name: str, type_name: str) -> str:
-        """Return the hash to offer a service under; empty where nobody has told any."""
+        """Return the hash to offer a service under; empty if none has been reported."""
         clients = self.graph.hashes(CLIENT, name, type_name)
         told = self._hashes_of(type_name) or clients
         return max(told, key=lambda one: (told.count(one), one in clients), default="")
@@ -147,7 +147,7 @@ class RmwZenohNode:
         return made
 
     def look(self) -> None:
-        """Offer services under the hash that most tell by now: who was first may have lied."""
+        """Offer services under the hash that most now report: the first report may be wrong."""
         now = time.monotonic()
         if now < self._look_at:
             return
@@ -175,7 +175,7 @@ class RmwZenohNode:
             return made
 
     def close(self) -> None:
-        """Close all services and clients, and the session. Repeatable."""
+        """Close all services and clients, and the session. Idempotent."""
         with self._lock:
             if not self._open:
                 return
@@ -198,7 +198,7 @@ ROUTER = "tcp/localhost:7447"
 SETTINGS: dict[str, Any] = {
     "mode": "peer",
     "connect/endpoints": [ROUTER],
-    "connect/timeout_ms": -1,  # a router that starts later is found then
+    "connect/timeout_ms": -1,  # keep trying: the router may start later
     "connect/exit_on_failure": False,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
     "listen/endpoints": ["tcp/localhost:0"],
@@ -216,13 +216,13 @@ SETTINGS: dict[str, Any] = {
 
 
 def settings_from(environ: Mapping[str, str]) -> zenoh.Config:
-    """Return an environment's Zenoh configuration. Raises RosError: a variable gives none."""
+    """Return an environment's Zenoh configuration. Raises RosError: a variable is unusable."""
     path = environ.get(FILE)
     try:
         made = zenoh.Config.from_file(path) if path else settings.to_zenoh(SETTINGS)
     except Exception as error:
         raise RosError(f"`{FILE}={path}` cannot be used: {error}") from error
-    settings.to_zenoh({})  # the runtime's own wish, whoever configures the session
+    settings.to_zenoh({})  # sets up Zenoh's threads, whoever configures the session
     for pair in filter(str.strip, environ.get(OVERRIDE, "").split(";")):
         key, _, value = map(str.strip, pair.partition("="))
         try:

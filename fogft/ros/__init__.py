@@ -1,4 +1,4 @@
 """ROS 2 through rclpy: serialised services, clients and topics of any type.
 
-Not here: what becomes of a request (`fogft.proxy`).
+Not here: handling requests (`fogft.proxy`).
 """

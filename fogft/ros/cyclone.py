@@ -1,9 +1,9 @@
-"""Which request CycloneDDS received, and who sent it.
+"""Identify a request that CycloneDDS received, and its sender.
 
-A request's header holds two numbers there: the client's own, and one by which this process alone
-knows the writer of its requests. Only CycloneDDS can tell whose it is.
+Under CycloneDDS a request's header holds two numbers: the client's own, and one that only this
+process uses for the writer of its requests. Only CycloneDDS can resolve the latter.
 
-Owns: what that header means. Not here: which node a writer belongs to (`node`).
+Owns: the meaning of that header. Not here: which node a writer belongs to (`node`).
 """
 
 import os
@@ -18,7 +18,7 @@ MIDDLEWARE = "rmw_cyclonedds_cpp"
 LIBRARY = "libddsc.so.0"  # of CycloneDDS 0.x, which every ROS distribution up to Kilted has
 _IDENTIFIER_BYTES = 16
 _OF_THIS_PROCESS = slice(8, 16)  # of a request's handle
-_MOST = 1024  # children of one entity that are looked at
+_MOST = 1024  # the maximum number of children read per entity
 _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "dds_lookup_participant": (c_int32, (c_uint32, c_void_p, c_size_t)),
     "dds_get_children": (c_int32, (c_int32, c_void_p, c_size_t)),
@@ -29,7 +29,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 @lru_cache(maxsize=1)
 def loaded_library() -> Any:
-    """Return the library that this process has loaded; None if it has none, or another one."""
+    """Return the CycloneDDS library if this process has loaded it in this version, else None."""
     try:
         return declared(CDLL(LIBRARY, mode=os.RTLD_NOLOAD | os.RTLD_NOW), _SIGNATURES)
     except (OSError, AttributeError):
@@ -37,12 +37,12 @@ def loaded_library() -> Any:
 
 
 def identity(handle: bytes) -> bytes:
-    """Return what of a request's handle is the same in each process that received it."""
+    """Return the part of a request's handle that is the same in each process that received it."""
     return handle[: _OF_THIS_PROCESS.start] + handle[_OF_THIS_PROCESS.stop :]
 
 
 def writer_of(client: bytes, domain_id: int) -> bytes:
-    """Return the identifier of the writer of a client's requests; empty if it is not known.
+    """Return the GID of the writer of a client's requests; empty if unknown.
 
     `client` is the first 16 bytes of the handle of a request that came in that ROS domain.
     """
@@ -53,7 +53,7 @@ def writer_of(client: bytes, domain_id: int) -> bytes:
     for participant in _entities(library.dds_lookup_participant, domain_id):
         for subscriber in _entities(library.dds_get_children, participant):
             for reader in _entities(library.dds_get_children, subscriber):
-                # NULL for what is no reader, and for one of another topic.
+                # NULL if it is not a reader, or reads another topic.
                 found = library.dds_get_matched_publication_data(reader, number)
                 if found:
                     try:

@@ -1,8 +1,8 @@
-"""The services and clients of a node, and which thread may call what.
+"""The services and clients of a node, and their threading rules.
 
-A take loop calls `drain` and `destroy`; everything else may come from any thread. Each
-entity has one lock: over *send and insert*, so that a response never comes before its
-request is known, and over the C message that sending uses.
+The take loop calls `drain` and `destroy`; any thread may call everything else. Each entity has
+one lock: for *send and insert*, so that no response arrives before its request is registered,
+and for the C message that sending uses.
 
 Owns: pending requests, the order of sending and closing.
 Not here: the loop (`node`), bytes (`serialised`).
@@ -52,7 +52,7 @@ class Server:
         self._in_bursts = False  # several came together the last time
         self._lock = threading.Lock()
         self._pacer = Pacer(self._send, self.probes, self.service.service_name)
-        self.respond = self._pacer.respond  # in a burst, paced to the client
+        self.respond = self._pacer.respond  # paces bursts to the client
 
     def _send(self, handle: Any, payload: bytes) -> None:
         with self._lock:
@@ -60,16 +60,16 @@ class Server:
                 self._end.respond(handle, payload)
 
     def close(self) -> None:
-        """Withdraw the service; repeatable. On return it is gone, unless the take loop called."""
+        """Withdraw the service; idempotent. On return it is gone, unless the take loop called."""
         self.withdraw(self)
 
     def drain(self) -> None:
         """Deliver received messages. Take loop only.
 
-        Where requests came one at a time lately, the first does not wait until ROS was asked for
-        another one: it takes no part in a burst that begins with it.
+        If requests came one at a time lately, the first is delivered before ROS is asked for
+        another: it is not part of a burst that begins with it.
         """
-        together = not self._in_bursts  # the second that is taken comes right after the first
+        together = not self._in_bursts  # `taken` below then comes right after the first
         taken = self._next()
         if taken is not None and not self._in_bursts:
             self._deliver(taken)
@@ -114,7 +114,7 @@ class Server:
             log.exception("%s: the end of a burst was not taken", self.service.srv_name)
 
     def destroy(self, node: Any) -> None:
-        """Free everything. Take loop only, once, when no wait set holds the handle."""
+        """Free all resources. Take loop only, once, when no wait set holds the handle."""
         self._pacer.close()
         with self._lock:
             end, self._end = self._end, None
@@ -125,15 +125,15 @@ class Server:
 
 @dataclass(eq=False)
 class ReadinessProbe:
-    """Whether the server of a service has discovered a client; if not, rmw drops its responses.
+    """Tests whether a service's server has discovered a client; until then rmw drops responses.
 
-    A process tells of its readers in the order of their making. So the server's node answers a
-    client that was made later only if it knows of the earlier one, too.
+    A process announces its readers in order of creation. So the server's node answers a client
+    that was created later only if it knows the earlier one, too.
 
     Args:
         find: Returns the name of a service of that node that changes nothing and takes an empty
-            list: None while it is not discovered, empty where there is none to ask.
-        make: Creates a client of it.
+            list; None while it is not discovered, empty if there is none.
+        make: Creates a client of that service.
     """
 
     find: Callable[[], str | None]
@@ -146,9 +146,9 @@ class ReadinessProbe:
         self._client: RosClient | None = None
 
     def passed(self, servers: int) -> bool:
-        """Return whether it has, or cannot be known; `servers` are listed. Call at about 10 Hz."""
+        """Return whether it has, or that cannot be told; `servers`: their count. About 10 Hz."""
         now = self.clock()
-        if servers > self._servers:  # one more than before is another one
+        if servers > self._servers:  # a new one has been discovered
             self._passed, self._ask_at, self._ends_at = False, now, now + _ASK_LIMIT_S
         self._servers = servers
         if not self._passed and now >= self._ask_at:
@@ -190,7 +190,7 @@ class Client:
         self.handle = client.handle
         self._probe = probe
         self._mismatch = mismatch
-        self._trouble: tuple[int, str] = 0, ""  # with so many servers
+        self._trouble: tuple[int, str] = 0, ""  # with this number of servers
         self._count = count
         self._client = client
         self._end: ClientEnd | None = end
@@ -207,7 +207,7 @@ class Client:
         return False
 
     def is_known(self) -> bool:
-        """Return whether the server has discovered this client, if that can be known."""
+        """Return whether the server has discovered this client, or that cannot be determined."""
         with contextlib.suppress(RosError):  # it is closed, or cannot be asked now
             return self._probe is None or self._probe.passed(self.servers())
         return False
@@ -232,7 +232,7 @@ class Client:
                 raise RosError(f"the client of `{self._client.srv_name}` is closed")
             ticket = self._end.send(payload)
             self._pending[ticket] = on_response
-            if len(self._pending) > _PENDING_LIMIT:  # who never answers must not fill the memory
+            if len(self._pending) > _PENDING_LIMIT:  # silent servers must not fill the memory
                 del self._pending[next(iter(self._pending))]
         return ticket
 
@@ -242,7 +242,7 @@ class Client:
             self._pending.pop(ticket, None)
 
     def close(self) -> None:
-        """Withdraw the client; repeatable. On return it is gone, unless the take loop called."""
+        """Withdraw the client; idempotent. On return it is gone, unless the take loop called."""
         self._withdraw(self)
 
     def drain(self) -> None:
@@ -268,7 +268,7 @@ class Client:
                 log.exception("%s: a response was lost", self._client.srv_name)
 
     def destroy(self, node: Any) -> None:
-        """Free everything. Take loop only, once, when no wait set holds the handle."""
+        """Free all resources. Take loop only, once, when no wait set holds the handle."""
         with self._lock:
             end, self._end = self._end, None
             self._pending.clear()

@@ -1,11 +1,11 @@
-"""The environment variables of ROS 2 processes, and the current ones.
+"""Environment variables for ROS 2 processes, and what the current environment contains.
 
-`prepare` must run before the first node is made, best before rclpy is imported.
-Settings of the user are never overridden; ``ROS_DOMAIN_ID``, ``ROS_LOCALHOST_ONLY`` and
+`prepare` must run before the first node is created, ideally before rclpy is imported.
+User settings are never overridden; ``ROS_DOMAIN_ID``, ``ROS_LOCALHOST_ONLY`` and
 ``ROS_AUTOMATIC_DISCOVERY_RANGE`` are left to ROS itself.
 
-Owns: the shared-memory profile's place, variables of ROS and of its Python wheels.
-Not here: judging what is found (`fogft doctor`).
+Owns: the shared-memory profile's location, variables of ROS and of its Python wheels.
+Not here: judging the findings (`fogft doctor`).
 """
 
 import contextlib
@@ -25,16 +25,16 @@ _PROFILE_VARIABLES = {
     "libfastrtps.so": "FASTRTPS_DEFAULT_PROFILES_FILE",
 }
 _CHOSEN_BY_USER = (*_PROFILE_VARIABLES.values(), "FASTDDS_BUILTIN_TRANSPORTS")
-# A segment as small as Fast DDS's own default means that no profile is in force.
+# A smaller segment, such as Fast DDS's own default, means that no profile is in force.
 PROFILE_SEGMENT_BYTES = 32_000_000
 _SEGMENT = re.compile(r"/dev/shm/fast(?:dds|rtps)_[0-9a-f]+\b")
 # Each participant takes 35 MB for its segment: room for the two ends of a call, twice.
 _ROOM_NEEDED_BYTES = 140_000_000
-# Fast DDS reads these from the working folder where no variable names a file.
+# Fast DDS reads these from the working folder if no variable names a file.
 _LOCAL_PROFILES = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
 
-# The wheels' start-up hook runs Python again with another LD_LIBRARY_PATH, once: this
-# variable, inherited by a child in another environment, would keep its hook from running.
+# The wheels' start-up hook re-executes Python once with another LD_LIBRARY_PATH and sets this
+# variable. Inherited by a child in another environment, it would keep that one's hook from running.
 _WHEELS_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 
 _DISTRIBUTIONS = {"3.3": "humble", "7.1": "jazzy", "9.1": "kilted"}  # by rclpy's version
@@ -48,8 +48,8 @@ def profile_path() -> Path:
 def profile_variable(environ: Mapping[str, str] = os.environ) -> str:
     """Return the variable from which the Fast DDS that will be loaded reads its profile.
 
-    Looks at which library lies in the ROS installation that is sourced, else beside this Python;
-    rclpy need not be imported. Where there is none, the variable of the newest Fast DDS.
+    Checks which library is in the sourced ROS installation, else beside this Python, without
+    importing rclpy. If there is none, returns the variable of the newest Fast DDS.
     """
     prefixes = [p for p in environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
     for prefix in (*prefixes, sys.prefix):
@@ -74,8 +74,8 @@ def largest_segment_bytes() -> int:
 def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
     """Set the shared-memory profile unless the user has set one; return whether it did.
 
-    It does not where /dev/shm is small, as containers have it by default (64 MB): Fast DDS
-    would report errors and fall back to UDP.
+    It does not if /dev/shm is small, as in containers by default (64 MB): Fast DDS would
+    report errors and fall back to UDP.
 
     Raises RosError: The installation is incomplete.
     """
@@ -91,9 +91,9 @@ def prepare(environ: MutableMapping[str, str] = os.environ) -> bool:
 def child_environment(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
     """Return the environment for a user's command, in any Python installation.
 
-    Undoes what the ROS wheels' start-up hook did for this process: a child in the same
-    virtual environment does it again for itself, and any other child must not find our
-    libraries before its own.
+    Undoes what the ROS wheels' start-up hook did for this process: the hook of a child in the
+    same virtual environment does it again, and any other child must not find our libraries
+    before its own.
     """
     child = dict(environ)
     if child.pop(_WHEELS_GUARD, None) is None:
@@ -143,7 +143,7 @@ def _shared_memory_free_bytes() -> int:
 def _rclpy_version(place: Path) -> str:
     from importlib import metadata  # late: it loads Python's email package
 
-    for name in ("ros-rclpy", "rclpy"):  # a wheel has rclpy's own record too, of another version
+    for name in ("ros-rclpy", "rclpy"):  # a wheel also has rclpy's own record, of another version
         for distribution in metadata.distributions(name=name, path=[str(place.parent)]):
             return distribution.version
     return "unknown"

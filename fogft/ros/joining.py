@@ -1,7 +1,7 @@
 """Join a ROS domain: a context, optionally with a DDS participant before any visible node.
 
-A participant that is known already has its services found within milliseconds, a new one in half a
-second. Owns: contexts. Not here: the node of a proxy (`node`).
+Others discover the services of a participant that they know within milliseconds, those of a new one
+in half a second. Owns: contexts. Not here: the node of a proxy (`node`).
 """
 
 import logging
@@ -16,14 +16,14 @@ from fogft.ros.shared_memory import break_dead_ports, make_private
 log = logging.getLogger(__name__)
 
 _SET_BACK_S = 0.5
-_FORGOTTEN_AFTER_S = 15.0  # of the 20 s that Fast DDS waits for a sign of life, sent every 3 s
-# A process that proxies must not leave files in ~/.ros/log; it has a log of its own, on standard
-# error. What goes through rclpy's loggers goes to /rosout only, or each line would be there twice.
+_FORGOTTEN_AFTER_S = 15.0  # of the 20 s lease of Fast DDS, renewed every 3 s
+# A proxy must not leave files in ~/.ros/log; it writes its own log to standard error. rclpy's
+# loggers write to /rosout only, or each line would appear twice.
 _ROS_ARGUMENTS = ["--ros-args", "--disable-external-lib-logs", "--disable-stdout-logs"]
 
 
 def new_context(domain_id: int | None) -> Any:
-    """Return a new rclpy context; its first node joins. Raises rclpy's errors, and ImportError."""
+    """Return a new rclpy context; its first node joins. Raises rclpy's errors or ImportError."""
     import rclpy
     from rclpy.context import Context
     from rclpy.signals import SignalHandlerOptions
@@ -59,9 +59,9 @@ def bare_node(name: str, context: Any) -> Any:
 class Timers:
     """Keeps Fast DDS's timers going when the system clock is set back.
 
-    Built for glibc before 2.30, as ROS's wheels are, Fast DDS waits by the system clock: set back
-    by an hour, its timers stand still for an hour. It sends no sign of life, and others forget it
-    after 20 s. A new entity wakes them.
+    If built for glibc before 2.30, as in ROS's wheels, Fast DDS waits by the system clock: when the
+    clock is set back by an hour, its timers stand still for an hour. It does not renew its lease,
+    and others forget it after 20 s. Creating an entity wakes the timers.
     """
 
     def __init__(self) -> None:
@@ -80,11 +80,11 @@ class Timers:
 
 
 class Pauses:
-    """Notices that this process was stopped for so long that others may have forgotten it.
+    """Detects that this process was stopped for so long that others may have forgotten it.
 
-    Fast DDS forgets those of whom it has not heard for 20 s, each side by itself. Afterwards one
-    may go on as before with another that has forgotten it, and neither ever hears the other again.
-    A new participant is found by all.
+    Fast DDS forgets a participant that it has not heard from for 20 s, each side on its own. If
+    only one of two sides has forgotten the other, neither ever hears the other again. All discover
+    a new participant.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -92,7 +92,7 @@ class Pauses:
         self._at = clock()
 
     def was_long(self) -> bool:
-        """Whether it was stopped since the last call. Call it every second or more often."""
+        """Whether it was stopped since the last call. Call it at least once a second."""
         before, self._at = self._at, self._clock()
         paused_s = self._at - before
         if paused_s <= _FORGOTTEN_AFTER_S:
@@ -104,8 +104,8 @@ class Pauses:
 class EarlyJoin:
     """A participant that others discover before it offers anything.
 
-    The participant comes with a context's first node. Its node offers nothing, and ROS's tools hide
-    it if its name begins with an underscore. `introduction` is what introduces it: to end that soon
+    A context's first node creates the participant. That node offers nothing, and ROS tools hide it
+    if its name begins with an underscore. `introduction` introduces it to others: ending that early
     would cost whole seconds.
 
     Raises RosError: ROS 2 is not usable here.
@@ -121,14 +121,14 @@ class EarlyJoin:
         self._timers = Timers()
 
     def look(self) -> None:
-        """Keep the participant known to others. Call it every second or more often."""
+        """Keep the participant discoverable. Call it at least once a second."""
         self._timers.look(self._node)
 
     def end_node(self) -> None:
-        """End the hidden node: another node uses the participant, and is known to those that run.
+        """End the hidden node, once others know the node that now uses the participant.
 
-        Not earlier: where an endpoint ends while others are still told of it, Fast DDS tells them
-        nothing more for a second.
+        Not earlier: if an endpoint ends while others are still being told of it, Fast DDS tells
+        them nothing more for a second.
         """
         self._node.destroy_node()
 

@@ -1,8 +1,8 @@
 """Keep glibc from returning large message buffers to the system after each message.
 
-A 0.9 MB buffer lies above malloc's threshold for mapping memory of its own; taking and
-dropping one costs hundreds of page faults: 0.75 ms against 0.05 ms when it is kept. So it
-is kept, and given back now and then (`Trimmer`), or one burst would hold its memory for ever.
+A 0.9 MB buffer is above malloc's mmap threshold; allocating and freeing one costs hundreds of
+page faults: 0.75 ms, against 0.05 ms if its memory is kept. So it is kept, and returned now and
+then (`Trimmer`), or the memory of one burst would be held forever.
 """
 
 import ctypes
@@ -14,7 +14,7 @@ from pathlib import Path
 _OPTIONS = (
     (-3, 64 << 20),  # M_MMAP_THRESHOLD, bytes
     (-1, 512 << 20),  # M_TRIM_THRESHOLD, bytes
-    (-8, 2),  # M_ARENA_MAX: each thread would have its own, and each keep what its own burst took
+    (-8, 2),  # M_ARENA_MAX: else each thread has an arena, which keeps the memory of its bursts
 )
 
 
@@ -28,7 +28,7 @@ def own_bytes() -> int:
     """Return this process's anonymous memory (RssAnon) in bytes; 0 if unknown."""
     try:
         found = re.search(r"RssAnon:\s+(\d+) kB", Path("/proc/self/status").read_text())
-    except OSError:  # there is no descriptor left
+    except OSError:  # no file descriptor is left
         return 0
     return int(found[1]) * 1024 if found else 0
 
@@ -41,7 +41,7 @@ def give_back() -> None:
 
 
 class Trimmer:
-    """Returns memory to the system from time to time if this process holds far too much."""
+    """Returns memory to the system every `every_s` if this process holds over `above_bytes`."""
 
     above_bytes = 64 << 20
     every_s = 5.0
@@ -51,7 +51,7 @@ class Trimmer:
         self._looked_at = clock()
 
     def look(self) -> None:
-        """Return memory to the system if it is time and there is much."""
+        """Return memory to the system if that is due and the process holds too much."""
         now = self._clock()
         if now - self._looked_at >= self.every_s:
             self._looked_at = now

@@ -1,10 +1,10 @@
-"""Convert Python messages to and from bytes, which are checked first.
+"""Convert Python messages to and from bytes, which are validated first.
 
-CycloneDDS ends the process over a message of fewer than four bytes, and takes some that Fast DDS
-refuses. So bytes are walked along their type first (`fogft.model.cdr`).
+CycloneDDS aborts the process on a message of fewer than four bytes, and accepts some that Fast DDS
+rejects. So bytes are first validated against their type (`fogft.model.cdr`).
 
-Owns: rclpy's two functions, default responses, boolean fields, comparing responses, one status list
-of an action out of its replicas'. Not here: C messages (`serialised`), votes
+Owns: rclpy's two functions, default responses, boolean fields, comparing responses, merging the
+replicas' status lists of an action. Not here: C messages (`serialised`), votes
 (`fogft.requests.votes`), which status counts (`fogft.topics.goals`).
 """
 
@@ -51,8 +51,8 @@ def default_response(name: str) -> bytes:
 def bool_field(name: str, field: str) -> Callable[[bytes], bool]:
     """Return a function that reads a boolean field of a serialised response.
 
-    The function raises Unreadable for bytes that are no such response. Where only numbers
-    stand before the field, it looks at one byte; else it deserialises the response.
+    The function raises Unreadable for bytes that are not such a response. If only numbers
+    precede the field, it reads one byte; else it deserialises the response.
 
     Raises RosError: The type cannot be loaded, or its response has no such boolean field.
     """
@@ -81,7 +81,7 @@ def bool_field(name: str, field: str) -> Callable[[bytes], bool]:
 
 
 def fixed_offset(fields: dict[str, str], field: str) -> int | None:
-    """Return where a field lies in every serialised message; None if that varies."""
+    """Return a field's byte offset in every serialised message; None if it varies."""
     offset = 0
     for name, kind in fields.items():
         size = NUMBER_BYTES.get(kind)
@@ -95,9 +95,9 @@ def fixed_offset(fields: dict[str, str], field: str) -> int | None:
 
 
 def merged_status(said: Mapping[int, bytes]) -> bytes | None:
-    """Return one `action_msgs/msg/GoalStatusArray` (CDR) from the replicas' last ones.
+    """Merge the replicas' last `action_msgs/msg/GoalStatusArray` messages (CDR) into one.
 
-    None where a list cannot be read; what cannot be read comes from no action server.
+    None if a list cannot be read: it does not come from an action server.
     """
     from action_msgs.msg import GoalStatusArray
 
@@ -119,11 +119,11 @@ def merged_status(said: Mapping[int, bytes]) -> bytes | None:
 
 
 class Comparison:
-    """Compares responses of a service type field by field: padding between them is anything.
+    """Compares responses of a service type field by field, as padding between fields is arbitrary.
 
     Args:
-        tolerances: Path of a float field -> how far two values may be apart. A path leads
-            through lists as through their elements. All else must be equal.
+        tolerances: Path of a float field -> the maximum difference of two values. A path passes
+            through lists to their elements. All other fields must be equal.
 
     Raises:
         RosError: The type cannot be loaded, or has no such float field.
@@ -136,11 +136,11 @@ class Comparison:
             _check_float(self._response, type_name, path)
 
     def read(self, payload: bytes) -> tuple[bytes, Any]:
-        """Return the message, with its bytes. Raises Unreadable."""
+        """Return the bytes and the message that they hold. Raises Unreadable."""
         return payload, from_bytes(payload, self._response)
 
     def agree(self, one: tuple[bytes, Any], other: tuple[bytes, Any]) -> bool:
-        """Whether two messages that were read are the same within the tolerances.
+        """Whether two messages returned by `read` are equal within the tolerances.
 
         NaN agrees with NaN.
         """
@@ -161,7 +161,7 @@ class Comparison:
         return len(one) == len(other) and self._same_elements(one, other, path)
 
     def _same_elements(self, one: Any, other: Any, path: str) -> bool:
-        if hasattr(one, "tobytes"):  # numbers, side by side: usually there is no difference at all
+        if hasattr(one, "tobytes"):  # an array of numbers: usually identical
             if one.tobytes() == other.tobytes():
                 return True
             kind = getattr(one, "typecode", None) or one.dtype.kind

@@ -1,9 +1,9 @@
 """The proxy's ROS node: one context, one thread, one wait set for all services and clients.
 
 Two rules:
-1. Only the take loop touches the wait set, and only it destroys. Other threads put their
-   change into a list and trigger the guard condition.
-2. Callbacks run on the take loop. They must not block; what they raise is logged.
+1. Only the take loop touches the wait set and destroys entities. Other threads put their
+   changes into a list and trigger the guard condition.
+2. Callbacks run on the take loop. They must not block; their exceptions are logged.
 
 Owns: the context, the node, the thread, quality of service.
 Not here: pending requests (`entities`), bytes (`serialised`).
@@ -36,11 +36,11 @@ log = logging.getLogger(__name__)
 Entity = Server | Client | Publisher | Subscription
 E = TypeVar("E", Server, Client, Publisher, Subscription)
 
-_CLOSE_LIMIT_S = 10.0  # an ended loop takes milliseconds; more means that a callback blocks
+_CLOSE_LIMIT_S = 10.0  # ending takes milliseconds; more means that a callback blocks
 _KEPT = 5000  # Fast DDS keeps no more of any kind
-_KNOWN_AFTER_S = 2.0  # until those that run know of a new node, many or busy as they may be
-_NO_LIMIT = -1  # of rcl_wait: until something happens
-_REST = 9  # times what a new wait set takes, until the next one: many entities may be made in a row
+_KNOWN_AFTER_S = 2.0  # until running nodes know a new node, even if they are many or busy
+_NO_LIMIT = -1  # rcl_wait waits until something happens
+_REST = 9  # times a wait set's build time before the next: many entities may be created in a row
 
 
 class SerialisedNode:
@@ -85,7 +85,7 @@ class SerialisedNode:
 
         self_test()
         self._middleware: str = get_rmw_implementation_identifier()
-        # Returns what tells a request, of its handle, to each process that received it.
+        # Maps a request's handle to an id that is the same in each process that received it.
         by_cyclone = self._middleware == cyclone.MIDDLEWARE
         self.identity: Callable[[bytes], bytes] = cyclone.identity if by_cyclone else bytes
         self._new_wait_set: Any = rclpy_implementation.WaitSet
@@ -95,8 +95,8 @@ class SerialisedNode:
             durability=DurabilityPolicy.VOLATILE,
         )
         self._quality = quality(history=HistoryPolicy.KEEP_ALL)
-        # What clients that were killed have not received is kept for them until their leases end.
-        # With KEEP_ALL no response to the others is accepted once there are so many.
+        # Responses that killed clients have not received are kept until their leases end. With
+        # KEEP_ALL, once there are this many, responses to other clients are refused.
         self._served = quality(history=HistoryPolicy.KEEP_LAST, depth=_KEPT)
         self._context: Any = early.context if early is not None else new_context(domain_id)
         try:
@@ -112,7 +112,7 @@ class SerialisedNode:
 
     @property
     def alive(self) -> bool:
-        """Whether the take loop runs. It ends by `close`, or by an error that was logged."""
+        """Whether the take loop runs. `close` ends it, or an error, which is logged."""
         return not self._ended.is_set()
 
     def serve(
@@ -122,7 +122,7 @@ class SerialisedNode:
         on_request: Callable[[bytes, Any], None],
         on_burst: OnBurst | None = None,
     ) -> Server:
-        """Offer a service. A first request may come before this returns."""
+        """Offer a service. The first request may arrive before this returns."""
         service_type = load_service_type(type_name)
 
         def create() -> Server:
@@ -154,9 +154,9 @@ class SerialisedNode:
         return self._add(name, create)
 
     def _count_servers(self, service: str) -> int:
-        """Count the servers of an absolute name: rclpy's own way takes twice as long."""
+        """Count the servers of an absolute service name: rclpy's own method takes twice as long."""
         handle = self._node.handle
-        # ROS 2 Humble cannot count: there, whether one is available must do.
+        # ROS 2 Humble cannot count servers: there `available` has to suffice.
         count: Any = getattr(handle, "get_count_services", lambda _: 0)
         with handle:
             return int(count(service))
@@ -173,7 +173,7 @@ class SerialisedNode:
         return self._add(topic.name, create)
 
     def subscribe(self, topic: TopicSpec, on_message: Callable[[bytes], None]) -> Subscription:
-        """Subscribe to a topic: serialised messages. Raises RosError: the type cannot be loaded."""
+        """Subscribe to a topic's serialised messages. RosError: the type cannot be loaded."""
         message_type = load_message_type(topic.type)
 
         def create() -> Subscription:
@@ -186,7 +186,7 @@ class SerialisedNode:
         return self._add(topic.name, create)
 
     def make_visible(self, name: str, judge: Callable[[Mapping[str, Any]], str]) -> VisibleNode:
-        """Create a second node, visible to ROS tools; `judge` as for it. It ends with this one.
+        """Create a second node, visible to ROS tools (see `VisibleNode`). It ends with this one.
 
         Raises RosError: ROS refuses it, or this node is closed.
         """
@@ -199,7 +199,7 @@ class SerialisedNode:
     def offered(self) -> dict[str, str]:
         """Return name -> type of the discovered services that applications offer.
 
-        Asked node by node: the list of all names has clients' in it too.
+        Queried node by node, because the list of all names also contains those of clients.
         """
         found: dict[str, str] = {}
         with contextlib.suppress(Exception):  # rclpy's InvalidHandle: closed meanwhile
@@ -216,12 +216,12 @@ class SerialisedNode:
     def same_node_serves(self, what: str, service: str, client: bytes) -> str | None:
         """Return the full name of the service `what` of the node that a client belongs to.
 
-        None while it is not discovered, empty where there is none: a process's ends are discovered
-        in the order of their making, and a node's own services come before its clients. Its name
-        may be told three seconds later: where its process has but one such service, that is it.
+        None while it is not discovered, empty if there is none: a process's endpoints are
+        discovered in order of creation, a node's own services before its clients. The node's name
+        may arrive three seconds later; until then its process's only such service is taken.
 
-        `client` is the first 16 bytes of a request's handle: the reader of its responses, or under
-        CycloneDDS what stands for the writer of its requests.
+        `client` is the first 16 bytes of a request's handle: the GID of the reader of its
+        responses or, under CycloneDDS, an id for the writer of its requests.
         """
         if self._middleware == cyclone.MIDDLEWARE:
             client = cyclone.writer_of(client, self._context.get_domain_id())
@@ -234,13 +234,13 @@ class SerialisedNode:
         return None
 
     def _beside_server(self, what: str, service: str) -> str | None:
-        """Return the same of a node that offers a service: of the last that discovery lists."""
+        """Like `same_node_serves`, for the last node that discovery lists as a server."""
         readers = self._endpoints(self._node.get_subscriptions_info_by_topic, f"rq{service}Request")
         return self._same_node(what, readers[-1]) if readers else None
 
     def _same_node(self, what: str, end: Any) -> str | None:
         process = bytes(end.endpoint_gid)[: spdp.PREFIX_BYTES]
-        if end.node_name.startswith("_"):  # not known yet
+        if end.node_name.startswith("_"):  # its name is not known yet
             topics = self._request_topics(what)
         else:
             topics = [f"rq{end.node_namespace.rstrip('/')}/{end.node_name}/{what}Request"]
@@ -250,7 +250,7 @@ class SerialisedNode:
         return found[0][len("rq") : -len("Request")] if found else ""
 
     def _request_topics(self, what: str) -> list[str]:
-        """Return the topics of requests to services of this last name, of all nodes."""
+        """Return the request topics of all nodes' services with this last name."""
         with contextlib.suppress(Exception):  # rclpy's InvalidHandle
             known = self._node.get_topic_names_and_types(no_demangle=True)
             return [topic for topic, _ in known if topic.endswith(f"/{what}Request")]
@@ -261,9 +261,9 @@ class SerialisedNode:
         return any(bytes(one.endpoint_gid).startswith(process) for one in readers)
 
     def participant(self, service: str) -> bytes:
-        """Return the first bytes of our DDS participant's id; empty before `service` is offered.
+        """Return the prefix of our DDS participant's id; empty before `service` is offered.
 
-        Empty as well while another of our name does: one that hands over to us, or was killed.
+        Also empty while another node of our name offers it: one that hands over or was killed.
         """
         requests, own = f"rq{service}Request", self._node.get_name()
         named = {
@@ -290,7 +290,7 @@ class SerialisedNode:
                 f"{one.node_namespace.rstrip('/')}/{one.node_name}"
                 for one in readers
                 if one.node_name != own
-                and not one.node_name.startswith("_")  # not known yet
+                and not one.node_name.startswith("_")  # its name is not known yet
                 and not vendors.strangers(self._middleware, [bytes(one.endpoint_gid)])
             ),
         )
@@ -302,18 +302,18 @@ class SerialisedNode:
         return vendors.of_server(service, self._middleware, others[0]) if none_is_ours else ""
 
     def _identifiers(self, find: Any, service: str) -> list[bytes]:
-        """Return the identifiers of those who write, or read, the requests to a service."""
+        """Return the GIDs of the writers, or readers, of requests to a service."""
         return [bytes(one.endpoint_gid) for one in self._endpoints(find, f"rq{service}Request")]
 
     @staticmethod
     def _endpoints(find: Any, topic: str) -> list[Any]:
-        """Return what discovery tells of a topic's writers, or readers; nothing once closed."""
+        """Return the discovered writers, or readers, of a topic; none once closed."""
         with contextlib.suppress(Exception):  # rclpy's InvalidHandle
             return list(find(topic, no_mangle=True))
         return []
 
     def look(self) -> None:
-        """Keep this process known to others. Call it every second or more often."""
+        """Keep this process discoverable. Call it at least once a second."""
         with self._create_lock:
             if not self._stopping and not self._ended.is_set():
                 self._timers.look(self._node)
@@ -322,7 +322,7 @@ class SerialisedNode:
                     self._early = None
 
     def _add(self, name: str, create: Callable[[], E]) -> E:
-        """Create an entity, and have the take loop attend to it."""
+        """Create an entity and hand it to the take loop."""
         with self._create_lock:
             if self._stopping or self._ended.is_set():
                 raise RosError("the ROS node is closed")
@@ -348,7 +348,7 @@ class SerialisedNode:
             done.wait(_CLOSE_LIMIT_S)
 
     def close(self) -> None:
-        """Stop the thread and close the node. Repeatable; from a callback it only requests that."""
+        """Stop the thread and close the node. Idempotent; from a callback it only requests that."""
         if self._visible is not None:
             self._visible.close()
         with self._create_lock:
@@ -366,7 +366,7 @@ class SerialisedNode:
             rest_until = 0.0
             while not self._stopping:
                 began = time.monotonic()
-                if self._changes and (  # somebody waits for what is withdrawn
+                if self._changes and (  # a caller waits for a withdrawal
                     began >= rest_until or not all(added for _, added, _ in tuple(self._changes))
                 ):
                     wait_set, waiting = self._apply_changes()
@@ -388,7 +388,7 @@ class SerialisedNode:
             self._end_ros()
 
     def _apply_changes(self) -> tuple[Any, list[tuple[Any, tuple[str, int], Any]]]:
-        """Return a new wait set and, for each entity, how to add it and where it then stands."""
+        """Return a new wait set and, for each entity, how to add it and its index there."""
         with self._create_lock:
             changes, self._changes = self._changes, []
         entities = dict.fromkeys(self._entities)

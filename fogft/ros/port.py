@@ -1,11 +1,11 @@
-"""The port to ROS 2: serialised services and clients, for any type, never a Python message.
+"""The interface to ROS 2: serialised services and clients of any type, without Python messages.
 
-One context, one node and one thread that takes (one wait set) for each `RosNode`.
-Callbacks come from that thread and must not block. Responses and requests may be sent
-from any thread.
+Each `RosNode` has one context, one node and one take loop (a thread with one wait set).
+Callbacks run on that thread and must not block. Responses and requests may be sent from
+any thread.
 
 Implementations: `fogft.ros.node.SerialisedNode` (rclpy), `fogft.rmw_zenoh.node.RmwZenohNode`
-(Zenoh, no ROS installed), `tests.fakes.ros` (tests). Topics pass by the first alone.
+(Zenoh, no ROS installed), `tests.fakes.ros` (tests). Only the first supports topics.
 """
 
 from collections.abc import Callable, Mapping
@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from fogft.errors import RosError
 
-OnBurst = Callable[[bool], None]  # gets True where a burst begins, False where it has ended
+OnBurst = Callable[[bool], None]  # called with True when a burst begins, False after it
 
 
 class NotFoundYet(RosError):
@@ -28,11 +28,11 @@ class RosServer(Protocol):
     def respond(self, handle: Any, payload: bytes) -> None:
         """Send the serialised response to the request that came with `handle`.
 
-        Any thread. A client that is gone is no error. At most once for each handle.
+        Any thread. No error if the client is gone. Call it at most once for each handle.
         """
 
     def mismatch(self) -> str:
-        """Return why clients are not received, or who else answers; empty if all is well. Cheap."""
+        """Return why a client gets no answers, or who else serves; empty if neither. Cheap."""
 
     def close(self) -> None:
         """Withdraw the service."""
@@ -47,20 +47,20 @@ class RosClient(Protocol):
     def is_known(self) -> bool:
         """Whether the server has discovered this client too; until then its responses are lost.
 
-        True where that cannot be known. One thread calls it, at about 10 Hz.
+        True if that cannot be determined. One thread calls it, at about 10 Hz.
         """
 
     def mismatch(self) -> str:
         """Return why none of the servers can be called; empty if one can. Cheap."""
 
     def servers(self) -> int:
-        """Count the servers that discovery lists: one that died stays listed for a while."""
+        """Count the servers that discovery lists; one that died stays listed for a while."""
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
-        """Send a serialised request; `on_response` comes at most once. Returns a ticket.
+        """Send a serialised request; `on_response` is called at most once. Returns a ticket.
 
         Raises:
-            Unreadable: The bytes are no request of this type.
+            Unreadable: The bytes are not a request of this type.
             RosError: ROS refused the request (its queue is full, the client is closed).
         """
 
@@ -76,7 +76,7 @@ class RosNode(Protocol):
 
     @property
     def alive(self) -> bool:
-        """Whether its thread runs. It ends by `close`, or by an error, which was logged."""
+        """Whether the node's thread runs. `close` ends it, or an error, which is logged."""
 
     def serve(
         self,
@@ -88,8 +88,8 @@ class RosNode(Protocol):
         """Offer a service.
 
         Args:
-            on_request: Gets the serialised request and a handle.
-            on_burst: Told, by the same thread, before and after requests that came together.
+            on_request: Called with the serialised request and a handle.
+            on_burst: Called by the same thread before and after requests that came together.
 
         Raises:
             RosError: The type cannot be loaded.
@@ -99,16 +99,16 @@ class RosNode(Protocol):
         """Create a client of a service. Raises RosError: the type cannot be loaded."""
 
     def look(self) -> None:
-        """Keep this process known to others. Call it every second or more often."""
+        """Keep this process discoverable. Call it at least once a second."""
 
     def offered(self) -> Mapping[str, str]:
         """Return name -> type of the services that applications offer in this domain.
 
-        As discovery knows them now, without those of ROS itself and of proxies.
+        As currently discovered, without those of ROS itself and of proxies.
         """
 
     def close(self) -> None:
-        """Stop the thread and close the node. Repeatable."""
+        """Stop the thread and close the node. Idempotent."""
 
 
 class Level(IntEnum):

@@ -1,8 +1,8 @@
 """The few functions of rcl and rmw that serialised services need, through ctypes.
 
-These are C interfaces that ROS 2 documents and keeps. One handle on ``librcl`` finds them all,
+These are documented, stable C interfaces of ROS 2. One handle on ``librcl`` finds them all,
 whatever middleware is loaded: the dynamic linker searches a library's dependencies too. Each
-function exists twice: one keeps the global interpreter lock, one gives it up while the call runs.
+function is loaded twice: one holds the global interpreter lock, one releases it during the call.
 
 Owns: names, argument types, return codes, C structures, error texts.
 Not here: when to call them (`serialised`).
@@ -30,7 +30,7 @@ from typing import Any
 from fogft.errors import RosError
 
 OK = 0
-TIMEOUT = 2  # of a response: whoever asked is not known yet, and was waited for
+TIMEOUT = 2  # of a response: the client was not discovered within ROS's wait
 CLIENT_TAKE_FAILED = 501  # nothing was there to take
 SERVICE_TAKE_FAILED = 601
 
@@ -84,7 +84,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 
 def declared(library: CDLL, signatures: Mapping[str, Any] = _SIGNATURES) -> CDLL:
-    """Return a library whose functions are known to have these results and arguments."""
+    """Declare the result and argument types of a library's functions; return the library."""
     for name, (result, arguments) in signatures.items():
         function = getattr(library, name)
         function.restype, function.argtypes = result, arguments

@@ -1,8 +1,8 @@
 """Reserve a ROS domain and a TCP port that no other machine on this computer uses.
 
-A reservation is an abstract socket name: the kernel gives it to one process, of whatever
-user, and takes it back when the process ends. What others use without asking us shows in
-the ports that are bound.
+A reservation is an abstract socket name: the kernel gives it to one process, of any user, and
+takes it back when the process ends. Domains and ports that others use without a reservation
+show in the ports that are bound.
 """
 
 import contextlib
@@ -15,8 +15,8 @@ from pathlib import Path
 
 from fogft.ros.spdp import domain_of
 
-DOMAINS = range(1, 102)  # above, the ports of a domain reach Linux's ephemeral ones
-_LOW_DOMAINS = 60  # robots' own, chosen by hand or by tests, tend to be 0 or above these
+DOMAINS = range(1, 102)  # ports of higher domains are in Linux's ephemeral range
+_LOW_DOMAINS = 60  # preferred: robots' and tests' own tend to be 0 or above these
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ones
 
 
@@ -28,7 +28,7 @@ class Reservation:
     _socket: socket.socket
 
     def release(self) -> None:
-        """Give the number back. Repeatable."""
+        """Give the number back. Idempotent."""
         self._socket.close()
 
 
@@ -41,7 +41,7 @@ def own_domain(environ: Mapping[str, str] = os.environ) -> int:
 
 
 def reserve_domain(not_these: Iterable[int] = ()) -> Reservation | None:
-    """Reserve a ROS domain id, none of these, whose ports nobody has bound; None: none is left."""
+    """Reserve a ROS domain id, not one of these, whose ports are unbound; None: none is left."""
     taken = set(not_these) | _domains_in_use()
     tried = sorted(DOMAINS, key=lambda domain: (domain >= _LOW_DOMAINS, random.random()))
     reserved = (_reserve("ros-domain", domain) for domain in tried if domain not in taken)

@@ -53,8 +53,8 @@ def answer(name: str) -> int:
 def ask(name: str) -> int:
     """Call that service; print the seconds taken by discovery and by the call, or the error.
 
-    That is printed before the node is taken down: Fast DDS now and then crashes there, which
-    is no answer to the question.
+    The result is printed before the node is destroyed: Fast DDS sometimes crashes there, which
+    says nothing about the test.
     """
     with contextlib.ExitStack() as until_told:
         return _tell(lambda: _call(name, *until_told.enter_context(_node(f"{name}_ask"))))
@@ -85,7 +85,7 @@ def _call(name: str, node: Any, executor: Any) -> dict[str, float]:
 
 
 def _tell(find: Callable[[], Mapping[str, Any]]) -> int:
-    """Print what is found, or the error that stood in its way; return the exit status."""
+    """Print the result of `find`, or its error; return the exit status."""
     try:
         found, status = find(), 0
     except Exception as error:
@@ -95,7 +95,7 @@ def _tell(find: Callable[[], Mapping[str, Any]]) -> int:
 
 
 def main(arguments: list[str]) -> int:
-    """Run one of the four tests, which prints its result."""
+    """Run one of the four tests and print its result."""
     environment.prepare(os.environ)
     match arguments:
         case ["describe"]:

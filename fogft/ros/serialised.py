@@ -1,10 +1,10 @@
 """Take and send serialised requests and responses without Python messages.
 
-`take` belongs to the take loop and raises RosError for what could not be read, which is gone;
-sending needs the caller's lock. Design: docs/design/serialised-services.md.
+`take` belongs to the take loop and raises RosError for an unreadable message, which is lost;
+callers must hold a lock to send. Design: docs/design/serialised-services.md.
 
-Interpreter lock: held below `LARGE_BYTES`, released above, and while ROS may wait for room.
-Takes go by the size of the last one.
+GIL: held for messages below `LARGE_BYTES`, released above, and while ROS may wait for room.
+A take goes by the size of the previous message.
 
 Owns: C messages and buffers. Not here: threads and locks (`node`), types (`types`), C signatures
 (`rcl`).
@@ -28,7 +28,7 @@ class CMessage:
     def __init__(self, message_type: Any) -> None:
         kind = type(message_type)
         self._held, self._released = rcl.load()
-        self.functions = self._held  # those for a message as large as the last that was written
+        self.functions = self._held  # by the size of the last message written
         self._type_support = rcl.address(kind._TYPE_SUPPORT)
         self._destroy = rcl.destroy_function(rcl.address(kind._DESTROY_ROS_MESSAGE))
         self._name = message_type.__name__
@@ -43,13 +43,13 @@ class CMessage:
             raise RosError(f"no memory for a {self._name}")
 
     def read(self, payload: bytes) -> CDLL:
-        """Fill the message from serialised bytes; return what to send it with.
+        """Fill the message from serialised bytes; return the functions to send it with.
 
-        Raises Unreadable: They are no such message; what the message holds now is undefined.
+        Raises Unreadable: They are not such a message; the message's content is now undefined.
         """
         size = len(payload)
         fault = self._shape.fault(payload)
-        if fault:  # what is refused is the same under every middleware
+        if fault:  # every middleware then rejects the same bytes
             raise Unreadable(f"{size} bytes are not a serialised {self._name}: {fault}")
         source = self._input
         source.buffer = payload
@@ -72,7 +72,7 @@ class CMessage:
         return payload
 
     def close(self) -> None:
-        """Free the message and the buffer. Repeatable."""
+        """Free the message and the buffer. Idempotent."""
         if self.address:
             self._destroy(self.address)
             self.address = 0
@@ -80,7 +80,7 @@ class CMessage:
 
 
 class _End:
-    """What both ends share: the rcl handle, one message to take into, one to send from."""
+    """The common part of both ends: rcl handle, a message to take into, one to send from."""
 
     def __init__(self, entity: Any, taken_type: Any, sent_type: Any) -> None:
         self._held, self._released = rcl.load()
@@ -90,7 +90,7 @@ class _End:
         self._taken_address = self._taken.address
         self._sent = CMessage(sent_type)
         self._sent_address = self._sent.address
-        self._refused = False  # the last send: the next may wait for room, up to 0.1 s
+        self._refused = False  # the last send; the next may wait for room, up to 0.1 s
         self._header = rcl.RequestHeader()
         self._header_reference = byref(self._header)
 
@@ -99,7 +99,7 @@ class _End:
         return kind(f"a {what} cannot be sent: {rcl.error_text()}")
 
     def _check_name(self, found: bytes | None, name: str) -> None:
-        """Make sure that the address is what we take it for."""
+        """Verify that the handle's address is that of the rcl entity of this name."""
         if found is None or not found.decode().endswith(name.lstrip("~/")):
             raise RosError(f"rclpy's handle of `{name}` is not rcl's")
 
@@ -117,7 +117,7 @@ class ServiceEnd(_End):
         self._check_name(name, service.srv_name)
 
     def take(self) -> tuple[bytes, bytes] | None:
-        """Return the next serialised request and the bytes of its header."""
+        """Return the next serialised request and the bytes of its header; None if none waits."""
         code = self._taken.functions.rcl_take_request(
             self._pointer, self._header_reference, self._taken_address
         )
@@ -149,7 +149,7 @@ class ClientEnd(_End):
         self._ticket_reference = byref(self._ticket)
 
     def take(self) -> tuple[int, bytes] | None:
-        """Return the next response: sequence number and bytes."""
+        """Return the next response, as sequence number and bytes; None if none waits."""
         code = self._taken.functions.rcl_take_response(
             self._pointer, self._header_reference, self._taken_address
         )
@@ -173,11 +173,11 @@ class ClientEnd(_End):
 
 @lru_cache(maxsize=1)
 def self_test() -> None:
-    """Once per process, compare a message sent this way with one sent by rclpy.
+    """Once per process, check that a message converted here and back equals rclpy's.
 
-    Compared after deserialising: the padding between fields is whatever lay in memory.
+    Both are compared after deserialising, because padding between fields is arbitrary.
 
-    Raises RosError: This path is not usable with the ROS 2 that is here.
+    Raises RosError: This path does not work with the installed ROS 2.
     """
     from rclpy.serialization import deserialize_message, serialize_message
 

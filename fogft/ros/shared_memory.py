@@ -1,23 +1,23 @@
-"""Deal with shared memory that killed ROS processes left in /dev/shm.
+"""Clean up shared memory that killed ROS processes left in /dev/shm.
 
-Fast DDS makes, for each participant, a *segment* (random name) and, for each port of a
-domain, a *port* (its number as the name), with lock files beside them::
+Fast DDS creates a *segment* (random name) for each participant and a *port* (named by its
+number) for each port of a domain, with lock files beside them::
 
     fastdds_8d5e2bd0a1c7f3e4      a segment    fastdds_8d5e2bd0a1c7f3e4_el  held while it lives
     fastdds_port22911             a port       fastdds_port22911_el / _sl   held by its readers
                                                sem.fastdds_port22911_mutex  held while opening
 
-A group of such files goes when no process maps or holds open any of them, none of its
-lock files is locked (which also tells of processes that /proc hides: another container),
-it is this user's, and nothing touched it for `SETTLED_S`. A port's name is used again by
-the next process, so a port goes under its own mutex, as Fast DDS does it.
+A group of such files is removed if no process maps or holds open any of them, none of its lock
+files is locked (which also covers processes that /proc hides: another container), it belongs to
+this user, and nothing has touched it for `SETTLED_S`. The next process reuses a port's name, so a
+port is removed under its own mutex, as Fast DDS does it.
 
-That process removes its predecessor's port and makes a new one. Fast DDS goes on writing to the
-removed one for two seconds, and what went there comes up to three seconds later still, all at
-once: more than a client keeps. A port that is marked as broken it opens anew immediately.
+The next process removes its predecessor's port and creates a new one. Fast DDS keeps writing to
+the removed port for two seconds, and that data arrives up to three seconds later, all at once: more
+than a client keeps. Fast DDS immediately reopens a port that is marked as broken.
 
 Names begin with ``fastrtps`` before Fast DDS 3. The ROS wheels' tracing library leaves
-``lttng-ust-wait-*``; the same rules hold. Needs neither rclpy nor Fast DDS.
+``lttng-ust-wait-*``; the same rules apply. Needs neither rclpy nor Fast DDS.
 """
 
 import contextlib
@@ -39,15 +39,15 @@ FOLDER = Path("/dev/shm")
 _TURN_LIMIT_S = 5.0
 _IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
 _PORT_EVENT = re.compile(rb"\0fast(?:dds|rtps)_port(\d+)\0")
-# A process that begins or ends removes dozens of files within some ms: one look sees many of them.
+# A process that starts or exits removes dozens of files within a few ms: one read returns many.
 _REST_S = 0.05
-_STALE_S = 1.0  # so long after a look this process may have opened other ports
+_STALE_S = 1.0  # this long after a check, this process may have opened other ports
 _OPEN = re.compile(rb"([0-9a-f]+)-.*/fast(?:dds|rtps)_port(\d+)( \(deleted\))?")
-# A port begins, in Fast DDS 2.14 and 3.2, with: its number, how many read it, two limits in ms (one
-# a third of the other), how many messages it holds, how many wait; flags, the lowest "not broken".
+# A port begins, in Fast DDS 2.14 and 3.2, with its number, its reader count, two limits in ms (one
+# a third of the other), the counts of messages and waiters, and flags (the lowest: "not broken").
 _PORT, _HEAD_BYTES = struct.Struct("=7I"), 1024
-_ASIDE = "_aside"  # behind the name of a port, in that of its mutex
-_SET_ASIDE = re.compile(rf"(?:{_ASIDE})*_mutex$")  # again, where a sweep was killed
+_ASIDE = "_aside"  # follows the port's name in the name of its mutex
+_SET_ASIDE = re.compile(rf"(?:{_ASIDE})*_mutex$")  # repeated if a sweep was killed
 _SEGMENT = re.compile(r"fast(?:dds|rtps)_[0-9a-f]{16}")
 _OURS = re.compile(
     r"(?:sem\.)?(?P<group>fast(?:dds|rtps)_(?:port\d+|[0-9a-f]+)|fast_datasharing_[^/]+?"
@@ -58,8 +58,8 @@ _OURS = re.compile(
 def sweep() -> list[str]:
     """Remove files that no living process uses; return their names, sorted.
 
-    Takes tens of milliseconds. Safe to run beside anything, itself included; files that
-    cannot be judged stay.
+    Takes tens of milliseconds. Safe to run concurrently with anything, including itself; files
+    that cannot be judged stay.
     """
     with _one_at_a_time() as my_turn:
         unused = _unused() if my_turn else {}
@@ -92,14 +92,14 @@ def _lock(descriptor: int) -> bool:
 
 
 def _unused() -> dict[str, list[str]]:
-    """Return the groups that no process of ours maps or holds open."""
+    """Return the groups of which no process of this user maps or holds open a file."""
     candidates = grouped_names()
     used = names_in_use() if candidates else set()
     return {group: names for group, names in candidates.items() if used.isdisjoint(names)}
 
 
 def grouped_names() -> dict[str, list[str]]:
-    """Return this user's files that are old enough, grouped by owner."""
+    """Return this user's files that are old enough, grouped by segment or port."""
     groups: dict[str, list[str]] = {}
     fresh: set[str] = set()
     now = time.time()
@@ -122,8 +122,8 @@ def grouped_names() -> dict[str, list[str]]:
 def make_private() -> None:
     """Make this process's segments, which hold its messages, private to this user.
 
-    Fast DDS makes them readable by all, whatever the umask. Other users' processes lose nothing:
-    they would have to write to a segment to use it, and go through UDP as before.
+    Fast DDS makes them world-readable, whatever the umask. Other users' processes lose nothing:
+    they would need write access to use a segment, and they use UDP as before.
     """
     for name in _mapped("self"):
         if _SEGMENT.fullmatch(name):
@@ -132,10 +132,10 @@ def make_private() -> None:
 
 
 def break_dead_ports(domain_id: int) -> set[str]:
-    """Mark a domain's ports of killed processes as broken, so that who has one opens it anew.
+    """Mark a domain's ports of killed processes as broken, so that their writers reopen them.
 
-    A process that wrote to one would do so for a second more, though nobody reads it, once a new
-    participant has its number. Returns their names.
+    Otherwise a writer would keep using such a port, which nobody reads, for one more second after
+    a new participant has taken its number. Returns their names.
     """
     broken, first = set[str](), spdp.first_port(domain_id)
     ports = {str(number) for number in range(first, first + spdp.DOMAIN_GAIN)}
@@ -153,7 +153,7 @@ def break_dead_ports(domain_id: int) -> set[str]:
 
 
 class PortWatch:
-    """Has this process open anew each port of a domain that another removes, on a thread."""
+    """Makes this process reopen each port of a domain that another removes, on a thread."""
 
     def __init__(self, domain_id: int) -> None:
         self._domain_id = domain_id
@@ -176,15 +176,15 @@ class PortWatch:
             os.close(self._watch)
 
     def close(self) -> None:
-        """Return once it has ended. Only once."""
+        """Stop it and wait until it has ended. Call it only once."""
         self._closed = True
         if self._id >= 0:
-            self._libc.inotify_rm_watch(self._watch, self._id)  # which is an event
+            self._libc.inotify_rm_watch(self._watch, self._id)  # this wakes the thread
         self._thread.join()
 
 
 def reopen_ports() -> tuple[set[int], int]:
-    """Mark ports that this process has open and that were removed as broken.
+    """Mark removed ports that this process still has open as broken, so that it reopens them.
 
     Returns the ports that it has open, and how many it has marked.
     """
@@ -236,11 +236,11 @@ def names_in_use() -> set[str]:
 
 
 def _remove(unused: set[str]) -> list[str]:
-    """Remove groups after a second look, taken while nobody can open them as a port.
+    """Remove groups after a second check, made while nobody can open them as a port.
 
-    The mutexes are held without being mapped, so that a process that waits for one shows
-    in /proc. One that cannot be had is mapped by a living process, or its holder was
-    killed. They go last: until then they keep others from the port.
+    The mutexes are held without being mapped, so that a process that waits for one shows in
+    /proc. A mutex that cannot be acquired is mapped by a live process, or its holder was killed.
+    Mutexes are removed last: until then they keep others from the port.
     """
     held = [group for group in unused if "_port" in group and semaphore(group, "sem_trywait")]
     going: list[str] = []
@@ -253,26 +253,26 @@ def _remove(unused: set[str]) -> list[str]:
         new_names = {name: _SET_ASIDE.sub(f"{_ASIDE}_mutex", name) for name in mutexes}
         used = _set_aside(new_names)
     finally:
-        for group in held:  # where ours went aside, somebody may have made another by now
+        for group in held:  # if ours was set aside, another may have been created by now
             aside = _ASIDE if f"sem.{group}_mutex" in going else ""
             semaphore(group + aside, "sem_post")
     return removed + [name for name in mutexes if unlink_name(new_names[name]) and name not in used]
 
 
 def _set_aside(new_names: Mapping[str, str]) -> set[str]:
-    """Rename mutexes, and give those back that somebody waits for; return these.
+    """Rename mutexes, and restore those that a process waits for; return the latter.
 
-    The next one to open the port would not wait for him. Both would make the port, and the one that
-    lost would leave the other without its file for good: each ROS process that starts afterwards
-    prints `Failed init_port`.
+    Otherwise the next process to open the port would not wait for that one. Both would create the
+    port, and the loser would leave the winner without its file for good: each ROS process that
+    starts afterwards prints `Failed init_port`.
     """
     for name, aside in new_names.items():
         with contextlib.suppress(OSError):
-            (FOLDER / name).rename(FOLDER / aside)  # nobody can come to it any more
+            (FOLDER / name).rename(FOLDER / aside)  # nobody can reach it any more
     in_use = names_in_use() if new_names else set()
     used = {name for name, aside in new_names.items() if aside in in_use}
     for name in used:
-        with contextlib.suppress(OSError):  # somebody has made another
+        with contextlib.suppress(OSError):  # another has been created
             os.link(FOLDER / new_names[name], FOLDER / name)
     return used
 
@@ -287,7 +287,7 @@ def unlink_name(name: str) -> bool:
 
 
 def semaphore(group: str, operation: str) -> bool:
-    """Operate on the POSIX semaphore of a port; return whether it exists and that worked."""
+    """Call an operation on a port's POSIX semaphore; return whether it exists and that worked."""
     libc = ctypes.CDLL(None)
     libc.sem_open.restype = ctypes.c_void_p
     opened = libc.sem_open(f"/{group}_mutex".encode(), 0)
@@ -300,7 +300,7 @@ def semaphore(group: str, operation: str) -> bool:
 
 
 def _locked(name: str) -> bool:
-    """Whether some process, be it hidden from us, holds a lock on a lock file."""
+    """Whether any process, even one hidden from us, holds a lock on a lock file."""
     if not name.endswith(("_el", "_sl")):
         return False
     try:

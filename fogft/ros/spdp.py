@@ -1,11 +1,11 @@
 """DDS participant discovery (SPDP) messages that fogft sends itself: RTPS 2.3, 8.5.3, 9.4.5.3.
 
-Others believe in a killed process for 20 seconds, DDS's lease, unless it takes its leave with one
-message, which whoever knows its id can send as well. A new process often misses what those that run
-answer to its first announcement: Fast DDS listens only afterwards. So another participant, which
-ROS does not see, is announced for an instant, and what it is answered is passed on.
+Others keep a killed process listed for 20 seconds, DDS's lease, unless one message says that it is
+gone; anybody who knows its id can send that message. A new process often misses the answers of
+running ones to its first announcement: Fast DDS listens only afterwards. So a second participant,
+which ROS does not see, is announced briefly, and the answers to it are passed on.
 
-Owns: these messages, and where they go. Not here: who was killed (`fogft.proxy.robot.process`).
+Owns: these messages and their destinations. Not here: who was killed (`fogft.proxy.robot.process`).
 """
 
 import contextlib
@@ -18,22 +18,22 @@ import time
 from fogft.process import on_thread
 
 PREFIX_BYTES = 12
-_FAST_DDS, _CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # who else keeps to this is not known
+_FAST_DDS, _CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # support by others is unknown
 _PARTICIPANT = b"\x00\x00\x01\xc1"
 _SPDP_WRITER, _SPDP_READER = b"\x00\x01\x00\xc2", b"\x00\x01\x00\xc7"
 _LITTLE_ENDIAN, _INLINE, _DATA, _KEY = 0x01, 0x02, 0x04, 0x08
 _END = struct.pack("<HH", 1, 0)
-_LAST = 0x7FFFFFFF  # a number above all that it can have used
+_LAST = 0x7FFFFFFF  # a sequence number above any that it can have used
 _GROUP = "239.255.0.1"
 _LOOPBACK = "127.0.0.1"
 BASE_PORT, DOMAIN_GAIN, _UNICAST_OFFSET, _ID_GAIN = 7400, 250, 10, 2
-_IDS = 64  # participants of one machine that are told, one by one
+_IDS = 64  # participants of one machine that get the message, one by one
 _ANSWERED_WITHIN_S = 0.3
 _LOOK_S = 0.02
 
 
 def is_known(prefix: bytes) -> bool:
-    """Whether a participant id is of a middleware that understands the message."""
+    """Whether a participant id belongs to a middleware that understands the message."""
     return len(prefix) == PREFIX_BYTES and prefix.startswith((_FAST_DDS, _CYCLONE_DDS))
 
 
@@ -54,7 +54,7 @@ def gone(prefix: bytes) -> bytes:
 
 
 def _here(prefix: bytes, port: int) -> bytes:
-    """Return the announcement of a participant that is to be answered at a port of this machine."""
+    """Return the announcement of a participant that takes answers at a port of this machine."""
     at = struct.pack("<iI12x", 1, port) + socket.inet_aton(_LOOPBACK)
     parameters = {
         0x15: b"\x02\x03\x00\x00",  # protocol version
@@ -62,20 +62,20 @@ def _here(prefix: bytes, port: int) -> bytes:
         0x50: prefix + _PARTICIPANT,
         0x32: at,  # for discovery
         0x31: at,  # for data
-        0x02: struct.pack("<iI", 1, 0),  # it is gone after so many seconds without a sign of life
-        0x58: struct.pack("<I", 3),  # it has nothing but participant discovery
+        0x02: struct.pack("<iI", 1, 0),  # its lease in seconds
+        0x58: struct.pack("<I", 3),  # it has participant discovery only
     }
     told = b"".join(struct.pack("<HH", id, len(value)) + value for id, value in parameters.items())
     return _message(prefix, 1, _DATA, b"\x00\x03\x00\x00" + told)
 
 
 def domain_of(port: int) -> int:
-    """Return the domain of a port; less than 0 for one below those of all domains."""
+    """Return the domain that a port belongs to; negative for ports below all domains."""
     return (port - BASE_PORT) // DOMAIN_GAIN
 
 
 def first_port(domain_id: int) -> int:
-    """Return the UDP port at which a machine's first participant of a domain hears of others."""
+    """Return the UDP discovery port of a machine's first participant in a domain."""
     return BASE_PORT + DOMAIN_GAIN * domain_id + _UNICAST_OFFSET
 
 
@@ -94,23 +94,23 @@ def _send(message: bytes, domain_id: int) -> None:
 
 def _tell(message: bytes, domain_id: int, host: str) -> None:
     with (
-        contextlib.suppress(OSError, UnicodeError),  # it has no such name
+        contextlib.suppress(OSError, UnicodeError),  # the name is unknown
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sending,
     ):
         address = socket.gethostbyname(host)  # without a network that takes seconds
         for port in range(first_port(domain_id), 1 << 16, _ID_GAIN)[:_IDS]:
-            with contextlib.suppress(OSError):  # a firewall may let only some pass
+            with contextlib.suppress(OSError):  # a firewall may allow only some ports
                 sending.sendto(message, (address, port))
 
 
 def declare_gone(prefix: bytes, domain_id: int) -> None:
-    """Send a killed participant's disposal message, by its id's prefix."""
+    """Send the disposal message of the killed participant with this id prefix."""
     if is_known(prefix):
         _send(gone(prefix), domain_id)
 
 
 class Introduction:
-    """Has this process's new participants in a domain hear of those that run, on a thread."""
+    """Helps this process's new participants discover a domain's running ones, on a thread."""
 
     def __init__(self, domain_id: int) -> None:
         self._domain_id = domain_id
@@ -118,14 +118,14 @@ class Introduction:
         self._thread = on_thread(self._run, name="introduction")
 
     def close(self) -> None:
-        """Return once it has ended, which it does soon by itself as well. Repeatable."""
+        """Stop it and wait until it has ended; it also ends by itself soon. Idempotent."""
         self._closed = True
         self._thread.join()
 
     def _run(self) -> None:
         prefix = _FAST_DDS + os.urandom(PREFIX_BYTES - len(_FAST_DDS))
         with (
-            contextlib.suppress(OSError),  # no descriptor: then they are heard of later
+            contextlib.suppress(OSError),  # no descriptor: discovery then takes longer
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
         ):
             sock.bind((_LOOPBACK, 0))
@@ -135,14 +135,14 @@ class Introduction:
             end = time.monotonic() + _ANSWERED_WITHIN_S
             while not self._closed and time.monotonic() < end:
                 with contextlib.suppress(TimeoutError):
-                    answer = sock.recv(1 << 16).replace(prefix, bytes(PREFIX_BYTES))  # to any
+                    answer = sock.recv(1 << 16).replace(prefix, bytes(PREFIX_BYTES))  # to anyone
                     for port in ours:
                         sock.sendto(answer, (_LOOPBACK, port))
             _send(gone(prefix), self._domain_id)
 
 
 def _own_ports(domain_id: int) -> list[int]:
-    """Return the ports at which this process's participants of a domain hear of others."""
+    """Return the discovery ports of this process's participants in a domain."""
     sockets = set()
     for descriptor in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):

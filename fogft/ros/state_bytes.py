@@ -1,8 +1,8 @@
 """A service's state as bytes, independent of the service types that carry it.
 
-The state sits in one text or byte field of a response (snapshot) and of a request (restore).
-Where the response has a boolean `success`, false is a failure. These calls are rare, so
-Python messages are built here, as nowhere else in a proxy.
+The state is in one text or byte field of a response (snapshot) and of a request (restore).
+If the response has a boolean `success`, false is a failure. These calls are rare, so they may
+build Python messages.
 
 Owns: reading and writing that field. Not here: when (`fogft.proxy.replica.ordered_responder`).
 """
@@ -54,7 +54,7 @@ class StateBytes:
         try:
             self._in.set(message, state)
             return to_bytes(message)
-        except Exception as error:  # what a message's setter raises is its own affair
+        except Exception as error:  # a message's setter may raise anything
             raise RosError(f"a state of {len(state)} bytes does not fit: {error}") from error
 
     def check_restored(self, response: bytes) -> None:
@@ -94,7 +94,7 @@ class _Field:
         value = getattr(self._parent(message), self._name)
         if self.is_text:
             return str(value).encode()
-        if self._element == "octet":  # rclpy has these as a list of single bytes
+        if self._element == "octet":  # rclpy represents these as a list of single bytes
             return b"".join(value)
         return bytes(value.tobytes())
 

@@ -1,4 +1,4 @@
-"""For Python nodes: make a service stateful in a few lines. This file needs nothing else of fogft.
+"""Make a Python node's service stateful in a few lines. This file needs nothing else of fogft.
 
     from fogft.ros.stateful import AttributeState
 
@@ -24,7 +24,7 @@ class StateServices:
     Args:
         node: The rclpy node that offers the service of that name.
         snapshot: Returns the whole state. Equal states should give equal bytes.
-        restore: Takes a whole state in place of the present one. What it raises is told to
+        restore: Replaces the current state with a whole new one. An exception is reported to
             the proxy, which tries again.
     """
 
@@ -62,7 +62,7 @@ class StateServices:
 class AttributeState(StateServices):
     """`StateServices` for attributes of an object (its owner), as JSON.
 
-    They may be numbers, text, and lists and dictionaries of them.
+    Their values may be numbers, text, and lists and dictionaries of these.
     """
 
     def __init__(self, node: Any, service: str, owner: Any, *names: str) -> None:

@@ -1,7 +1,7 @@
 """A node's publishers and subscriptions, for serialised messages of any type.
 
-Owns: quality of service of topics; that bytes are checked before they are published.
-Not here: the loop (`node`), which messages pass (`fogft.proxy`).
+Owns: quality of service of topics, validating bytes before they are published.
+Not here: the loop (`node`), which messages to forward (`fogft.proxy`).
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ class Publisher:
         self._open = True
 
     def check(self, payload: bytes) -> None:
-        """Raise Unreadable where bytes are no message of this type: ROS must not be given them."""
+        """Raise Unreadable if bytes are not a message of this type: ROS must not get them."""
         fault = self._shape.fault(payload)
         if fault:
             raise Unreadable(f"{len(payload)} bytes are no message of its type: {fault}")
 
     def publish(self, payload: bytes) -> None:
-        """Publish a checked message. Nothing happens once it is withdrawn. Raises RosError."""
+        """Publish a checked message; does nothing once withdrawn. Raises RosError."""
         try:
             if self._open:
                 self._publisher.publish(payload)
@@ -64,12 +64,12 @@ class Publisher:
             return 0
 
     def close(self) -> None:
-        """Withdraw it; repeatable."""
+        """Withdraw the publisher; idempotent."""
         self._open = False
         self._withdraw(self)
 
     def destroy(self, node: Any) -> None:
-        """Free everything. Take loop only, once."""
+        """Free all resources. Take loop only, once."""
         self._open = False
         node.destroy_publisher(self._publisher)
 
@@ -90,7 +90,7 @@ class Subscription:
         self._open = True
 
     def mismatch(self) -> str:
-        """Return why a publisher is not received; empty if all are."""
+        """Return why a publisher's messages are not received; empty if all are."""
         from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
         name = self._name
@@ -109,7 +109,7 @@ class Subscription:
         return ""
 
     def close(self) -> None:
-        """Withdraw it; repeatable. On return it is gone, unless the take loop called."""
+        """Withdraw it; idempotent. On return it is gone, unless the take loop called."""
         self._open = False
         self.withdraw(self)
 
@@ -118,7 +118,7 @@ class Subscription:
         for _ in range(BURST):
             try:
                 taken = self.handle.take_message(self.subscription.msg_type, True)
-            except Exception as error:  # of one message; the take loop goes on
+            except Exception as error:  # one message; the take loop continues
                 log.warning("message_not_taken topic=%s reason=%r", self._name, str(error))
                 return
             if taken is None:
@@ -130,6 +130,6 @@ class Subscription:
                 log.exception("%s: a message was lost", self._name)
 
     def destroy(self, node: Any) -> None:
-        """Free everything. Take loop only, once, when no wait set holds the handle."""
+        """Free all resources. Take loop only, once, when no wait set holds the handle."""
         self._open = False
         node.destroy_subscription(self.subscription)

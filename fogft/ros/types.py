@@ -1,7 +1,7 @@
 """Service and message types by name: loading, fields, hashes and checks.
 
-Needs the interface package, not rclpy, to load a type; so the pool file's reader can
-check one without starting ROS.
+Loading a type needs its interface package but not rclpy, so the pool file's reader can check
+a type without starting ROS.
 
 Owns: names of types, their errors and hints, shapes, definitions.
 Not here: messages (`messages`), comparing two definitions (`fogft.model.type_definition`).
@@ -76,7 +76,7 @@ def trouble(make: Callable[..., object], *arguments: Any) -> RosError | None:
     return None
 
 
-# What an action is made of, by the end of its name: attributes of the action's `Impl`.
+# The end of an action part's type name -> the attribute of the action's `Impl`.
 _PARTS = {
     "SendGoal": "SendGoalService",
     "GetResult": "GetResultService",
@@ -165,8 +165,8 @@ def definition(type_name: str) -> Definition:
     hashes = _hashes(type_name)
     parts = [hashes.get(f"{type_name}_{part}", "") for part in ("Request", "Response")]
     return Definition(
-        # Of request and response: the service's own also covers its event message, which never
-        # travels and may change with the distribution.
+        # Of request and response: the service's own hash also covers its event message, which is
+        # never sent and may differ between distributions.
         "+".join(parts) if all(parts) else "",
         fields,
         service_hash=hashes.get(type_name, ""),
@@ -175,7 +175,7 @@ def definition(type_name: str) -> Definition:
 
 @lru_cache(maxsize=256)
 def shape(message_type: Any) -> Shape:
-    """Return the shape of a message's bytes; None if its fields cannot be read."""
+    """Return the shape of a message's bytes; it knows only the header if fields cannot be read."""
     fields: dict[str, Fields] = {}
     try:
         _add("", message_type, fields)
@@ -185,7 +185,7 @@ def shape(message_type: Any) -> Shape:
 
 
 def _add(name: str, message: Any, fields: dict[str, Fields]) -> None:
-    """Add a message's fields under a name, then those of what it is made of."""
+    """Add a message's fields under a name, then those of its nested types."""
     fields[name] = tuple(message.get_fields_and_field_types().items())
     for _, kind in fields[name]:
         other = nested(kind)
@@ -203,7 +203,7 @@ def nested_type(name: str) -> Any:
 
 
 def _hashes(type_name: str) -> dict[str, str]:
-    """Return type -> hash from the file that was installed with a type's code, if there is one."""
+    """Return type -> hash from the file installed with a type's code; empty if there is none."""
     package, _, short = type_name.split("/")
     code = Path(str(importlib.import_module(package).__file__)).resolve()
     for prefix in code.parents:

@@ -1,8 +1,8 @@
 """Detect DDS vendors that cannot call each other, and other servers of a service. Pure.
 
-Two implementations of DDS find each other and exchange topics, but not services: Fast DDS and
-CycloneDDS put requests behind headers of their own. Discovery shows a service that never answers.
-What tells them apart is the number of the implementation, which every identifier begins with.
+Two DDS implementations discover each other and exchange topics, but not services: Fast DDS and
+CycloneDDS put different headers before requests, so a discovered service never answers. The vendor
+id at the start of every GID tells them apart.
 """
 
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ _OF_DYNAMIC = {"rmw_fastrtps_dynamic_cpp": "rmw_fastrtps_cpp"}
 def strangers(ours: str, identifiers: Iterable[bytes]) -> list[str]:
     """Return the middleware of each endpoint (by its GID) that is incompatible with ours.
 
-    Of a middleware that is not known here nothing is said. Ours is such as ``rmw_fastrtps_cpp``.
+    Unknown middlewares are left out. `ours` is a name such as ``rmw_fastrtps_cpp``.
     """
     ours = _OF_DYNAMIC.get(ours, ours)
     if ours not in _MIDDLEWARE.values():

@@ -1,11 +1,11 @@
 """A proxy's node for people: `/diagnostics`, parameters, and its log on `/rosout`.
 
-An ordinary rclpy node on an executor and a thread of its own, in the context of the node that
-takes requests. Other threads only put work and log records into its queues, so nothing here ever
-stands in a request's way, and whatever goes wrong here is logged and ends there.
+An ordinary rclpy node with its own executor and thread, in the context of the node that takes
+requests. Other threads only put work and log records into its queues, so nothing here ever delays
+a request, and errors here are logged and go no further.
 
-Owns: that node, its thread and its level, which that of our log follows.
-Not here: what is said (`fogft.proxy.robot.diagnostics`).
+Owns: that node, its thread and its log level, which our own log's level follows.
+Not here: the contents (`fogft.proxy.robot.diagnostics`).
 """
 
 import logging
@@ -21,7 +21,7 @@ from fogft.ros.port import Status
 log = logging.getLogger(__name__)
 
 TOPIC = "/diagnostics"
-_LOOK_EVERY_S = 5.0  # what there is to do wakes it
+_LOOK_EVERY_S = 5.0  # work wakes it earlier
 _CLOSE_LIMIT_S = 5.0
 
 
@@ -29,9 +29,9 @@ class VisibleNode:
     """The node that ROS 2 command-line tools and dashboards see.
 
     Args:
-        context: That of the proxy's own node.
-        judge: Takes parameters that somebody sets, and returns why not; empty where they hold
-            from now on. Called by this node's thread.
+        context: The context of the proxy's own node.
+        judge: Called by this node's thread with parameters that somebody sets. Returns why they
+            are rejected; empty if they apply from now on.
 
     Raises:
         RosError: ROS refuses the node.
@@ -60,7 +60,7 @@ class VisibleNode:
     # -- any thread -----------------------------------------------------------------------
 
     def diagnose(self, statuses: Sequence[Status]) -> None:
-        """Publish statuses on `/diagnostics`, if possible and heard by anybody."""
+        """Publish statuses on `/diagnostics`, if possible and if anybody subscribes."""
         if self._diagnostics is None or not self._thread.is_alive():
             return
         if self._diagnostics.get_subscription_count():
@@ -75,13 +75,13 @@ class VisibleNode:
         self._wake()
 
     def _wake(self) -> None:
-        """End the executor's wait. Only something to do ends it; its guard condition does not."""
+        """End the executor's wait. Only a task ends it; its guard condition does not."""
         if not self._awake:
             self._awake = True
             self._executor.create_task(lambda: None)
 
     def close(self) -> None:
-        """Close the node; call it before the context ends. Repeatable."""
+        """Close the node; call it before the context ends. Idempotent."""
         if not self._closing:
             self._closing = True
             self._put(lambda: None)
@@ -92,7 +92,7 @@ class VisibleNode:
     def _run(self) -> None:
         try:
             while not self._closing:
-                self._awake = False  # before looking: what comes after that wakes us again
+                self._awake = False  # first, so that later work wakes us again
                 self._work()
                 self._log.pass_on()
                 self._executor.spin_once(timeout_sec=0 if self._closing else _LOOK_EVERY_S)
@@ -131,7 +131,7 @@ class VisibleNode:
         from rcl_interfaces.msg import ParameterDescriptor
         from rclpy.parameter import Parameter
 
-        # Dynamic: `timeout_s 3` is as good as 3.0, and a wrong type is refused in our words.
+        # Dynamic: `timeout_s 3` works like 3.0, and a wrong type gets our own error message.
         about = ParameterDescriptor(
             description="As in the pool file; holds until that changes it.", dynamic_typing=True
         )
@@ -166,7 +166,7 @@ def _new_node(name: str, context: Any) -> Any:
 
 
 def _diagnostics_publisher(node: Any) -> Any:
-    """Return the publisher of `/diagnostics`, or None where its type is not to be had."""
+    """Return the publisher of `/diagnostics`, or None if its message type is not installed."""
     try:
         from diagnostic_msgs.msg import DiagnosticArray
     except ImportError as error:
@@ -179,16 +179,16 @@ def _diagnostics_publisher(node: Any) -> Any:
     return node.create_publisher(DiagnosticArray, TOPIC, 10)
 
 
-OURS = "fogft"  # the logger above all of ours
+OURS = "fogft"  # the parent of all our loggers
 RECORDS_LIMIT = 1000
-SAME_LIMIT = 10  # a second of one kind: rclpy takes longer for each than a request does
+SAME_LIMIT = 10  # per second and kind: rclpy takes longer for one record than a request takes
 
 
 class RosLog(logging.Handler):
     """A log handler that forwards records to a node's logger, and so to `/rosout`.
 
-    Of those that differ in their values only, `SAME_LIMIT` a second; the rest are counted. Whoever
-    changes that logger's level changes ours. `wake` has `pass_on` called soon.
+    Of records that differ only in their values, it forwards `SAME_LIMIT` a second and counts the
+    rest. Changing that logger's level changes ours. `wake` causes `pass_on` to be called soon.
     """
 
     def __init__(self, logger: Any, wake: Callable[[], None]) -> None:
@@ -199,13 +199,13 @@ class RosLog(logging.Handler):
         self._dropped = 0
         self._second, self._same = 0, Counter[str]()  # how many of each kind in that second
         ours = logging.getLogger(OURS)
-        level = ours.getEffectiveLevel() // 10 * 10  # the numbers of both are the same
+        level = ours.getEffectiveLevel() // 10 * 10  # both use the same numbers
         logger.set_level(max(logging.DEBUG, min(logging.CRITICAL, level)))
         self._level: int = int(logger.get_effective_level())
         ours.addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Keep a record for `pass_on`."""
+        """Queue a record for `pass_on`."""
         if (second := int(record.created)) != self._second:
             self._second = second
             self._same.clear()
@@ -232,10 +232,10 @@ class RosLog(logging.Handler):
     def _tell(self, record: logging.LogRecord) -> None:
         try:
             text = self.format(record).encode(errors="replace").decode()  # rclpy takes UTF-8
-        except Exception:  # a message that does not go with its arguments
+        except Exception:  # a message that does not match its arguments
             self.handleError(record)
             return
-        # rclpy knows a line of code by its level: each has a line of its own.
+        # rclpy ties a line of code to one level, so each level has its own line.
         if record.levelno >= logging.CRITICAL:
             self._logger.fatal(text)
         elif record.levelno >= logging.ERROR:
@@ -248,6 +248,6 @@ class RosLog(logging.Handler):
             self._logger.debug(text)
 
     def close(self) -> None:
-        """Stop taking records. Repeatable."""
+        """Stop taking records. Idempotent."""
         logging.getLogger(OURS).removeHandler(self)
         super().close()

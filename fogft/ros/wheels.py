@@ -1,8 +1,8 @@
-"""Build interface packages beside the ROS 2 wheels: ``python -m fogft.ros.wheels FOLDER``.
+"""Prepare builds against the ROS 2 wheels: ``python -m fogft.ros.wheels FOLDER``.
 
-The wheels' CMake files name the Python of the machine that built them. This lays a prefix down in
-which they name the Python that runs; everything else is linked. An installed ROS 2 distribution
-needs none of this.
+The wheels' CMake files name the Python of the machine that built them. This creates a prefix in
+which they name the running Python; everything else is symlinked. Interface packages can be built
+against it. An installed ROS 2 distribution needs none of this.
 
 Owns: that prefix. Not here: building (`templates/workspace.sh`).
 """
@@ -57,7 +57,7 @@ def _name_this_python(path: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Create a prefix in the given folder, and print it."""
+    """Create a prefix in the given folder, and print its path."""
     if len(arguments) != 1:
         print("usage: python -m fogft.ros.wheels FOLDER", file=sys.stderr)
         return 2

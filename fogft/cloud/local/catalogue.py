@@ -1,6 +1,6 @@
 """The local cloud's catalogue: regions, zones, instance types and prices.
 
-Prices are made up. ``regions.yaml`` in the cloud's folder replaces any of it.
+Prices are made up. ``regions.yaml`` in the cloud's folder overrides any part of it.
 """
 
 import re
@@ -22,9 +22,9 @@ class Zone:
     name: str
     boot_s: float = 0.5  # from the order until the machine runs
     notice_s: float = 5.0  # between a preemption notice and the end
-    capacity: int = 8  # how many machines fit
-    price_factor: float = 1.0  # of all prices here
-    relay: bool = True  # before the machines, so that links can be slowed and cut
+    capacity: int = 8  # maximum number of machines
+    price_factor: float = 1.0  # multiplies all prices here
+    relay: bool = True  # in front of machines, to slow and cut links
 
     @property
     def location(self) -> str:
@@ -52,7 +52,7 @@ class Catalogue:
     instances: tuple[Instance, ...]
 
 
-# Region: what its prices are multiplied by, and its boot time.
+# Region -> its price factor and boot time in seconds.
 REGIONS = {
     "us-west-2": (1.00, 0.4),
     "us-east-1": (1.03, 0.5),

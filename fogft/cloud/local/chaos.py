@@ -1,4 +1,4 @@
-"""Inject faults into the local cloud, by files that the machines watch and by signals."""
+"""Inject faults into the local cloud, through files that machines watch and through signals."""
 
 import contextlib
 import signal
@@ -18,12 +18,12 @@ from fogft.errors import CloudError
 from fogft.model.replica import ReplicaId
 from fogft.poolfile.tree import nearest, shown
 
-# In an outage a machine is cut off first, and gone so long after.
+# In an outage a machine is cut off first, and ends this much later.
 OUTAGE_KILL_AFTER_S = 1.0
 
 
 class Chaos:
-    """Faults in one local cloud, and all its pools. CloudError: no such machine, or location.
+    """Injects faults into one local cloud and its pools. CloudError: no such machine or location.
 
     A location is `region` or `region/zone`, with or without `local/` before it.
     """
@@ -32,7 +32,7 @@ class Chaos:
         self._cloud = LocalCloud(root)
 
     def preempt(self, id: ReplicaId, notice_s: float | None = None) -> float:
-        """Preempt a machine with notice (None: its zone's); return the seconds until it ends."""
+        """Preempt a machine after `notice_s` (None: the zone's); return the seconds left."""
         folder = self._living(id)
         now = time.time()
         if notice_s is None:
@@ -47,7 +47,7 @@ class Chaos:
         """Stop all processes of a machine (SIGSTOP); return how many. Its kernel still answers."""
         self._living(id)
         pids = processes.find(machine=str(id))
-        while not all(map(processes.stopped, pids)):  # what it forked meanwhile as well
+        while not all(map(processes.stopped, pids)):  # including new forks
             processes.send(pids, signal.SIGSTOP)
             time.sleep(0.002)
             pids = processes.find(machine=str(id))
@@ -67,18 +67,18 @@ class Chaos:
         rate_bytes_per_s: float | None = None,
         for_s: float | None = None,
     ) -> None:
-        """Delay traffic to and from a machine, each way, and limit its rate; None: till `clear`."""
+        """Delay a machine's traffic, each way, and limit its rate. `for_s` None: until `clear`."""
         if not 0 <= delay_s <= 3600 or not (rate_bytes_per_s is None or rate_bytes_per_s >= 1):
             raise CloudError("the delay is out of range", "give a delay of 0 to 3600 s")
         until = _deadline(for_s)
         self._change_link(id, delay_s=delay_s, rate_bytes_per_s=rate_bytes_per_s, slow_until=until)
 
     def blackhole(self, id: ReplicaId, for_s: float | None = None) -> None:
-        """Drop all traffic to and from a machine; connections stay open. None: until `clear`."""
+        """Drop a machine's traffic; connections stay open. `for_s` None: until `clear`."""
         self._change_link(id, blackhole=True, blackhole_until=_deadline(for_s))
 
     def outage(self, location: str, for_s: float | None = None) -> list[ReplicaId]:
-        """Cut off, then end all machines in a location, and refuse launches there meanwhile."""
+        """Cut off, then end all machines in a location; refuse launches there during the outage."""
         place = self._location(location)
         until = _deadline(for_s)
         self._change_cloud(lambda old: replace(old, outages={**old.outages, place: until}))
@@ -133,7 +133,7 @@ class Chaos:
             faults.write(self._cloud.root / faults.FILE, change(known))
 
     def _location(self, text: str) -> str:
-        """Return a location in full, if it exists."""
+        """Return a location's full name, if it exists."""
         place = text.strip().rstrip("/")
         place = place if place.split("/")[0] == CLOUD else f"{CLOUD}/{place}"
         zones = self._cloud.catalogue().zones

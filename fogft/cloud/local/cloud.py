@@ -26,13 +26,13 @@ from fogft.poolfile.tree import nearest
 log = logging.getLogger(__name__)
 
 SERVE = (sys.executable, "-m", "fogft", "serve")  # starts a server proxy; without its options
-# What ties a process to the session that it was started from, and is wrong in a machine.
+# Variables that tie a process to the unit that started it; they are wrong in a machine.
 _NOT_INHERITED = ("NOTIFY_SOCKET", "LISTEN_FDS", "LISTEN_FDNAMES", "LISTEN_PID", "WATCHDOG_USEC")
 _UNKNOWN = Placement("local", "unknown", "unknown", "unknown")
 
 
 class LocalCloud:
-    """Replicas as processes on this machine (`fogft.cloud.port.Cloud`). Any thread, any process."""
+    """Replicas as local processes (`fogft.cloud.port.Cloud`). Thread- and process-safe."""
 
     def __init__(self, root: Path, serve: Sequence[str] = SERVE) -> None:
         self.root = Path(os.path.abspath(root))
@@ -47,7 +47,7 @@ class LocalCloud:
         return catalogue.read(self.root / catalogue.FILE)
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """Return an offer for each matching zone. Full zones are included: only a launch tells."""
+        """Return an offer for each matching zone, even a full one: only a launch can tell."""
         return offers_for(self.catalogue(), resources)
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
@@ -69,7 +69,7 @@ class LocalCloud:
     def launch(self, order: Launch) -> None:
         """Write the machine's folder, then start its process; both outlive the caller."""
         zone = self._zone(order)
-        self.folders()  # or it cannot be told whether the order is a repeated one
+        self.folders()  # raises if unreadable: this may be a repeated order
         with ending.cloud_lock(self.root):
             folder = MachineFolder.under(self.machines_folder, order.id)
             if not self._is_new(folder):
@@ -95,13 +95,13 @@ class LocalCloud:
         self._reap()
 
     def audit(self, pool_uid: str = "") -> Audit:
-        """See `fogft.cloud.port.Auditing`: the machines' folders are all that there is."""
+        """See `fogft.cloud.port.Auditing`: the machines' folders are the only record."""
         uids = {pool_uid} if pool_uid else {folder.id.pool_uid for folder in self.folders()}
         found = (machine for uid in sorted(uids) for machine in self.machines(uid))
         return Audit(tuple(found), frozenset({CLOUD}))
 
     def log(self, id: ReplicaId) -> str | None:
-        """Return the log of a machine, also for a while after its end."""
+        """Return the path of a machine's log, also for a while after the machine has ended."""
         folder = MachineFolder.under(self.machines_folder, id)
         paths = (folder.log, ending.kept_log(self.root, id))
         return next((str(path) for path in paths if path.exists()), None)
@@ -125,7 +125,7 @@ class LocalCloud:
         return found
 
     def living(self) -> list[tuple[MachineFolder, Placement]]:
-        """Return the machines of all pools that take up room."""
+        """Return the machines of all pools that count against capacity."""
         now = time.time()
         found = []
         for folder in self.folders():
@@ -146,16 +146,16 @@ class LocalCloud:
                 return None
             self._warn_once(folder.path.name, error.message)
             if folder.locked:
-                # Its files cannot be read, but it lives: listed, it can be ended.
+                # Unreadable but alive: list it, so that it can be terminated.
                 failure = Reason(Cause.ERROR, words=error.message)
                 return Machine(folder.id, _UNKNOWN, MachinePhase.FAILED, now, failure=failure)
-        # Later, if the cloud is busy: a list never waits.
+        # If the lock is taken, a later call does this: listing never waits.
         with contextlib.suppress(CloudUnreachable), ending.cloud_lock(self.root, 0.0):
             ending.bury(self.root, folder)
         return None
 
     def _is_new(self, folder: MachineFolder) -> bool:
-        """Whether an order's machine has yet to be started. The cloud's lock is held."""
+        """Whether a machine has yet to be started. The caller holds the cloud's lock."""
         if folder.exists:
             try:
                 life = folder.life(time.time())
@@ -171,7 +171,7 @@ class LocalCloud:
         environ = {k: v for k, v in os.environ.items() if k not in _NOT_INHERITED}
         environ[processes.MACHINE] = str(folder.id)
         environ[processes.POOL] = folder.id.pool_uid
-        environ.setdefault("PYTHONUNBUFFERED", "1")  # logs as they come
+        environ.setdefault("PYTHONUNBUFFERED", "1")  # so that logs appear at once
         package = Path(__file__).resolve().parents[3]
         if package.name not in ("site-packages", "dist-packages"):  # a checkout
             paths = (str(package), environ.get("PYTHONPATH", ""))
@@ -182,7 +182,7 @@ class LocalCloud:
             self._spawned.append(process)
 
     def _reap(self) -> None:
-        """Let go of the zombies of machines that we started and that have ended."""
+        """Reap the processes of machines that we started and that have ended."""
         with self._spawned_lock:
             self._spawned = [process for process in self._spawned if process.poll() is None]
 
@@ -196,7 +196,7 @@ class LocalCloud:
         return zones[location]
 
     def _check_room(self, zone: Zone, order: Launch) -> None:
-        """Raise `NoCapacity` unless one more fits. The cloud's lock is held."""
+        """Raise `NoCapacity` unless one more machine fits. The caller holds the cloud's lock."""
         wrong = faults.read_cloud(self.root)
         for location in wrong.out(time.time()):
             if order.placement.within(location):

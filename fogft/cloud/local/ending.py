@@ -1,7 +1,7 @@
-"""End machines for good: their processes, their folder, their shared memory. Keep their log.
+"""Terminate machines: remove processes, folder and shared memory, and keep the log.
 
-A machine is gone when none of its processes is left and its folder has been removed; then its
-log stands in ``logs/``, which also marks its id as used. `CloudUnreachable`: it is not sure.
+A machine is gone when none of its processes is left and its folder has been removed. Its log is
+then in ``logs/``, which also marks its id as used. `CloudUnreachable`: it may not be gone.
 """
 
 import contextlib
@@ -26,18 +26,18 @@ _POLL_S = 0.01
 
 
 def kept_log(root: Path, id: ReplicaId) -> Path:
-    """Return where the log of an ended machine is kept."""
+    """Return the path of an ended machine's log."""
     return root / "logs" / f"{id}.log"
 
 
 def end(root: Path, folder: MachineFolder) -> None:
-    """End a machine, whatever state it is in; return when it is gone. Repeatable."""
+    """Terminate a machine in any state; return when it is gone. Idempotent."""
     if folder.exists:
-        with contextlib.suppress(StateError):  # a full disk keeps nobody alive
-            folder.ask_end(0.0)  # a process that starts only now sees it
+        with contextlib.suppress(StateError):  # a full disk must not keep it alive
+            folder.ask_end(0.0)  # seen by a process that only starts now
     ran = processes.end_machine(str(folder.id))
     with cloud_lock(root):
-        ran |= processes.end_machine(str(folder.id))  # one that a launcher spawned meanwhile
+        ran |= processes.end_machine(str(folder.id))  # a launcher may have spawned one meanwhile
         _remove(root, folder, keep_log=True)
     if ran:
         sweep_shared_memory()
@@ -48,12 +48,12 @@ def bury(root: Path, folder: MachineFolder) -> bool:
     lock = disk.Lock(folder.path / LOCK)
     try:
         if not lock.acquire(wait=False):
-            return False  # it lives, or somebody looks at it just now
+            return False  # it is alive, or another process is checking it
     except FileNotFoundError:
         return True
     try:
         processes.end_machine(str(folder.id))
-        # One whose process never ran may be ordered again.
+        # If its process never ran, the same id may be launched again.
         ran = folder.log.exists() and folder.log.stat().st_size > 0
         _remove(root, folder, keep_log=ran or (folder.path / STATE).exists())
     except CloudUnreachable as error:
@@ -65,7 +65,7 @@ def bury(root: Path, folder: MachineFolder) -> bool:
 
 
 def overdue(folder: MachineFolder, now: float) -> bool:
-    """Return whether a machine should have ended by itself and has not: it is frozen."""
+    """Return whether a machine should have ended by itself and has not, so it is frozen."""
     try:
         due = (at for at in map(folder.due, (NOTICE, END)) if at is not None)
         return any(now > at + _PATIENCE_S for at in due) and folder.life(now) is Life.ALIVE
@@ -113,7 +113,7 @@ def _remove(root: Path, folder: MachineFolder, *, keep_log: bool) -> None:
 
 
 def sweep_shared_memory() -> None:
-    """Remove the shared memory that killed ROS processes left."""
+    """Remove the shared memory that killed ROS processes left behind."""
     from fogft.ros import shared_memory
 
     with contextlib.suppress(OSError):

@@ -1,6 +1,6 @@
-"""Injected faults, as files that both sides can read at any time.
+"""Injected faults, stored in files that both sides can read at any time.
 
-A fault with a duration carries its deadline (seconds since the epoch): it ends by itself.
+A fault with a duration stores its deadline (seconds since the epoch), so it ends by itself.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ FILE = "faults.json"
 
 @dataclass(frozen=True)
 class LinkFaults:
-    """Faults of the network path to one machine. A deadline of None is never."""
+    """Faults of the network path to one machine. Without a deadline (None) they last."""
 
-    delay_s: Moment = 0.0  # added to everything, each way
-    rate_bytes_per_s: Moment | None = None  # the most that passes each way
-    slow_until: float | None = None  # when these two end
+    delay_s: Moment = 0.0  # added to all traffic, each way
+    rate_bytes_per_s: Moment | None = None  # the limit, each way
+    slow_until: float | None = None  # when delay and rate end
     blackhole: bool = False  # nothing passes, but connections stay
     blackhole_until: float | None = None
 
@@ -35,13 +35,13 @@ class LinkFaults:
 
 @dataclass(frozen=True)
 class CloudFaults:
-    """Faults of locations: outages and capacity limits."""
+    """Faults in locations: outages and capacity limits."""
 
     outages: Mapping[str, float | None] = field(default_factory=dict)  # when each ends; None: never
     capacity: Mapping[str, int] = field(default_factory=dict)  # instead of the catalogue's numbers
 
     def out(self, now: float) -> list[str]:
-        """Return the locations that are out at a time."""
+        """Return the locations with an outage at a time."""
         return sorted(p for p, until in self.outages.items() if until is None or now < until)
 
 

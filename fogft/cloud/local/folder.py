@@ -2,16 +2,16 @@
 
 ===============  ==========================================================  ==============
 ``machine.json``  the order, written once before the process exists          the launcher
-``state.json``    how far it has come                                        the machine
-``lock``          held (flock) while the machine, or its guard, lives        the machine
+``state.json``    its phase and progress                                     the machine
+``lock``          held (flock) while the machine or its guard is alive       the machine
 ``notice.json``   a preemption notice: ``{"action": "terminate", "at": ..}``  `chaos`
-``end.json``      it shall end, at once or at a time: ``{"at": ..}``         the cloud, `chaos`
-``link.json``     faults of the path to it (`faults.LinkFaults`)             `chaos`
-``machine.log``   all output of it and what it runs                          all below it
+``end.json``      a request to end at a time: ``{"at": ..}``                 the cloud, `chaos`
+``link.json``     faults of its network path (`faults.LinkFaults`)           `chaos`
+``machine.log``   all output of the machine and of what it runs              all its processes
 ===============  ==========================================================  ==============
 
-The order's own files (certificates, ``replica.yaml``) lie beside them. Times are seconds
-since the epoch.
+The last column names the writer. The launch's own files (certificates, ``replica.yaml``) are in
+the same folder. Times are seconds since the epoch.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ LINK = "link.json"
 LOG = "machine.log"
 OWN_FILES = frozenset({RECORD, STATE, LOCK, NOTICE, END, LINK, "link.lock", LOG})
 
-# From the launcher's rename to the machine's first sign of life, without and with a process
-# there: on an overloaded computer it takes its time to start. Longer: it never was.
+# From the launcher's rename to the machine's first sign of life, without and with a process, which
+# starts slowly on an overloaded computer. After that, the machine is considered never started.
 START_LIMIT_S = 10.0
 SLOW_START_LIMIT_S = 60.0
 
@@ -62,9 +62,9 @@ class Life(Enum):
 
 @dataclass(frozen=True)
 class Record:
-    """A machine's order, with its zone at that time: ``machine.json``."""
+    """A machine's launch order, and its zone at that time: ``machine.json``."""
 
-    order: Launch  # without its files
+    order: Launch  # without `files`
     zone: Zone
     launched_at: float
     serve: tuple[str, ...]  # the command that starts a server proxy, without its options
@@ -93,12 +93,12 @@ class MachineFolder:
 
     @classmethod
     def under(cls, machines: Path, id: ReplicaId) -> MachineFolder:
-        """Return the folder that a machine has, or would have."""
+        """Return the folder of a machine, which need not exist."""
         return cls(machines / str(id), id)
 
     @classmethod
     def at(cls, path: Path) -> MachineFolder | None:
-        """Return the machine that a folder's name stands for; None if it is not a machine's."""
+        """Return the machine folder at a path; None if its name is not that of a machine."""
         match = _NAME.fullmatch(path.name)
         if match is None:
             return None
@@ -117,11 +117,11 @@ class MachineFolder:
 
     @property
     def locked(self) -> bool:
-        """Whether the machine's process, or its guard, lives."""
+        """Whether the machine's process or its guard is alive."""
         return disk.is_locked(self.path / LOCK)
 
     def life(self, now: float) -> Life:
-        """Return whether the machine is alive. Looks twice: it may start or end meanwhile."""
+        """Return the machine's life. Checks the lock twice, as it may start or end meanwhile."""
         if self.locked:
             return Life.ALIVE
         state = self.state()
@@ -132,7 +132,7 @@ class MachineFolder:
         return Life.FAILED if state.phase is MachinePhase.FAILED else Life.DEAD
 
     def _may_start(self, now: float) -> bool:
-        """Whether a process that has shown no sign of life may still show one."""
+        """Whether a machine without a sign of life may still be starting."""
         age_s = abs(now - self.record().launched_at)
         if age_s < START_LIMIT_S:
             return True
@@ -143,7 +143,7 @@ class MachineFolder:
         return self.life(now) in (Life.ORDERED, Life.ALIVE)
 
     def record(self) -> Record:
-        """Return the order."""
+        """Return the launch record."""
         found = disk.read_as(Record, self.path / RECORD)
         if found is None:
             raise StateError(f"`{self.path / RECORD}` is missing")
@@ -154,7 +154,7 @@ class MachineFolder:
         return disk.read_as(State, self.path / STATE)
 
     def due(self, name: str) -> float | None:
-        """Return when the machine is to end by a `NOTICE` or a request (`END`); None for never."""
+        """Return when a `NOTICE` or `END` file tells the machine to end; None without a file."""
         found = disk.read_as(_Moment, self.path / name)
         return None if found is None else found.at
 
@@ -173,14 +173,14 @@ class _Moment:
 
 
 def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes]) -> None:
-    """Make a machine's folder, whole or not at all. It must not exist."""
+    """Create a machine's folder atomically. It must not exist."""
     wrong = [n for n in files if n in OWN_FILES or n != os.path.basename(n) or n.startswith(".")]
     if wrong:
         raise CloudError(f"a machine cannot be given a file named `{wrong[0]}`")
     beside = folder.path.with_name(f".new-{folder.path.name}")
     try:
         disk.make_folder(beside.parent)
-        remove(beside)  # of a launcher that was killed; we hold the cloud's lock
+        remove(beside)  # left by a killed launcher; we hold the cloud's lock
         beside.mkdir(mode=0o700)
         for name, content in files.items():
             disk.write_whole(beside / name, content, durable=False)
@@ -196,6 +196,6 @@ def write_new(folder: MachineFolder, record: Record, files: Mapping[str, bytes])
 
 
 def remove(path: Path) -> None:
-    """Remove a folder with all that is in it; fine if there is none."""
+    """Remove a folder and its contents, if it exists."""
     with contextlib.suppress(FileNotFoundError):
         shutil.rmtree(path)

@@ -1,7 +1,7 @@
-"""A machine: ``python -m fogft.cloud.local.machine FOLDER``. Boots, sets up, serves, ends.
+"""A local machine's process: ``python -m fogft.cloud.local.machine FOLDER``.
 
-It ends when it is told to (``end.json``, ``notice.json``, a signal) or when what it serves has
-ended. One thread: the kernel ties children to the thread that started them.
+It boots, runs `setup`, serves and ends: when told to (``end.json``, ``notice.json``, a signal) or
+with the server proxy. Single-threaded: the kernel ties children to the thread that started them.
 """
 
 import contextlib
@@ -38,7 +38,7 @@ FOLDER_PATIENCE_S = 5.0  # somebody removed it: nobody can list or end this mach
 
 
 class _Ended(Exception):
-    """The machine's time has come; says why."""
+    """The machine has to end; says why."""
 
 
 class _Failed(Exception):
@@ -56,12 +56,12 @@ def main(arguments: list[str]) -> int:
         print("error: this is started by the local cloud only", file=sys.stderr)
         return 2
     if not folder.exists:
-        return 0  # it was ended before it began
+        return 0  # it was terminated before it started
     start_log()
     lock = disk.Lock(folder.path / LOCK)
     try:
         begins = lock.acquire(wait=False) and folder.due(END) != 0
-    except FileNotFoundError:  # it has just been ended
+    except FileNotFoundError:  # it has just been terminated
         return 0
     if begins:
         Machine(folder, folder.record()).run()
@@ -110,7 +110,7 @@ class Machine:
         sweep_shared_memory()
 
     def _boot(self) -> Path:
-        """Return where `setup` and `run` run: the pool's own folder, used in place."""
+        """Wait, then return the folder for `setup` and `run`: `workdir`, used in place."""
         id, placement = self._folder.id, self._record.order.placement
         log.info("machine_boots replica=%s zone=%s", id.short, placement.location)
         booted_at = time.monotonic() + self._record.zone.boot_s
@@ -131,7 +131,7 @@ class Machine:
         command = self._record.order.task.get("setup")
         if not command:
             return
-        # One at a time in a folder: machines share it, and two builds in it would clash.
+        # One `setup` at a time per folder: machines share it, and two builds would clash.
         name = hashlib.sha256(str(workdir.resolve()).encode()).hexdigest()[:16]
         turn = disk.Lock(self._folder.path.parents[1] / f"setup-{name}.lock")
         waits = "waiting for another machine's setup"
@@ -153,7 +153,7 @@ class Machine:
     # -- serve ------------------------------------------------------------------------------
 
     def _serve(self, workdir: Path) -> None:
-        domain = reserve_domain({own_domain()})  # not that of whoever launched it
+        domain = reserve_domain({own_domain()})  # not the launcher's own domain
         port = reserve_port()
         if domain is None or port is None:
             missing = "ROS domain" if domain is None else "port"
@@ -164,7 +164,7 @@ class Machine:
         if self._record.zone.relay:
             from fogft.cloud.local.relay import Relay  # late: it loads asyncio
 
-            self._relay = Relay(("127.0.0.1", port.number), begins=b"\x16\x03")  # of TLS
+            self._relay = Relay(("127.0.0.1", port.number), begins=b"\x16\x03")  # a TLS handshake
             endpoint = self._relay.endpoint
         running = State(
             MachinePhase.RUNNING,
@@ -208,7 +208,7 @@ class Machine:
     # -- the loop ---------------------------------------------------------------------------
 
     def _wait(self, done: Callable[[], object]) -> None:
-        """Pass time, and bytes, until something is so. Raises `_Ended` when the end comes first."""
+        """Run timers and relay until `done()`. Raises `_Ended`: the machine has to end first."""
         while True:
             now = time.monotonic()
             if now >= self._next_tick:
@@ -229,7 +229,7 @@ class Machine:
         if os.getppid() != self._guard:
             raise _Ended("its guard was killed")
         for reason, name in (("preempted", NOTICE), ("told to", END)):
-            with contextlib.suppress(StateError):  # it is damaged: nobody of ours wrote it
+            with contextlib.suppress(StateError):  # a damaged file: not written by us
                 at = self._folder.due(name)
                 if at is not None and time.time() >= at:
                     raise _Ended(reason)
@@ -243,7 +243,7 @@ class Machine:
             logfile.bound(self._folder.log)
 
     def _reap(self) -> None:
-        """Collect every child that ended, orphans that we inherited included."""
+        """Reap every child that has exited, including inherited orphans."""
         while True:
             try:
                 pid, status = os.waitpid(-1, os.WNOHANG)

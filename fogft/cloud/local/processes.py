@@ -1,8 +1,8 @@
-"""Find and end all processes of a machine or a pool, and tie a machine's together.
+"""Find and kill all processes of a machine or a pool, and tie a machine's processes together.
 
-All carry ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID`` in the environment that they began with; one that
-began with a clean one is found as a descendant of one that did not. The machine's guard, its
-parent, shares its lock: it counts as alive until all of it is gone. See docs/design/local-cloud.md.
+Their initial environment has ``FOGFT_MACHINE`` and ``FOGFT_POOL_UID``; a process with a clean one
+is found as a descendant of a marked process. The guard, the machine's parent, shares its lock, so
+the machine counts as alive until all of it is gone. See docs/design/local-cloud.md.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 
 def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
-    """Return the living processes of a pool, a machine (`ReplicaId` text) or any, but this one."""
+    """Return the live processes of a pool or machine (`ReplicaId` text), or all; never this one."""
     marks = [f"{MACHINE}={machine}".encode()] if machine else []
     marks += [f"{POOL}={pool_uid}".encode()] if pool_uid else []
     parents: dict[int, int] = {}
@@ -40,7 +40,7 @@ def find(pool_uid: str | None = None, machine: str | None = None) -> list[int]:
         try:
             parent = _parent(entry)
             environ = (_PROC / entry / "environ").read_bytes().split(b"\0")
-        except OSError:  # it has ended, or is another user's
+        except OSError:  # it has exited, or is another user's
             continue
         if parent is None:
             continue
@@ -68,9 +68,9 @@ def end(pids: Iterable[int], limit_s: float = _LIMIT_S) -> None:
 
 
 def end_machine(machine: str, *, spare: Collection[int] = ()) -> bool:
-    """End a machine's processes but some; return if there were any.
+    """Kill a machine's processes except `spare`; return whether there were any.
 
-    All are stopped first: of one that dies as it forks, the child might be nobody's descendant.
+    All are stopped first: if one is killed while it forks, its child might be untraceable.
     """
     held: set[int] = set()
     while new := set(find(machine=machine)) - set(spare) - held:
@@ -81,14 +81,14 @@ def end_machine(machine: str, *, spare: Collection[int] = ()) -> bool:
 
 
 def send(pids: Iterable[int], number: signal.Signals) -> None:
-    """Send a signal to processes; those that are gone meanwhile are fine."""
+    """Send a signal to processes; ignore those that are gone."""
     for pid in pids:
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.kill(pid, number)
 
 
 def alive(pid: int) -> bool:
-    """Return whether a process runs: it exists and is no zombie."""
+    """Return whether a process exists and is not a zombie."""
     try:
         return _parent(str(pid)) is not None
     except OSError:
@@ -115,13 +115,13 @@ def _stat(pid: str) -> list[str]:
 
 
 def start(end_the_rest: Callable[[], None]) -> int:
-    """Become the machine, before there are threads; return the process id of the guard above it."""
+    """Fork guard and machine, before any thread starts; return the guard's pid in the machine."""
     # Every orphan below this process stays a descendant.
     _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     guard = os.getpid()
     machine = os.fork()
     if machine == 0:
-        _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # it is not inherited
+        _libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)  # not inherited
         return guard
     try:
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):

@@ -1,8 +1,8 @@
 """The simulated network path to one machine: a TCP relay with delay, rate and blackhole.
 
-A chunk occupies the path for its size over the rate, after those before it, and arrives the delay
-later, in order whatever changes meanwhile. What the other side does not take stops the reading.
-The server sees from which host who connects. A host that floods the port costs the others little.
+A chunk occupies the path for its size divided by the rate, after earlier chunks, and arrives after
+the delay, in order even if faults change meanwhile. If the other side stops reading, so does the
+relay. The server sees each client's host. A host that floods the port costs other hosts little.
 """
 
 import asyncio
@@ -20,17 +20,17 @@ from fogft.records.accepting import oldest_of_most
 CHUNK_BYTES = 256 << 10
 MAX_HELD_BYTES = 32 << 20
 RETRY_S = 0.05
-_CHUNK_S = 0.02  # how much a slow path takes at a time
+_CHUNK_S = 0.02  # traffic that a slow path reads at a time
 _MIN_CHUNK_BYTES = 1024
 _SLACK_BYTES = 64 << 10
-_YOUNG_LIMIT = 32  # connections that the server has not taken yet
-_FIRST_S = 5.0  # within which a client has to say something
-_CONNECT_S = 2.0  # a server that drops connections is tried no longer
+_YOUNG_LIMIT = 32  # connections that have not reached the server yet
+_FIRST_S = 5.0  # for the client's first bytes
+_CONNECT_S = 2.0  # for connecting to the server, which may drop packets
 _RESET = struct.pack("ii", 1, 0)  # SO_LINGER with no time: close sends RST
 
 
 class Shaper:
-    """One direction of the path, shared by its connections. What is on it keeps its arrival."""
+    """One direction of the path, shared by its connections. Data on it keeps its arrival time."""
 
     def __init__(self) -> None:
         self.delay_s = 0.0
@@ -39,12 +39,12 @@ class Shaper:
 
     @property
     def chunk_bytes(self) -> int:
-        """How much to receive at once."""
+        """How many bytes to receive at once."""
         return max(_MIN_CHUNK_BYTES, int(min(CHUNK_BYTES, self.rate * _CHUNK_S)))
 
     @property
     def room_bytes(self) -> int:
-        """How much one connection may hold before reading stops."""
+        """How many bytes one connection may hold before reading stops."""
         if self.rate == math.inf:
             return MAX_HELD_BYTES if self.delay_s else 0
         return int(min(MAX_HELD_BYTES, self.rate * (self.delay_s + _CHUNK_S) + _SLACK_BYTES))
@@ -57,7 +57,7 @@ class Shaper:
 
 @dataclass(eq=False)
 class _Pipe:
-    """Bytes from one socket to another, both non-blocking. An empty chunk is the end."""
+    """Copies bytes between two non-blocking sockets. An empty chunk marks the end."""
 
     source: socket.socket
     target: socket.socket
@@ -102,9 +102,9 @@ class _Pipe:
 
 
 class Relay:
-    """Relays the connections of one machine, as slow or broken as its faults say.
+    """Relays the connections of one machine, subject to its link faults.
 
-    Its event loop runs only within `step`. Who does not begin with `begins` is not passed on.
+    Its event loop runs only within `step`. Rejects clients whose first bytes are not `begins`.
     """
 
     def __init__(self, upstream: tuple[str, int], begins: bytes = b"") -> None:
@@ -113,7 +113,7 @@ class Relay:
         self._young: dict[asyncio.Task[None], str] = {}  # oldest first, with the client's host
         self._shapers = (Shaper(), Shaper())
         self._loop = asyncio.new_event_loop()
-        self._passes = asyncio.Event()  # unless there is a blackhole
+        self._passes = asyncio.Event()  # cleared by a blackhole
         self._passes.set()
         self.connections: dict[asyncio.Task[None], tuple[_Pipe, ...]] = {}
         self._listener = socket.create_server(("127.0.0.1", 0), backlog=128)
@@ -123,7 +123,7 @@ class Relay:
         self.reached = False  # whether the server has ever accepted a connection
 
     def set_faults(self, faults: LinkFaults) -> None:
-        """Change what is wrong with the path (deadlines already applied)."""
+        """Apply faults to the path (with deadlines already evaluated)."""
         for shaper in self._shapers:
             shaper.delay_s = faults.delay_s
             shaper.rate = faults.rate_bytes_per_s or math.inf
@@ -158,10 +158,10 @@ class Relay:
             connection.add_done_callback(partial(self._forget, client))
             if len(self._young) > _YOUNG_LIMIT:
                 oldest_of_most(self._young).cancel()
-            await asyncio.sleep(0)  # however many come, those that are through have their turn
+            await asyncio.sleep(0)  # let established connections run, however many arrive
 
     def _forget(self, client: socket.socket, connection: asyncio.Task[None]) -> None:
-        client.close()  # of one that was cancelled before it began
+        client.close()  # if the task was cancelled before it began
         self._young.pop(connection, None)
         del self.connections[connection]
 
@@ -181,7 +181,7 @@ class Relay:
                         side.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
 
     async def _first_of(self, client: socket.socket) -> bytes:
-        """Return what the client says first, if that matters. Raises OSError: it may not."""
+        """Return the client's first bytes, if `begins` is set. Raises OSError: a mismatch."""
         if not self._begins:
             return b""
         first = await self._loop.sock_recv(client, self._shapers[0].chunk_bytes)
@@ -190,11 +190,11 @@ class Relay:
         return first
 
     async def _connected(self, client: socket.socket, host: str) -> socket.socket:
-        """Connect to the server; wait until it first listens, as for a machine that still boots."""
+        """Connect to the server; until it first listens, retry: the machine may be booting."""
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         while True:
-            reached = self.reached  # before: meanwhile another connection may find it listening
-            # A new one each time: connecting again, one that was refused may fail untried.
+            reached = self.reached  # read first: another connection may set it
+            # A new socket each time: a refused one may fail again without trying.
             server = socket.socket()
             server.setblocking(False)
             server.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

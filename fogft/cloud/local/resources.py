@@ -1,4 +1,4 @@
-"""Which of the local cloud's offers meet a task's `resources`, written for any cloud. Pure."""
+"""Match the local cloud's offers to a task's `resources`, written for any cloud. Pure."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -15,7 +15,7 @@ from fogft.poolfile.tree import nearest, shown
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)
 _PLACE_KEYS = ("infra", "cloud", "region", "zone")
 _MACHINE_KEYS = ("use_spot", "instance_type", "cpus", "memory", "accelerators")
-_IDLE_KEYS = (  # they say neither where a machine may be nor what it is
+_IDLE_KEYS = (  # they affect neither place nor machine type
     *("accelerator_args", "autostop", "disk_size", "disk_tier", "ephemeral_storage", "hooks"),
     *("image_id", "job_recovery", "labels", "local_disk", "max_hourly_cost", "network_tier"),
     *("ports", "priority", "priority_class", "volumes"),
@@ -27,7 +27,7 @@ _ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
 
 
 def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer]:
-    """Return each zone's cheapest instance that meets the resources. Raises `SpecError`: none."""
+    """Return the cheapest matching instance in each zone. Raises `SpecError`: there is none."""
     best: dict[Placement, Offer] = {}
     for where, entry in alternatives(resources):
         spot = bool(entry.get("use_spot"))
@@ -40,9 +40,9 @@ def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer
 
 
 def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield each alternative, complete, with the path of its keys.
+    """Yield each alternative in full, with its key path.
 
-    The form of the lists and of `use_spot` was checked with the pool file (`check_resources`).
+    `check_resources` has already checked the form of the lists and of `use_spot`.
     """
     _check_keys("resources", resources, ("any_of", "ordered"))
     if resources.get("any_of") and resources.get("ordered"):
@@ -82,7 +82,7 @@ def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Z
     if region and region not in regions:
         raise wrong("region", "the local cloud has no region", region, regions)
     there = [zone for zone in catalogue.zones if region in ("", zone.region)]
-    # Other clouds' zones begin with their region: us-west-1a, us-west1-a.
+    # Other clouds' zone names begin with the region: us-west-1a, us-west1-a.
     found = [z for z in there if name in ("", z.name, z.region + z.name, f"{z.region}-{z.name}")]
     if not found:
         here = f"region `{region}`" if region else "the local cloud"
@@ -91,7 +91,7 @@ def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Z
 
 
 def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: bool) -> Instance:
-    """Return the cheapest instance that suffices."""
+    """Return the cheapest matching instance."""
     named = entry.get("instance_type")
     names = [instance.name for instance in catalogue.instances]
     if named is not None and named not in names:
@@ -115,7 +115,7 @@ def _instance(catalogue: Catalogue, where: str, entry: Mapping[str, Any], spot: 
 
 
 def suffices(where: str, key: str, wanted: Any, instance: Instance) -> bool:
-    """Return whether a machine has what a key asks for. Raises `SpecError` for no amount."""
+    """Return whether a machine satisfies a key. Raises `SpecError`: `wanted` is not an amount."""
     if key == "accelerators":
         return any(
             instance.accelerators.get(name, 0) >= count for name, count in _devices(where, wanted)

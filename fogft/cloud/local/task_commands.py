@@ -1,4 +1,4 @@
-"""How a machine runs a task's commands: environment and ROS domain."""
+"""The environment in which a local machine runs a task's commands."""
 
 import os
 import sys
@@ -10,7 +10,7 @@ from fogft.ros.environment import child_environment
 
 
 def environment(task: Mapping[str, Any]) -> dict[str, str]:
-    """Return the environment of `setup`: the user's own, with the task's variables."""
+    """Return the environment of `setup`: the user's own plus the task's variables."""
     environ = child_environment(os.environ)
     if sys.prefix != sys.base_prefix:
         environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
@@ -18,15 +18,15 @@ def environment(task: Mapping[str, Any]) -> dict[str, str]:
 
 
 def server_environment(task: Mapping[str, Any], domain: int) -> dict[str, str]:
-    """Return the server proxy's environment, so that both ends have one `RMW_IMPLEMENTATION`."""
+    """Return the server proxy's environment, including the service's `RMW_IMPLEMENTATION`."""
     given = variables(task)
-    if "PYTHONPATH" in given and "PYTHONPATH" in os.environ:  # where fogft itself may lie
+    if "PYTHONPATH" in given and "PYTHONPATH" in os.environ:  # fogft may be installed there
         given["PYTHONPATH"] += os.pathsep + os.environ["PYTHONPATH"]
     return {**os.environ, **given, "ROS_DOMAIN_ID": str(domain)}
 
 
 def variables(task: Mapping[str, Any]) -> dict[str, str]:
-    """Return a task's own variables."""
+    """Return the variables in a task's `envs` and `secrets`."""
     found = {**(task.get("envs") or {}), **(task.get("secrets") or {})}
     return {str(k): "" if v is None else str(v) for k, v in found.items()}
 

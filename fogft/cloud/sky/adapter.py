@@ -56,16 +56,16 @@ def _each_second(step: Callable[[], bool]) -> None:
 
 
 def make(folder: Path) -> SkyCloud:
-    """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until it is asked."""
+    """Return the real clouds of this user. Imports neither SkyPilot nor boto3 until first use."""
     try:
         user = getpass.getuser()
     except (KeyError, OSError):  # a container's user often has no name
         user = f"uid{os.getuid()}"
-    # Robots of one image have one user and one host name, but each should have its own id.
+    # Robots made from one image share user and host name; the machine id tells them apart.
     machine = hashlib.sha256(read_bytes(MACHINE_ID) or b"").hexdigest()[:8]
     owner = f"{user}-{socket.gethostname()}"[:50] + f"-{machine}"
     if not folder.exists() and importlib.util.find_spec("sky") is None:
-        InstalledSky().load()  # raises: without a launch no folder says that clouds were used
+        InstalledSky().load()  # raises: there is no SkyPilot, and no folder of earlier launches
     google = importlib.util.find_spec("google") and importlib.util.find_spec("google.auth")
     providers = [Aws(), Gcp()] if google else [Aws()]
     return SkyCloud(folder, InstalledSky(), providers, owner=owner)
@@ -75,11 +75,11 @@ def make(folder: Path) -> SkyCloud:
 class SkyCloud:
     """Real clouds. Implements all of `fogft.cloud.port`."""
 
-    folder: Path  # where it remembers its launches, for all pools of this user
+    folder: Path  # of its records, for all pools of this user
     sky: InstalledSky
     providers: Sequence[Provider] = ()  # clouds that can be asked directly
     _: KW_ONLY
-    owner: str  # whose machines these are, for their labels
+    owner: str  # in the labels of our machines
     clock: Callable[[], float] = time.time
     steady: Callable[[], float] = time.monotonic
     submit: Callable[[Callable[[], None]], object] = on_thread
@@ -98,7 +98,7 @@ class SkyCloud:
         self._census = Census(by_name, clock, submit)
         self.unverified = self._census.unverified
         self._presence = seen = Presence(sky, journal, self._census, clock, submit)
-        # The provider is asked where it can be: SkyPilot's own refresh waits.
+        # Asks the provider if possible: SkyPilot's own refresh has to queue.
         self.refresh = seen.refresh
         self._ending = Ending(sky, journal, self._census, self.sleep, clock)
         self._following = Following(
@@ -109,17 +109,17 @@ class SkyCloud:
         self._lock = threading.Lock()
         self._followed: set[ReplicaId] = set()
         self._closed = False
-        self._ends: tuple[float, float | None] = (-math.inf, None)  # asked at, and the answer
+        self._ends: tuple[float, float | None] = (-math.inf, None)  # time of the query, answer
 
     # -- the port -------------------------------------------------------------------------
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """See `Cloud`. Of each location the cheapest machine; see `Prices.instead` for others."""
+        """See `Cloud`. The cheapest machine in each location; `Prices.instead` returns others."""
         refuse_what_cannot_be_honoured({"resources": resources})
         return self._prices.offers(resources)
 
     def machines(self, pool_uid: str) -> Sequence[Machine]:
-        """See `Cloud`. Costs one question to SkyPilot's memory; no cloud is asked, as a rule."""
+        """See `Cloud`. Costs one read of SkyPilot's records; usually no cloud is queried."""
         entries = self.journal.entries(pool_uid)
         machines = self._presence.machines(pool_uid, entries, self._prices.regions)
         for entry in entries:
@@ -128,8 +128,8 @@ class SkyCloud:
         return machines
 
     def launch(self, order: Launch) -> None:
-        """See `Cloud`. Returns when SkyPilot has accepted the order: seconds."""
-        if order.is_there:  # SkyPilot starts a cluster that it has when it is to launch it
+        """See `Cloud`. Returns when SkyPilot has accepted the request, which takes seconds."""
+        if order.is_there:  # SkyPilot starts a stopped cluster when told to launch it
             self.journal.close(order.id)
         cloud = order.placement.cloud
         if order.more_ports and cloud in MAPPING_CLOUDS:
@@ -168,13 +168,13 @@ class SkyCloud:
             self._follow(order.id)
             raise
         entry = self.journal.update(order.id, stage=Stage.LAUNCHING, request=request)
-        if entry is None or entry.stage is Stage.ENDING:  # ended meanwhile, by another process
+        if entry is None or entry.stage is Stage.ENDING:  # terminated meanwhile by another process
             self._ending.end(order.id)
             return
         self._follow(order.id)
 
     def terminate(self, id: ReplicaId) -> None:
-        """See `Cloud`. Returns when SkyPilot, and the provider where it can be asked, agree."""
+        """See `Cloud`. Returns when SkyPilot and, if it can be asked, the provider agree."""
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             self.journal.update(id, stage=Stage.ENDING)
         try:
@@ -206,7 +206,7 @@ class SkyCloud:
     # -- beyond the port --------------------------------------------------------------------
 
     def credentials_end_at(self) -> float | None:
-        """See `RealCloud`. What is known is looked at again after a minute."""
+        """See `RealCloud`. The answer is cached for a minute."""
         now = self.clock()
         if not 0 <= now - self._ends[0] < _ENDS_FRESH_S:
             used = [one for one in self.providers if one.cloud in self._prices.regions]
@@ -215,7 +215,7 @@ class SkyCloud:
         return self._ends[1]
 
     def hindrances(self, clouds: Sequence[str], until: float | None) -> Sequence[str]:
-        """See `RealCloud`. An API server of another SkyPilot is ended where it is idle."""
+        """See `RealCloud`. Also stops an idle API server of another SkyPilot version."""
         found = [self.sky.renew_server()]
         for provider in self.providers:
             at = provider.credentials_end_at() if provider.cloud in clouds else None
@@ -269,12 +269,12 @@ class SkyCloud:
     def bake(self, task: Mapping[str, Any], image: str, folder: Path) -> None:
         """See `RealCloud`."""
         packed, lock = self.make_wheel(self.folder / "wheels"), dict[str, bytes]()
-        with contextlib.suppress(CloudError):  # then the image resolves, as a VM would
+        with contextlib.suppress(CloudError):  # then the image resolves packages, as a VM would
             lock |= self._locks.renew(packed)
         bake.write(folder, task, image, packed, lock)
 
     def audit(self, pool_uid: str = "") -> Audit:
-        """See `Auditing`. Of all pools only those whose machines carry this user's label."""
+        """See `Auditing`. Without a pool, all of this user's, by the owner label of machines."""
         self._presence.clusters.forget()
         machines: dict[ReplicaId, Machine] = {}
         for uid in {pool_uid} if pool_uid else self._pools():
@@ -288,11 +288,11 @@ class SkyCloud:
         return Audit(tuple(machines[id] for id in sorted(machines)), asked)
 
     def close(self) -> None:
-        """Stop to follow launches; they go on. Repeatable."""
+        """Stop following launches, which continue. Idempotent."""
         self._closed = True
 
     def _pools(self) -> set[str]:
-        """Return the uids of this user's pools, as the journal and SkyPilot know them."""
+        """Return the uids of this user's pools, from the journal and SkyPilot's list."""
         uids = {entry.id.pool_uid for entry in self.journal.entries()}
         for cluster in self._presence.clusters.renew():
             id = replica_of(cluster.name)
@@ -304,7 +304,7 @@ class SkyCloud:
         return labels.get(OWNER, label_value(self.owner)) == label_value(self.owner)
 
     def _firewall(self, order: Launch) -> str:
-        """Return the name of what holds an order's `allow_from`; empty for nothing."""
+        """Return the name of the rule that enforces `allow_from`; empty if there is none."""
         place = order.placement
         provider = self._providers.get(place.cloud)
         if provider is None or not order.allow_from:
@@ -333,7 +333,7 @@ class SkyCloud:
             more = not self._closed and self._following.step(id)
         except CloudUnreachable as error:
             log.warning("launch_unknown replica=%s reason=%r", id.short, error.message)
-        except CloudError as error:  # an answer that no step expects; the limits end it
+        except CloudError as error:  # an unexpected answer; the time limits end the launch
             log.warning("launch_unclear replica=%s reason=%r", id.short, error.message)
         except StateError:  # the journal cannot be read: `machines` says so to the user
             more = False

@@ -20,30 +20,30 @@ from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.reason import Cause
 from fogft.model.replica import Placement
 
-_ALIVE = ["pending", "running", "stopping", "stopped"]  # a stopped one's disk still costs
+_ALIVE = ["pending", "running", "stopping", "stopped"]  # a stopped machine's disk still costs money
 _FORBIDDEN = ("UnauthorizedOperation", "AccessDenied", "AccessDeniedException")
 _HOME = "us-east-1"  # any region lists the others
 ROLE = "skypilot-v1"
 _ENDS_IN_ENVIRONMENT = ("AWS_CREDENTIAL_EXPIRATION", "AWS_SESSION_EXPIRATION")
-_ENDS_IN_PROFILE = ("aws_expiration", "expiration", "x_security_token_expires")  # of login tools
+_ENDS_IN_PROFILE = ("aws_expiration", "expiration", "x_security_token_expires")  # by login tools
 _MIGHTY = ("AdministratorAccess", "PowerUserAccess")
 
 
 class Aws:
-    """AWS, asked directly; see `fogft.cloud.sky.provider.Provider`."""
+    """AWS's own API; see `fogft.cloud.sky.provider.Provider`."""
 
     cloud = "aws"
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._session: Any = None
-        # By service and region: safe to share, and each costs megabytes.
+        # By service and region: thread-safe, and each takes megabytes.
         self.clients: dict[tuple[str, str], Any] = {}
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
-        """See `Provider`. Regions are asked side by side.
+        """See `Provider`. Queries regions in parallel.
 
-        Of all regions some may refuse: many accounts are kept out of most, and run nothing there.
+        Without `regions` some may refuse: many accounts are barred from most and run nothing there.
         """
         where = sorted(set(self.regions() if regions is None else regions))
         if not where:
@@ -77,9 +77,9 @@ class Aws:
             )
 
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
-        """See `Provider`. A security group in each VPC: SkyPilot decides which one a machine is in.
+        """See `Provider`. Creates a security group in each VPC, as SkyPilot chooses the VPC.
 
-        Named for its rules, it serves all pools that have the same, and is never changed.
+        It is named by a hash of its rules, shared by all pools with these rules, and never changed.
         """
         rules = {(port, source) for port in ports for source in sources}
         name = f"fogft-{hashlib.sha256(repr(sorted(rules)).encode()).hexdigest()[:16]}"
@@ -94,11 +94,11 @@ class Aws:
         return name
 
     def credentials_end_at(self) -> float | None:
-        """See `Provider`. A login that renews itself has no end that is known."""
+        """See `Provider`. A login that renews itself counts as having no expiry."""
         try:
             session = importlib.import_module("botocore.session").Session()
             told = dict(session.get_scoped_config())
-        except Exception:  # not installed, or a profile that is not there: the check of it tells
+        except Exception:  # not installed, or no such profile: `check` reports it
             return None
         found = [os.environ.get(name, "") for name in _ENDS_IN_ENVIRONMENT]
         found += [str(told.get(name, "")) for name in _ENDS_IN_PROFILE]
@@ -112,7 +112,7 @@ class Aws:
         return min((at for at in map(moment, found) if at), default=None)
 
     def quota(self, region: str, code: str) -> float | None:
-        """See `Provider`. By the code of AWS's Service Quotas."""
+        """See `Provider`. `code` is one of AWS's Service Quotas."""
         with self._asked(region, "service-quotas") as quotas:
             try:
                 found = quotas.get_service_quota(ServiceCode="ec2", QuotaCode=code)
@@ -126,7 +126,7 @@ class Aws:
             pages = ec2.get_paginator("describe_spot_price_history").paginate(
                 InstanceTypes=sorted(set(instances)),
                 ProductDescriptions=["Linux/UNIX"],
-                # The one price in force now, of each zone.
+                # Only the current price in each zone.
                 StartTime=datetime.datetime.now(datetime.timezone.utc),
             )
             found = [entry for page in pages for entry in page["SpotPriceHistory"]]
@@ -154,7 +154,7 @@ class Aws:
             return [str(region["RegionName"]) for region in ec2.describe_regions()["Regions"]]
 
     def warning(self) -> str:
-        """See `Provider`. Reads the policies of SkyPilot's role, where the account may."""
+        """See `Provider`. Reads the policies of SkyPilot's role, if the account may."""
         try:
             with self._asked(_HOME, "iam") as iam:
                 mighty = _mighty(iam)
@@ -191,7 +191,7 @@ class Aws:
 
     @contextlib.contextmanager
     def _asked(self, region: str, service: str = "ec2") -> Iterator[Any]:
-        """Give a client, and translate the errors of its calls."""
+        """Yield a client, and convert the errors of its calls."""
         try:
             yield self._client(service, region)
         except ImportError as error:
@@ -203,7 +203,7 @@ class Aws:
                 raise NotAllowedError(f"{code}: {plain(str(error))}") from error
             hint = ""
             if classify(code, [str(error)]).cause is Cause.CREDENTIALS:
-                with self._lock:  # renewed ones are read by a new session only
+                with self._lock:  # only a new session reads renewed ones
                     self._session = None
                     self.clients.clear()
                 hint = "renew the AWS credentials; `sky check aws` tests them"
@@ -211,7 +211,7 @@ class Aws:
 
 
 def _mighty(iam: Any) -> list[str] | None:
-    """Return the role's policies that allow all of a service, by AWS's own names; None: no role."""
+    """Return the names of the role's policies that allow all of a service; None: no such role."""
     try:
         attached = iam.list_attached_role_policies(RoleName=ROLE)["AttachedPolicies"]
     except iam.exceptions.NoSuchEntityException:
@@ -226,7 +226,7 @@ def _mighty(iam: Any) -> list[str] | None:
 
 
 def _allows_all(statement: Mapping[str, Any]) -> bool:
-    """Whether a statement of a policy allows every action of a service, on whatever there is."""
+    """Whether a policy statement allows every action of a service on every resource."""
     if statement.get("Effect") != "Allow" or statement.get("Condition"):
         return False
     everything = any(one == "*" or one.endswith(":*") for one in _listed(statement.get("Action")))
@@ -239,7 +239,7 @@ def _listed(value: Any) -> list[Any]:
 
 
 def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:
-    """Make a security group in each VPC that has none; return those that let in anything else."""
+    """Create the group in each VPC that has none; return the ids of groups with other rules."""
 
     def groups() -> list[Any]:
         by_name = [{"Name": "group-name", "Values": [name]}]
@@ -252,7 +252,7 @@ def _firewalls(name: str, rules: Set[tuple[int, str]], ec2: Any) -> list[str]:
     wanted = [_permission(port, source) for port, source in sorted(rules)]
     changed = []
     for group in groups():
-        if not group["IpPermissions"]:  # its making was interrupted
+        if not group["IpPermissions"]:  # its creation was interrupted
             with _unless("InvalidPermission.Duplicate"):
                 ec2.authorize_security_group_ingress(GroupId=group["GroupId"], IpPermissions=wanted)
         by_group = [{"Name": "group-id", "Values": [group["GroupId"]]}]
@@ -277,7 +277,7 @@ def _permission(port: int, source: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _unless(code: str) -> Iterator[None]:
-    """Pass over an error of AWS's that says that it is so already."""
+    """Ignore an AWS error that says that the change has already been made."""
     try:
         yield
     except Exception as error:

@@ -1,7 +1,7 @@
-"""What SkyPilot's catalogue offers for a task as launched, and which clouds cannot run it.
+"""Offers of SkyPilot's catalogue for a task as launched, and why some clouds cannot run it.
 
-SkyPilot chooses one machine without accelerators; one type alone often has no capacity. So others
-of a cloud's general families are offered beside it: as many vCPUs, no less memory.
+Without accelerators SkyPilot chooses a single machine type, which often has no capacity. So other
+types of the cloud's general families are offered, too: as many vCPUs, no less memory.
 """
 
 import importlib
@@ -16,8 +16,8 @@ from fogft.model.replica import Offer, Placement
 CHOICES = 5
 """Types of machines that are offered in one location."""
 
-_ZONE_ID = re.compile(r"[a-z]{2,5}\d-[a-z]{2,4}\d")  # `use1-az1`: a zone whose name is not known
-# What runs a steady load on x86: no burstable, bare-metal or old machines.
+_ZONE_ID = re.compile(r"[a-z]{2,5}\d-[a-z]{2,4}\d")  # `use1-az1`: an id of a zone, not its name
+# Types for a steady load on x86: no burstable, bare-metal or old machines.
 _FAMILIES = {
     "aws": r"[cmr][5-9][a-z-]*\.\d*x?large",
     "azure": r"Standard_[DEF]\d+[a-z]*_v[2-9]",
@@ -34,7 +34,7 @@ _MISSING = {
 
 
 def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
-    """Return what is sold for SkyPilot's `Resources`; `enabled` is for those that name no cloud."""
+    """Return the offers for SkyPilot's `Resources`; those that name no cloud use `enabled`."""
     prices: dict[Placement, float] = {}
     left_out: dict[str, str] = {}
     quotas: dict[tuple[str, bool], tuple[str, float]] = {}
@@ -74,7 +74,7 @@ def missing(cloud: Any, resources: Any) -> str:
 
 
 def _machines(cloud: Any, resources: Any) -> list[Any]:
-    """Return launchable machines that would do, SkyPilot's own choice first."""
+    """Return the launchable machines that match, SkyPilot's own choice first."""
     chosen = list(cloud.get_feasible_launchable_resources(resources, num_nodes=1).resources_list)
     if len(chosen) != 1 or resources.instance_type or resources.accelerators:
         return chosen
@@ -84,7 +84,7 @@ def _machines(cloud: Any, resources: Any) -> list[Any]:
 
 
 def _like(cloud: str, instance: str, *, exact: bool) -> list[str]:
-    """Return other types with as many vCPUs and no less memory, the cheapest first."""
+    """Return other types with as many vCPUs and no less (`exact`: equal) memory, cheapest first."""
     family = _FAMILIES.get(cloud)
     if family is None:
         return []
@@ -108,7 +108,7 @@ def _sold(cloud: str, machine: Any) -> Iterator[tuple[Placement, float]]:
     instance = machine.instance_type
     if machine.accelerators and cloud == "gcp":
         name, count = next(iter(machine.accelerators.items()))
-        instance = f"{instance}+{name}:{count}"  # there the type does not imply them
+        instance = f"{instance}+{name}:{count}"  # on GCP the type does not imply them
     price = _price(cloud, machine)
     for region in machine.get_valid_regions_for_launchable():
         for zone in [zone.name for zone in region.zones or ()] or [None]:
@@ -118,7 +118,7 @@ def _sold(cloud: str, machine: Any) -> Iterator[tuple[Placement, float]]:
 
 
 def _price(cloud: str, machine: Any) -> Callable[[str, str | None], float]:
-    """Return what tells a machine's price in a place; SkyPilot would search its whole catalogue."""
+    """Return a function of region and zone for the price; SkyPilot searches its whole catalogue."""
     try:
         of_cloud = importlib.import_module(f"sky.catalog.{cloud}_catalog")
         common = importlib.import_module("sky.catalog.common")
@@ -126,7 +126,7 @@ def _price(cloud: str, machine: Any) -> Callable[[str, str | None], float]:
         search = common.get_hourly_cost_impl
     except (ImportError, AttributeError):  # another version of SkyPilot
         rows = None
-    if rows is None or cloud not in _FAMILIES or machine.accelerators:  # these cost extra
+    if rows is None or cloud not in _FAMILIES or machine.accelerators:  # accelerators cost extra
         return lambda region, zone: machine.copy(region=region, zone=zone).get_cost(3600)
     own = rows[rows["InstanceType"] == machine.instance_type]
     return lambda *place: search(own, machine.instance_type, machine.use_spot, *place)
@@ -142,9 +142,9 @@ def _fetched_at(cloud: str) -> float:
 
 
 def best(offers: Sequence[Offer]) -> tuple[list[Offer], Mapping[Placement, Sequence[Offer]]]:
-    """Return of each location the cheapest offer, and by its placement what would do instead.
+    """Return the cheapest offer of each `Placement.supply`, and its alternatives by placement.
 
-    At most `CHOICES` together, none at more than twice the cheapest one's price.
+    At most `CHOICES` per supply in total, none at more than twice the cheapest one's price.
     """
     by_supply: dict[str, list[Offer]] = {}
     for offer in sorted(offers, key=lambda o: (o.usd_per_hour, o.placement)):

@@ -1,7 +1,7 @@
 """Ask the providers which machines exist, because SkyPilot may have lost some.
 
-A machine's absence counts only where the provider has listed it before. The credentials here may be
-of another account than those that SkyPilot, or its API server elsewhere, launches with.
+A machine's absence counts only if the provider has listed it before: the local credentials may
+belong to another account than those that SkyPilot, or its remote API server, launches with.
 """
 
 import logging
@@ -17,12 +17,12 @@ from fogft.model.replica import ReplicaId
 log = logging.getLogger(__name__)
 
 EVERY_S = 60.0
-NOBODY = "0" * 16  # a pool that does not exist: may one ask at all?
+NOBODY = "0" * 16  # a nonexistent pool, to test the permission to list
 
 
 @dataclass
 class Census:
-    """The machines that providers list with our labels; `submit` runs a function elsewhere."""
+    """Machines that providers list with our labels; `submit` runs a function in the background."""
 
     providers: Mapping[str, Provider]
     clock: Callable[[], float]
@@ -36,7 +36,7 @@ class Census:
         self._seen: set[ReplicaId] = set()
 
     def of(self, id: ReplicaId, entry: Entry | None) -> list[Instance] | None:
-        """Return a replica's instances, asked now; None if only SkyPilot can be asked."""
+        """Query a replica's instances now; None if only SkyPilot can tell."""
         if entry is None:  # it may be anywhere
             found, _ = self.everywhere(id.pool_uid)
             return [i for i in found if i.id == id] or None
@@ -48,14 +48,14 @@ class Census:
         return [i for i in mine if i.id == id] if vouched else None
 
     def terminate(self, instance: Instance) -> None:
-        """Ask for the end of an instance. Raises CloudUnreachable: it may run on."""
+        """Request the termination of an instance. Raises CloudUnreachable: it may still run."""
         try:
             self.providers[instance.placement.cloud].terminate(instance)
         except NotAllowedError as error:
             raise CloudUnreachable(f"no permission to end {instance.key}: {error}") from error
 
     def end_when_shut_down(self, instance: Instance) -> None:
-        """Have an instance end when it shuts itself down; else its disk would cost on."""
+        """Make an instance terminate when it shuts itself down; else its disk still costs money."""
         try:
             self.providers[instance.placement.cloud].end_when_shut_down(instance)
         except (CloudUnreachable, NotAllowedError) as error:
@@ -66,7 +66,7 @@ class Census:
         return cloud in self.providers and cloud not in self._refused
 
     def latest(self, pool_uid: str, regions: Mapping[str, Iterable[str]]) -> Sequence[Instance]:
-        """Return a pool's last census; start another if it is old. The first looks everywhere."""
+        """Return a pool's last census; start a new one if it is old. The first asks all regions."""
         now = self.clock()
         with self._lock:
             begun_at = self._begun_at.get(pool_uid)
@@ -80,18 +80,18 @@ class Census:
         return found
 
     def everywhere(self, pool_uid: str) -> tuple[Sequence[Instance], frozenset[str]]:
-        """Return what carries a pool's labels now, or any pool's, and which clouds were asked."""
+        """List a pool's (empty: all pools') instances in all regions, and which clouds answered."""
         found = [i for p in self.providers.values() for i in self._ask(p, None, pool_uid)]
         return found, frozenset(cloud for cloud in self.providers if self.vouches(cloud))
 
     def forget(self, id: ReplicaId) -> None:
-        """Take a replica that is known to be gone out of the last census."""
+        """Remove a replica that is known to be gone from the last census."""
         with self._lock:
             kept = self._found.get(id.pool_uid, ())
             self._found[id.pool_uid] = [i for i in kept if i.id != id]
 
     def unverified(self, cloud: str) -> str:
-        """Return why a cloud's own list is not available, else empty. Takes seconds."""
+        """Return why a cloud's own list is unavailable; empty if it is available. Takes seconds."""
         provider = self.providers.get(cloud)
         if provider is None:
             return (

@@ -1,7 +1,7 @@
-"""End a replica reliably: abort its launch, take it down, and verify that it is gone.
+"""Terminate a replica reliably: abort its launch, take it down, and verify that it is gone.
 
-A "down" without an error is not believed: SkyPilot's list is read again, and the provider asked
-where it can be. What SkyPilot has forgotten is ended through the provider, by its labels.
+A "down" without an error is not trusted: SkyPilot's list is read again, and the provider is asked
+if possible. Machines that SkyPilot has forgotten are terminated through the provider, by label.
 """
 
 import contextlib
@@ -21,13 +21,13 @@ log = logging.getLogger(__name__)
 
 _TRIES = 5
 _PAUSE_S = 3.0
-_LIMIT_S = 300.0  # no further try after that
+_LIMIT_S = 300.0  # no further attempt after this
 _HEARD_WITHIN_S = 180.0  # as `following.ASK_LIMIT_S`
 
 
 @dataclass
 class Ending:
-    """Ends replicas, and makes sure that they are gone."""
+    """Terminates replicas and verifies that they are gone."""
 
     sky: InstalledSky
     journal: Journal
@@ -36,12 +36,12 @@ class Ending:
     clock: Callable[[], float]
 
     def end(self, id: ReplicaId) -> None:
-        """End a replica's machine; return when nothing is left. CloudUnreachable: it may run."""
+        """Terminate a replica's machine; return when it is gone. CloudUnreachable: it may run."""
         name = cluster_name(id)
         trouble: Exception | None = None
         begun_at = self.clock()
         entry = self.journal.get(id)
-        # Nothing must be found twice where SkyPilot may yet hear of the order.
+        # If SkyPilot may still receive the launch request, require two checks that find nothing.
         heard = entry is None or entry.request or begun_at - entry.launched_at >= _HEARD_WITHIN_S
         enough = 1 if heard else 2
         quiet = 0
@@ -60,7 +60,7 @@ class Ending:
                 trouble = error
                 log.warning("end_failed replica=%s reason=%r", id.short, str(error))
                 with contextlib.suppress(CloudUnreachable, RefusedError):
-                    self._left(id, name)  # what SkyPilot cannot end the provider may
+                    self._left(id, name)  # the provider may succeed where SkyPilot fails
                 continue
             quiet = 0 if left else quiet + 1
             if quiet >= enough:
@@ -73,9 +73,9 @@ class Ending:
         ) from trouble
 
     def _left(self, id: ReplicaId, name: str) -> list[str]:
-        """Return what still exists; ask the provider to end what SkyPilot did not."""
+        """Return what still exists; ask the provider to terminate what SkyPilot did not."""
         instances = self.census.of(id, self.journal.get(id))
-        # The provider knows best; SkyPilot's own look at the cloud waits behind its other requests.
+        # Prefer the provider's list: SkyPilot's refresh queues behind its other requests.
         clusters = self.sky.clusters(name, refresh=instances is None)
         left = [f"cluster {c.name} ({c.state.value})" for c in clusters if c.name == name]
         for instance in instances or ():

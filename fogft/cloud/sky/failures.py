@@ -1,7 +1,7 @@
-"""What a failed launch means: capacity, quota, credentials, setup, timeout or error. Pure.
+"""Classify a failed launch: capacity, quota, credentials, setup, timeout or error. Pure.
 
-The clouds' own codes decide, not the exception's class, which is the same for no capacity, no quota
-and no permission. They stand in the texts or, as AWS's do, in the log of the launch only.
+The clouds' own error codes decide, not the exception class, which is the same for no capacity, no
+quota and no permission. The codes are in the messages or, for AWS, only in the launch's log.
 """
 
 import re
@@ -47,7 +47,7 @@ _KINDS = {
 
 
 def classify(kind: str, texts: Iterable[str]) -> Reason:
-    """Return why a launch failed, by an exception's class name, its message and its history's."""
+    """Return why a launch failed; `kind`: the exception's class, `texts`: its messages."""
     told = [text for text in (plain(text) for text in texts) if text]
     for cause, pattern in _CODES:
         for text in told:
@@ -63,17 +63,17 @@ def told_last(log: str) -> Reason | None:
     return next((failure for failure in found if failure.cause is not Cause.ERROR), None)
 
 
-_NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # who asked may have a long name
+_NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # after the caller's long name
 _FOR_AWS = "Encoded authorization failure message"  # a thousand characters
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")
-_DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # what SkyPilot says of its own doing
-# What begins its log's lines.
+_DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # SkyPilot's own progress lines
+# The prefix of SkyPilot's log lines.
 _LOGGED = re.compile(r"^[A-Z] [\d-]+ [\d:.]+ (?:PID=\d+ )?\S+:\d+\] ")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 
 
 def plain(text: str) -> str:
-    """Return a text of SkyPilot's in one line, without colours, times and encoded AWS messages."""
+    """Return SkyPilot's text as one line, without colours, times and encoded AWS messages."""
     line = " ".join(_COLOUR.sub("", text).partition(_FOR_AWS)[0].split())
     return _LOGGED.sub("", line)
 
@@ -86,7 +86,7 @@ def tail(log: str, lines: int = 20, width: int = 200) -> str:
 
 
 def _short(text: str, pattern: str, room: int = 300) -> str:
-    """Return the part of a text around what matched, and of a refusal what was not allowed."""
+    """Return the text around the match or, for an AWS refusal, around the denied action."""
     found = _NOT_ALLOWED.search(text) or re.search(pattern, text) if pattern else None
     start = max(0, found.start() - 80) if found and len(text) > room else 0
     if start and found:  # not in the middle of a word

@@ -1,8 +1,8 @@
 """Follow a launch from the order to the running job, one level-triggered step at a time.
 
-A step can be lost, repeated, or made by another process after a crash. A launch that fails or hangs
-is taken down at once: a machine that was made before would cost money. Time limits count from when
-this process first saw the launch.
+A step can be lost, repeated, or taken by another process after a crash. A launch that fails or
+hangs is taken down at once, because a machine that it has created costs money. Time limits count
+from when this process first saw the launch.
 """
 
 import logging
@@ -28,7 +28,7 @@ JOB_PAUSE_S = 20.0
 of processor time, in one of its few workers; the pause grows with the time that an answer takes."""
 _JOB_PAUSE_LIMIT_S = 300.0
 
-_TRIES_LINES = 400  # of a launch's log: what its last tries have come to
+_TRIES_LINES = 400  # of a launch's log: enough for its last attempts
 ASK_LIMIT_S = 180.0
 """Until SkyPilot has accepted the order; then it is known that it never will."""
 LAUNCH_LIMIT_S = 900.0
@@ -37,19 +37,19 @@ LAUNCH_LIMIT_S = 900.0
 
 @dataclass
 class Following:
-    """Takes the next step of each launch; `on_move` is called when one has moved on."""
+    """Advances launches step by step; calls `on_move` when a launch reaches a new stage."""
 
     sky: InstalledSky
     journal: Journal
     ending: Ending
     clock: Callable[[], float]
-    steady: Callable[[], float]  # seconds that pass, however the clock is set
+    steady: Callable[[], float]  # monotonic seconds
     on_move: Callable[[], None]
-    # Of each launch under way: when this process first saw it so far, or may ask about its job.
+    # Per launch: when this process first saw it reach a point, and may next query its job.
     _times: dict[ReplicaId, dict[str, float]] = field(default_factory=dict, init=False)
 
     def step(self, id: ReplicaId) -> bool:
-        """Move a launch on; return whether there is more. CloudUnreachable: nothing was learned."""
+        """Advance a launch; return whether it needs more. CloudUnreachable: nothing was learned."""
         steps = {
             Stage.ASKING: self._asking,
             Stage.LAUNCHING: self._launching,
@@ -68,7 +68,7 @@ class Following:
     def _asking(self, entry: Entry) -> None:
         found = self.sky.launches(cluster_name(entry.id))
         requests = [one for one in found if one.active or not entry.starts]
-        if found and not requests and self._lasts_s(entry) <= ASK_LIMIT_S:  # it may have started
+        if found and not requests and self._lasts_s(entry) <= ASK_LIMIT_S:  # it may be up
             clusters = self.sky.clusters(cluster_name(entry.id), refresh=True)
             requests = [*found] if any(c.state is ClusterState.UP for c in clusters) else []
         if requests:
@@ -80,14 +80,14 @@ class Following:
         request = self.sky.request(entry.request)
         if request is None:
             self._lost(entry)
-        elif request.queued:  # behind others, which takes them no time limit of its own
+        elif request.queued:  # behind others: the launch limit does not run yet
             if self._lasts_s(entry) > SETUP_LIMIT_S:
                 self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "queued"))
         elif request.active:
             if self._lasts_s(entry, "begun") > LAUNCH_LIMIT_S:
                 self._fail(entry, self._hung(entry, LAUNCH_LIMIT_S, "launching"))
             elif not entry.placement.spot and not entry.endpoint:
-                # Once its provider lists it: it is to end itself, and not merely stop.
+                # Once the provider lists it: make it terminate, not stop, if it shuts down.
                 for instance in self.ending.census.of(entry.id, entry) or ():
                     self.ending.census.end_when_shut_down(instance)
                     if instance.public_ip:
@@ -100,10 +100,10 @@ class Following:
             else:
                 self._move(entry, stage=Stage.SETTING_UP, job=job, running_at=self.clock())
                 self._find_endpoint(entry)
-                self.ending.census.of(entry.id, entry)  # seen once, its absence counts
+                self.ending.census.of(entry.id, entry)  # once seen, its absence counts
 
     def _find_endpoint(self, entry: Entry) -> None:
-        """Ask where a machine is reached whose cloud maps its port, until that is known."""
+        """Look up the endpoint of a machine whose cloud maps ports, until it is known."""
         if entry.endpoint or not entry.port or entry.placement.cloud not in MAPPING_CLOUDS:
             return
         try:
@@ -114,7 +114,7 @@ class Following:
             self._move(entry, endpoint=found)
 
     def _lost(self, entry: Entry) -> None:
-        """SkyPilot lost the request (its database, or a server that was put in place of it)."""
+        """Handle a request that SkyPilot lost (with its database, or with a replaced server)."""
         clusters = self.sky.clusters(cluster_name(entry.id), refresh=True)
         if any(c.state is ClusterState.UP for c in clusters):
             self._move(entry, stage=Stage.SETTING_UP, running_at=self.clock())
@@ -129,7 +129,7 @@ class Following:
         self._find_endpoint(entry)
         try:
             job = self.sky.job(cluster_name(entry.id), entry.job)
-        except RefusedError as error:  # the cluster is gone, or not up: its absence will tell
+        except RefusedError as error:  # the cluster is gone or not up: its list will show it
             log.info("job_unknown replica=%s reason=%r", entry.id.short, str(error))
             job = JobState.PENDING
         finally:
@@ -145,16 +145,16 @@ class Following:
         elif job is JobState.ENDED:
             words = "`fogft serve` exited on the machine" + self._job_tail(entry)
             self._fail(entry, Reason(Cause.ERROR, words=words))
-        elif self._lasts_s(entry) > SETUP_LIMIT_S:  # asked: who hears nothing concludes nothing
+        elif self._lasts_s(entry) > SETUP_LIMIT_S:  # only after an answer: silence proves nothing
             self._fail(entry, self._hung(entry, SETUP_LIMIT_S, "setting up"))
 
     def _fail(self, entry: Entry, failure: Reason) -> None:
-        """Write the failure first: whatever happens while it is taken down, it stays known."""
+        """Record the failure first, so that it is kept whatever happens during the teardown."""
         log.warning("launch_failed replica=%s reason=%r", entry.id.short, in_words(failure))
         self.journal.update(entry.id, stage=Stage.FAILED, failure=failure)
         try:
             self.ending.end(entry.id)
-        except CloudError as error:  # it stays listed as failed until `terminate` has managed
+        except CloudError as error:  # it stays listed as failed until `terminate` succeeds
             log.warning("end_failed replica=%s reason=%r", entry.id.short, str(error))
 
     def _refused(self, entry: Entry, error: RefusedError) -> Reason:
@@ -191,5 +191,5 @@ class Following:
             self.on_move()
 
     def _lasts_s(self, entry: Entry, since: str = "ordered") -> float:
-        """Return for how long this process has seen a launch so far: a set clock ends none."""
+        """Return how long this process has seen a launch, unaffected by clock changes."""
         return self.steady() - self._times[entry.id].setdefault(since, self.steady())

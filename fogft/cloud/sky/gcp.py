@@ -1,6 +1,6 @@
 """GCP through its own API (REST, with google-auth, which comes with SkyPilot's GCP support).
 
-Lists machines by our labels, and deletes those that were just listed; no more of `provider`.
+Lists machines by our labels and deletes listed ones; implements nothing else of `provider`.
 """
 
 import datetime
@@ -21,7 +21,7 @@ _BEGINNING = frozenset(("PROVISIONING", "STAGING", "RUNNING", "REPAIRING"))
 
 
 class Gcp(Provider):
-    """GCP, asked directly; see `fogft.cloud.sky.provider.Provider`."""
+    """GCP's own API; see `fogft.cloud.sky.provider.Provider`."""
 
     cloud = "gcp"
 
@@ -31,7 +31,7 @@ class Gcp(Provider):
         self._known: tuple[Any, str] | None = None  # a session, and the project
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
-        """See `Provider`. All zones at once; a preempted machine is stopped and listed."""
+        """See `Provider`. Queries all zones at once; a preempted machine is listed as stopped."""
         where = None if regions is None else set(regions)
         if where is not None and not where:
             return []
@@ -65,8 +65,8 @@ class Gcp(Provider):
             told = answer.json() if answer.content else {}
         except NotAllowedError:
             raise
-        except Exception as error:  # the network, a login that has ended, no JSON
-            with self._lock:  # renewed credentials are read by a new session only
+        except Exception as error:  # the network, an expired login, no JSON
+            with self._lock:  # only a new session reads renewed credentials
                 self._known = None
             hint = "renew the GCP credentials; `sky check gcp` tests them"
             raise CloudUnreachable(f"GCP did not answer: {error}", hint) from error

@@ -1,7 +1,7 @@
-"""The installed SkyPilot. The only module that imports `sky`, and only when used.
+"""The SDK of the installed SkyPilot, which is imported on first use.
 
-Importing it takes 2 to 4 s, and the first call may start its API server (11 s, 0.6 GB); a
-server elsewhere is used by `SKYPILOT_API_SERVER_ENDPOINT` or ``sky api login``, as always.
+Importing it takes 2 to 4 s, and the first call may start its API server (11 s, 0.6 GB); a remote
+server is selected with `SKYPILOT_API_SERVER_ENDPOINT` or ``sky api login``, as usual.
 """
 
 from __future__ import annotations
@@ -46,18 +46,18 @@ CHECK_LIMIT_S = 300.0  # asks every cloud, and may start the API server: minutes
 JOB_LIMIT_S = 120.0  # starts a Python on the machine, over ssh
 LAUNCH_LIMIT_S = 120.0  # uploads `workdir` and `file_mounts`, and may start the API server
 DOWN_LIMIT_S = 300.0
-_FORGOTTEN = 10  # limits: SkyPilot waits without end for an answer that a router lost
+_FORGOTTEN = 10  # times the limit: SkyPilot waits forever for an answer that a router lost
 
 
 def _run(call: Callable[[], T], outcome: Future[T]) -> None:
     try:
         outcome.set_result(call())
-    except BaseException as error:  # SystemExit too: SkyPilot's client uses it
+    except BaseException as error:  # SystemExit too: SkyPilot's client raises it
         outcome.set_exception(error)
 
 
 def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
-    """Give a call a limit; `subject` says what it is about, with its arguments filled in."""
+    """Give a call a time limit; `subject` describes it, with its arguments filled in."""
 
     def decorate(call: F) -> F:
         @functools.wraps(call)
@@ -74,24 +74,24 @@ def _limited(limit_s: float, subject: str) -> Callable[[F], F]:
 
 
 class InstalledSky:
-    """SkyPilot's public SDK, as far as fogft uses it. From any thread.
+    """The part of SkyPilot's public SDK that fogft uses. Thread-safe.
 
-    Every call has a limit, and ends in a value or in one of these errors: `CloudUnreachable`, where
-    nothing is known and nothing may be concluded; `RefusedError`, where the answer is no.
+    Every call has a time limit. It returns a value, or raises `CloudUnreachable` if the answer is
+    unknown (conclude nothing) or `RefusedError` if the answer is no.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self.sky: Any = None  # the two modules, once they are used
+        self.sky: Any = None  # the two modules, once loaded
         self.sdk: Any = None
-        self._given_up: dict[str, tuple[Future[Any], float]] = {}  # by subject, with its begin
+        self._given_up: dict[str, tuple[Future[Any], float]] = {}  # by subject, with its start
         self._settings = Settings()
 
     def within(self, limit_s: float, subject: str, call: Callable[[], T]) -> T:
-        """Run a call on its own thread within a limit, which SkyPilot's client lacks.
+        """Run a call on its own thread with a timeout, which SkyPilot's client lacks.
 
-        One that is given up still runs, here and on the API server. Until it has ended, or must
-        have been lost, the same question (`subject`) is not asked again; a late answer is dropped.
+        A call that timed out still runs, here and on the API server. Until it ends, or must have
+        been lost, the same call (`subject`) is not made again; a late answer is dropped.
         """
         ends_at = time.monotonic() + limit_s
         running, begun_at = self._given_up.get(subject, (None, 0.0))
@@ -118,7 +118,7 @@ class InstalledSky:
 
     @_limited(LAUNCH_LIMIT_S, "the launch of `{1}`")
     def launch(self, task: Mapping[str, Any], name: str, group: str = "") -> str:
-        """Order a cluster, in a security group on AWS; return the request's id, before it runs."""
+        """Launch a cluster; return the request's id before it runs. `group`: AWS security group."""
         with as_answer():
             made = self.sky.Task.from_yaml_config(dict(task))
         cloud = str((task.get("resources") or {}).get("infra", "")).split("/")[0]
@@ -134,20 +134,20 @@ class InstalledSky:
 
     @_limited(ASK_LIMIT_S, "request {0}")
     def request(self, id: str) -> Request | None:
-        """Return how a request is doing; None when the API server does not know it."""
+        """Return a request's state; None if the API server does not know it."""
         found = self._asked(request_ids=[id])
         return next((request_of(r) for r in found if r.request_id == id), None)
 
     @_limited(ASK_LIMIT_S, "the outcome of request {0}")
     def launched_job(self, id: str) -> int | None:
-        """Return the job's number of a launch request; refused if that failed or was cancelled."""
+        """Return the job number of a launch request. RefusedError: it failed or was cancelled."""
         with as_answer():
             job, _ = self.sdk.get(id)
         return None if job is None else int(job)
 
     @_limited(ASK_LIMIT_S, "the abort of request {0}")
     def cancel(self, id: str) -> None:
-        """Abort a request; return when that is done. One that has ended is no error."""
+        """Abort a request; return when that is done. No error if it has already ended."""
         self.sdk.get(self.sdk.api_cancel([id], silent=True))
 
     def clusters(self, name: str | None, *, refresh: bool) -> Sequence[Cluster]:
@@ -158,8 +158,8 @@ class InstalledSky:
             modes = self.sky.StatusRefreshMode
             mode = modes.FORCE if refresh else modes.NONE
             names = None if name is None else [name]
-            # Of all users: who lost `~/.sky/user_hash` is another user to SkyPilot, and the
-            # machines still cost the same person. The pool's uid tells them apart.
+            # All users: whoever lost `~/.sky/user_hash` is another user to SkyPilot, but still
+            # pays for the machines. The pool's uid tells machines apart.
             found = self.sdk.get(self.sdk.status(names, refresh=mode, all_users=True))
             return [cluster_of(record) for record in found]
 
@@ -176,7 +176,7 @@ class InstalledSky:
 
     @_limited(ASK_LIMIT_S, "the address of `{0}`")
     def endpoint(self, name: str, port: int) -> str:
-        """Return ``host:port`` where a port of a cluster is reached; refused until it is mapped."""
+        """Return the ``host:port`` of a cluster's port. RefusedError: it is not mapped yet."""
         with as_answer():
             found = self.sdk.get(self.sdk.endpoints(name, port))
         told = {int(key): str(value) for key, value in found.items()}
@@ -200,7 +200,7 @@ class InstalledSky:
 
     @_limited(DOWN_LIMIT_S, "the end of `{0}`")
     def down(self, name: str) -> None:
-        """End a cluster; return when SkyPilot says that it is gone. Missing is no error."""
+        """Terminate a cluster; return when SkyPilot says it is gone. No error if it is missing."""
         try:
             self.sdk.get(self.sdk.down(name))
         except Exception as error:
@@ -209,7 +209,7 @@ class InstalledSky:
 
     @_limited(REFRESH_LIMIT_S, "the catalogue of prices")
     def offers(self, resources: Mapping[str, Any]) -> Sale:
-        """Return what the catalogue sells for a `resources` section as it will be launched."""
+        """Return the catalogue's offers for `resources`, as they will be launched."""
         with as_answer():
             asked = self.sky.Resources.from_yaml_config(copy.deepcopy(dict(resources)))
         names = []
@@ -219,7 +219,7 @@ class InstalledSky:
 
     @_limited(REFRESH_LIMIT_S, "the features of clouds")
     def lacking(self, resources: Mapping[str, Any]) -> Mapping[str, str]:
-        """Return what each cloud with VMs lacks for such a `resources` section."""
+        """Return what each VM cloud lacks for `resources`."""
         found = {}
         for name in VM_CLOUDS:
             (asked,) = self.sky.Resources.from_yaml_config({**resources, "cloud": name})
@@ -228,7 +228,7 @@ class InstalledSky:
 
     @_limited(CHECK_LIMIT_S, "the check of credentials")
     def check(self, clouds: Sequence[str]) -> Mapping[str, str]:
-        """Test the credentials of clouds, all if none is named: cloud -> "" or what is wrong."""
+        """Test the credentials of clouds (all if empty): cloud -> "" or what is wrong."""
         told = io.StringIO()
         request = self.sdk.check(tuple(clouds) or None, verbose=False)
         enabled = self.sdk.stream_and_get(request, output_stream=told)
@@ -247,12 +247,12 @@ class InstalledSky:
 
     @_limited(ASK_LIMIT_S, "the version of the API server")
     def renew_server(self) -> str:
-        """End a local API server of another SkyPilot if it is idle; return what to say of it."""
+        """Stop an idle local API server of another SkyPilot version; return a message, or ""."""
         try:
             found = str(getattr(self.sdk.api_info(), "version", None) or self.sky.__version__)
         except Exception as error:
             if type(error).__name__ in ("ApiServerConnectionError", "RuntimeError"):
-                return ""  # there is none: it will be of this version
+                return ""  # no server: a new one will have this version
             raise
         if found == self.sky.__version__:
             return ""
@@ -261,14 +261,14 @@ class InstalledSky:
             return both
         own = importlib.import_module("sky.skylet.constants").SKYPILOT_SYSTEM_USER_ID
         asked = [one for one in self.sdk.api_status() if own not in (one.user_id, one.user_name)]
-        if any(request_of(one).active for one in asked):  # what it does for itself never ends
+        if any(request_of(one).active for one in asked):  # its internal requests never end
             return f"{both}: it is busy; run `sky api stop` once it is idle"
         self.sdk.api_stop()
         return f"{both}: it was idle and has been restarted"
 
     @_limited(REFRESH_LIMIT_S, "the credentials that a VM would get")
     def uploaded_credentials(self, clouds: Sequence[str]) -> Sequence[str] | None:
-        """Return the credentials' files that a VM gets anyway; None: a server elsewhere decides."""
+        """Return the credential files that a VM gets anyway; None: a remote API server decides."""
         return self._settings.uploaded(clouds)
 
     def _log(self, lines: int, read: Callable[..., object]) -> str:
@@ -287,7 +287,7 @@ class InstalledSky:
         with self._lock:
             if self.sdk is not None:
                 return
-            os.environ.setdefault(NO_REPORTS, "1")  # unless the user chose
+            os.environ.setdefault(NO_REPORTS, "1")  # unless the user has set it
             try:
                 self.sky = importlib.import_module("sky")
                 self.sdk = importlib.import_module("sky.client.sdk")
@@ -298,10 +298,10 @@ class InstalledSky:
                 ) from error
 
     def _asked(self, **filters: Any) -> list[Any]:
-        """Return requests. Without the first call a local server that died would say "none"."""
+        """Return API requests. Without the first call, a dead local server looks like "none"."""
         try:
             self.sdk.api_info()  # also tells the client which filters this server knows
         except Exception:
-            # Starts a local one; says what ails a remote one.
+            # Starts a local server; raises what is wrong with a remote one.
             self.sdk.status(["fogft-is-the-server-there"])
         return list(self.sdk.api_status(**filters))

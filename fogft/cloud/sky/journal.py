@@ -1,8 +1,8 @@
 """The journal of launches requested from SkyPilot: one small file for each replica.
 
 SkyPilot's own list misses a launch in its first seconds, and forgets why one failed. Losing the
-journal loses no machine: names and labels in the cloud say the same. All raise `StateError` where a
-file cannot be read or written.
+journal loses no machine: names and labels in the cloud say the same. All methods raise `StateError`
+if a file cannot be read or written.
 """
 
 import contextlib
@@ -23,15 +23,15 @@ from fogft.model.replica import Placement, ReplicaId
 
 
 class Stage(str, Enum):
-    """How far a launch has come. It only ever moves down this list."""
+    """The stage of a launch. It only ever moves down this list."""
 
-    ASKING = "asking"  # SkyPilot is being asked; whether it heard us is not known
-    LAUNCHING = "launching"  # it accepted: `request` says how it is doing
+    ASKING = "asking"  # requested from SkyPilot; unknown whether it arrived
+    LAUNCHING = "launching"  # SkyPilot accepted it as `request`
     SETTING_UP = "setting up"  # the VM runs; the job does not yet
     RUNNING = "running"  # the job runs
     STANDBY = "standby"  # the VM is stopped
-    FAILED = "failed"  # it never will; `failure` says why
-    ENDING = "ending"  # to be gone
+    FAILED = "failed"  # it will never run; `failure` says why
+    ENDING = "ending"  # being terminated
 
 
 _ORDER = list(Stage)
@@ -56,11 +56,11 @@ class Entry:
     running_at: float = 0.0  # when SkyPilot said that the machine runs
     set_up_at: float = 0.0  # when the job was seen to run
     port: int = LINK_PORT  # the link's; 0 where the replica dials out
-    # Types that may have come in place of the one ordered, and their prices (USD per hour).
+    # Types that may have been launched instead of the one ordered, and their USD per hour.
     instead: Mapping[str, float] = field(default_factory=dict)
-    # `host:port`, on a cloud that maps ports or of a machine on demand; empty until it is known
+    # `host:port` on a cloud that maps ports, or of an on-demand machine; empty until known
     endpoint: str = ""
-    starts: bool = False  # a standby: requests that have ended are of earlier launches
+    starts: bool = False  # a standby: ended requests are of earlier launches
 
 
 class Journal:
@@ -71,13 +71,13 @@ class Journal:
         make_folder(folder)
 
     def open(self, entry: Entry, files: Mapping[str, bytes]) -> bool:
-        """Write a new entry and its files; False when there is one for this id already."""
+        """Write a new entry and its files; False if this id already has one."""
         with locked(self._folder / "journal.lock"):
             if self._path(entry.id).exists():
                 return False
             folder = self.files(entry.id)
             make_folder(folder)
-            write_json(self._path(entry.id), to_plain(entry))  # first: what it lists is removed
+            write_json(self._path(entry.id), to_plain(entry))  # first, or its files might stay
             try:
                 for name, content in files.items():
                     write_whole(folder / name, content)
@@ -101,7 +101,7 @@ class Journal:
             return changed
 
     def close(self, id: ReplicaId) -> None:
-        """Forget a replica that is gone, and remove its files. Repeatable."""
+        """Forget a replica that is gone, and remove its files. Idempotent."""
         with locked(self._folder / "journal.lock"):
             self._remove(id)
 
@@ -117,7 +117,7 @@ class Journal:
         return read_as(Entry, self._path(id), hint)
 
     def entries(self, pool_uid: str = "") -> list[Entry]:
-        """Return the entries of one pool, or of all, ordered by id; a damaged one is an error."""
+        """Return the entries of one pool, or of all, sorted by id; a damaged entry is an error."""
         ids = (replica_of(path.stem) for path in self._folder.glob("*.json"))
         wanted = sorted(id for id in ids if id and pool_uid in ("", id.pool_uid))
         return [entry for entry in map(self.get, wanted) if entry is not None]

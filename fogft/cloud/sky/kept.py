@@ -1,4 +1,4 @@
-"""Answers that are kept for a while, and renewed elsewhere before they are too old."""
+"""A cached answer that is renewed in the background before it is too old."""
 
 import math
 from collections.abc import Callable
@@ -12,21 +12,21 @@ T = TypeVar("T")
 
 @dataclass
 class Kept(Generic[T]):
-    """The answer to `ask`: asked anew by `submit` after `fresh_s`, waited for after `usable_s`."""
+    """Caches `ask()`: renews it through `submit` after `fresh_s`, waits for it after `usable_s`."""
 
     ask: Callable[[], T]
     fresh_s: float
     usable_s: float
     clock: Callable[[], float]
     submit: Callable[[Callable[[], None]], object]
-    failed: Callable[[CloudError | SpecError], None]  # hears why it was not renewed elsewhere
+    failed: Callable[[CloudError | SpecError], None]  # told why a renewal through `submit` failed
     answer: T | None = field(default=None, init=False)  # None: there was none yet
     _at: float = field(default=-math.inf, init=False)
-    _forgotten: int = field(default=0, init=False)  # how often
+    _forgotten: int = field(default=0, init=False)  # how many times `forget` was called
     _renewing: bool = field(default=False, init=False)
 
     def get(self) -> T:
-        """Return the answer."""
+        """Return the cached answer, or ask if there is none or it is too old."""
         age_s = self.clock() - self._at
         if self.answer is None or not 0 <= age_s < self.usable_s:  # a clock may be set back
             return self.renew()
@@ -39,13 +39,13 @@ class Kept(Generic[T]):
         """Ask now; return the answer."""
         begun_at, forgotten = self.clock(), self._forgotten
         answer = self.ask()
-        # What was asked before it was to be forgotten is no newer for being answered after.
+        # An answer requested before `forget` is stale, even if it arrives afterwards.
         self.answer = answer
         self._at = begun_at if forgotten == self._forgotten else -math.inf
         return answer
 
     def forget(self) -> None:
-        """Ask the next time."""
+        """Make the next `get` ask again."""
         self._forgotten += 1
         self._at = -math.inf
 

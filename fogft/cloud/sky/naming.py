@@ -1,7 +1,7 @@
 """Names and labels of a replica's machine in a cloud. Pure.
 
-What does not match is not ours, and nothing that is not ours is ever touched: every name that
-reaches SkyPilot is made by `cluster_name`.
+A machine whose name or labels do not match is not ours and is never touched: `cluster_name` makes
+every cluster name that is passed to SkyPilot.
 """
 
 import re
@@ -31,13 +31,13 @@ _NOT_A_LABEL = re.compile(r"[^a-z0-9_-]")
 def cluster_name(id: ReplicaId) -> str:
     """Return the name of a replica's cluster: ``fogft-<uid>-<slot>-<generation>``."""
     name = f"{PREFIX}{id.pool_uid}-{id.slot}-{id.generation}"
-    if replica_of(name) != id:  # it could mean something else
+    if replica_of(name) != id:  # the name would not parse back to this id
         raise ValueError(f"not a replica's id: {id!r}")
     return name
 
 
 def replica_of(name: str) -> ReplicaId | None:
-    """Return whose cluster a name belongs to, or None when it is not one of ours."""
+    """Return the replica whose cluster has this name, or None if it is not one of ours."""
     match = _NAME.fullmatch(name)
     if match is None:
         return None
@@ -46,7 +46,7 @@ def replica_of(name: str) -> ReplicaId | None:
 
 
 def labels(order: Launch, owner: str) -> dict[str, str]:
-    """Return the labels of an ordered machine, in characters that every cloud takes."""
+    """Return the labels for a machine to launch, in characters that every cloud accepts."""
     return {
         POOL: order.id.pool_uid,
         SLOT: str(order.id.slot),
@@ -60,7 +60,7 @@ def labels(order: Launch, owner: str) -> dict[str, str]:
 
 
 def replica_of_labels(found: Mapping[str, str]) -> ReplicaId | None:
-    """Return whose machine carries these labels, or None when it is not one of ours."""
+    """Return the replica whose machine has these labels, or None if it is not one of ours."""
     uid, slot, generation = (found.get(key, "") for key in (POOL, SLOT, GENERATION))
     if not (POOL_UID_PATTERN.fullmatch(uid) and _NUMBER.fullmatch(slot)):
         return None
@@ -68,22 +68,22 @@ def replica_of_labels(found: Mapping[str, str]) -> ReplicaId | None:
 
 
 def usd_per_hour(found: Mapping[str, str]) -> float:
-    """Return the price that the labels carry; 0 where they carry none."""
+    """Return the price in the labels; 0 if there is none."""
     text = found.get(PRICE, "")
     return int(text) / 1e6 if text.isascii() and text.isdigit() else 0.0
 
 
 def link_port(found: Mapping[str, str]) -> int:
-    """Return the link's port that the labels carry; the usual one where they carry none."""
+    """Return the link's port in the labels; the default port if there is none."""
     text = found.get(PORT, "")
     return int(text) if _NUMBER.fullmatch(text) else LINK_PORT
 
 
 def label_value(text: str) -> str:
-    """Return a text as a label's value: lower case, 63 characters at most."""
+    """Convert a text to a label value: lower case, at most 63 characters."""
     return _NOT_A_LABEL.sub("_", text.lower())[:63]
 
 
 def infra(placement: Placement) -> str:
-    """Return a placement in SkyPilot's words: ``aws/us-west-2/us-west-2a``."""
+    """Return a placement in SkyPilot's `infra` syntax: ``aws/us-west-2/us-west-2a``."""
     return "/".join(part for part in (placement.cloud, placement.region, placement.zone) if part)

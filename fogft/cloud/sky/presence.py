@@ -1,7 +1,7 @@
 """A pool's machines, from the journal, SkyPilot's list and the providers' lists.
 
 SkyPilot's list decides what exists; the journal says what a launch is waiting for and why it
-failed; the provider is heard where SkyPilot is silent.
+failed; the provider is asked about machines that SkyPilot does not list.
 """
 
 import logging
@@ -24,15 +24,15 @@ from fogft.model.replica import Machine, MachinePhase, Placement, ReplicaId
 log = logging.getLogger(__name__)
 
 CLUSTERS_FRESH_S = 5.0
-CLUSTERS_USABLE_S = 15.0  # so long nobody waits for a newer list, which is under way
+CLUSTERS_USABLE_S = 15.0  # until then callers get the old list while a newer one is fetched
 PROVIDER_SURE_AFTER_S = 60.0  # a provider's list may miss a machine in its first seconds
 
 
 def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -> Machine:
-    """Return a machine that the journal knows; the others may say nothing of it."""
+    """Return a machine that has a journal entry; `cluster` and `instance`: None if not found."""
     stage, failure, progress = entry.stage, entry.failure, ""
     if stage is Stage.ENDING:
-        # Listed until it is certain that nothing runs, so that a crash in between is repaired.
+        # Listed until it is certainly gone, so that a crash in between is repaired.
         failure = failure or _error("its end was not confirmed")
     is_stopped = cluster is not None and cluster.state is ClusterState.STOPPED
     if is_stopped and stage in (Stage.SETTING_UP, Stage.RUNNING):
@@ -73,7 +73,7 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
 
 
 def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
-    """Return a machine that SkyPilot lists and the journal has lost."""
+    """Return a machine that SkyPilot lists but that has no journal entry."""
     phase, failure, endpoint = MachinePhase.PROVISIONING, None, None
     if cluster.state is ClusterState.UP:
         phase = MachinePhase.RUNNING
@@ -98,7 +98,7 @@ def of_cluster(id: ReplicaId, cluster: Cluster, *, launching: bool) -> Machine:
 
 
 def of_instance(instance: Instance) -> Machine:
-    """Return a machine that only the provider knows: it cannot be used and must be ended."""
+    """Return a machine that only the provider lists: it is unusable and must be terminated."""
     return Machine(
         id=instance.id,
         placement=instance.placement,
@@ -121,7 +121,7 @@ def _error(words: str) -> Reason:
 
 
 def _as_found(entry: Entry, found: Placement) -> Placement:
-    """Keep what was ordered, but for a zone that the cloud has chosen, and a type in its place."""
+    """Return the ordered placement, with the zone and the substitute type that the cloud chose."""
     asked = entry.placement
     if (asked.cloud, asked.region) != (found.cloud, found.region):
         return asked
@@ -131,7 +131,7 @@ def _as_found(entry: Entry, found: Placement) -> Placement:
 
 @dataclass
 class Presence:
-    """Lists the machines of a pool; `submit` runs a function elsewhere."""
+    """Lists the machines of a pool; `submit` runs a function in the background."""
 
     sky: InstalledSky
     journal: Journal
@@ -140,7 +140,7 @@ class Presence:
     submit: Callable[[Callable[[], None]], object]
 
     def __post_init__(self) -> None:
-        self.clusters = Kept(  # SkyPilot's list, of all pools and of everybody's clusters
+        self.clusters = Kept(  # SkyPilot's list of all clusters, of any pool and user
             partial(self.sky.clusters, None, refresh=False),
             *(CLUSTERS_FRESH_S, CLUSTERS_USABLE_S, self.clock, self.submit),
             failed=lambda error: log.info("list_not_renewed reason=%r", error.message),
@@ -150,7 +150,7 @@ class Presence:
     def machines(
         self, pool_uid: str, entries: Iterable[Entry], regions: Mapping[str, Iterable[str]]
     ) -> list[Machine]:
-        """Return a pool's machines, ordered by id; `regions` is where they can be, by cloud."""
+        """Return a pool's machines, sorted by id; `regions`: cloud -> regions where they may be."""
         known = {entry.id: entry for entry in entries}
         clusters = _of_pool(pool_uid, self.clusters.get())
         if any(e.stage in ON_THE_MACHINE and e.id not in clusters for e in known.values()):
@@ -199,7 +199,7 @@ class Presence:
         self.census.forget(entry.id)
 
     def _drop_record(self, id: ReplicaId) -> None:
-        """Let SkyPilot find out that a machine is gone; it drops its record then."""
+        """Have SkyPilot refresh the record of a machine that is gone, so that it drops it."""
         try:
             self.sky.clusters(cluster_name(id), refresh=True)
         except CloudError as error:

@@ -1,6 +1,6 @@
-"""What can be bought, and for how much: SkyPilot's catalogue, live spot prices, disks, quotas.
+"""Offers and their prices: SkyPilot's catalogue, live spot prices, disks, quotas.
 
-SkyPilot renews its catalogue every few hours; spot prices move meanwhile.
+SkyPilot updates its catalogue every few hours; spot prices change in between.
 """
 
 import json
@@ -28,10 +28,10 @@ K = TypeVar("K")
 V = TypeVar("V")
 FRESH_S = 300.0
 USABLE_S = 3600.0
-# List prices of 2024-11 in each cloud's cheapest regions, for the disk that SkyPilot orders where
-# no `disk_tier` is named. Of others nothing is known; many sell machines with both.
+# List prices of 2024-11 in each cloud's cheapest regions, for SkyPilot's disk without a
+# `disk_tier`. Other clouds' prices are unknown; many include disk and address in the machine.
 HOURS_A_MONTH = 730.0
-# gp3 on AWS, a balanced disk on GCP; Azure's Premium SSDs have steps, of which this is the usual.
+# gp3 on AWS, a balanced disk on GCP; Azure prices Premium SSDs in steps: this is the usual one.
 DISK_USD_PER_GB_MONTH = {"aws": 0.08, "azure": 0.15, "gcp": 0.10}
 ADDRESS_USD_PER_HOUR = {"aws": 0.005, "azure": 0.005, "gcp": 0.005}
 SPOT_ADDRESS_USD_PER_HOUR = {"gcp": 0.0025}
@@ -41,14 +41,14 @@ _GB = {"k": 1e-6, "m": 1e-3, "": 1.0, "g": 1.0, "t": 1e3, "p": 1e6}
 
 @dataclass(frozen=True)
 class _Sold:
-    offers: tuple[Offer, ...]  # of each location the cheapest
-    instead: Mapping[Placement, Sequence[Offer]]  # what else would do
+    offers: tuple[Offer, ...]  # the cheapest of each `Placement.supply`
+    instead: Mapping[Placement, Sequence[Offer]]  # the alternatives to each offer
     left_out: Collection[str]  # in sentences
 
 
 @dataclass
 class Prices:
-    """Offers with prices, cached for a while; `submit` runs a function elsewhere."""
+    """Offers with prices, cached for a while; `submit` runs a function in the background."""
 
     sky: InstalledSky
     providers: Mapping[str, Provider]
@@ -56,13 +56,13 @@ class Prices:
     submit: Callable[[Callable[[], None]], object]
 
     def __post_init__(self) -> None:
-        self._kept: dict[str, Kept[_Sold]] = {}  # by what was asked
-        self._asked: dict[str, float] = {}  # when, by the same
+        self._kept: dict[str, Kept[_Sold]] = {}  # by the `resources` asked for
+        self._asked: dict[str, float] = {}  # when last asked, by the same key
         self._quotas: dict[tuple[str, str], tuple[float, float | None]] = {}
         self._unread: dict[str, str] = {}  # cloud -> why its quotas cannot be read
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """See `fogft.cloud.port.Cloud.offers`. The first call takes seconds, later ones none."""
+        """See `fogft.cloud.port.Cloud.offers`. The first call takes seconds, later ones rarely."""
         key = json.dumps(resources, sort_keys=True, default=str)
         if key not in self._kept:
             self._kept[key] = Kept(
@@ -74,12 +74,12 @@ class Prices:
         return self._kept[key].get().offers
 
     def instead(self, placement: Placement, limit: float | None) -> Sequence[Offer]:
-        """Return what else would do for at most `limit` US dollars per hour, the cheapest first."""
+        """Return alternatives to a placement for at most `limit` USD per hour, cheapest first."""
         lately = self.clock() - USABLE_S
-        keys = [key for key, at in list(self._asked.items()) if at >= lately]  # another may ask
+        keys = [key for key, at in list(self._asked.items()) if at >= lately]  # threads may add
         used = [self._kept[key].answer for key in keys]
         asked = [sold.instead[placement] for sold in used if sold and placement in sold.instead]
-        allowed = [{offer.placement for offer in others} for others in asked]  # by each who asked
+        allowed = [{offer.placement for offer in others} for others in asked]  # for each request
         found = [o for o in asked[0] if all(o.placement in a for a in allowed)] if asked else []
         return [offer for offer in found if limit is None or offer.usd_per_hour <= limit]
 
@@ -89,7 +89,7 @@ class Prices:
 
     @property
     def regions(self) -> Mapping[str, set[str]]:
-        """Cloud -> regions that were offered: where machines of ours can be."""
+        """Cloud -> regions that were offered, where our machines may be."""
         out: dict[str, set[str]] = {}
         for place in (offer.placement for sold in self._answers() for offer in sold.offers):
             out.setdefault(place.cloud, set()).add(place.region)
@@ -118,7 +118,7 @@ class Prices:
         return _Sold(tuple(firsts), instead, left_out)
 
     def _within_quotas(self, sale: Sale, left_out: list[str]) -> Sequence[Offer]:
-        """Return the offers that the account's quotas have room for, were nothing else running."""
+        """Return the offers that fit the account's quotas, assuming that nothing else runs."""
         needed: dict[Placement, tuple[tuple[str, str, str], float]] = {}  # which quota, how much
         for place in (offer.placement for offer in sale.offers):
             code, vcpus = sale.quotas.get((place.instance, place.spot), ("", 0.0))
@@ -185,7 +185,7 @@ class Prices:
         def priced(offer: Offer) -> Offer:
             place = offer.placement
             found = answers.get((place.cloud, place.region), {}) if place.spot else {}
-            # Without a zone the cloud chooses one: count with the dearest.
+            # Without a zone the cloud chooses one: assume the most expensive.
             prices = [
                 price
                 for (zone, kind), price in found.items()
@@ -209,7 +209,7 @@ def _with_extras(offer: Offer, resources: Mapping[str, Any]) -> Offer:
 
 
 def extras_usd_per_hour(placement: Placement, resources: Mapping[str, Any]) -> float:
-    """Return what the address and the disk of a machine of a `resources` section cost."""
+    """Return what a machine's address and disk cost, in US dollars per hour."""
     address = ADDRESS_USD_PER_HOUR.get(placement.cloud, 0.0)
     if placement.spot:
         address = SPOT_ADDRESS_USD_PER_HOUR.get(placement.cloud, address)
@@ -217,12 +217,12 @@ def extras_usd_per_hour(placement: Placement, resources: Mapping[str, Any]) -> f
 
 
 def disk_usd_per_hour(placement: Placement, resources: Mapping[str, Any]) -> float:
-    """Return what the disk of a machine of a `resources` section costs."""
+    """Return what a machine's disk costs, in US dollars per hour."""
     size_gb = disk_gb(alternative(resources, placement).get("disk_size", DISK_GB))
     return size_gb * DISK_USD_PER_GB_MONTH.get(placement.cloud, 0.0) / HOURS_A_MONTH
 
 
 def disk_gb(asked: Any) -> float:
-    """Return a `disk_size` as SkyPilot reads it, in GB; 0 for what is none."""
+    """Parse a `disk_size` as SkyPilot does, in GB; 0 if it is not a size."""
     match = _SIZE.fullmatch(str(asked).strip())
     return float(match[1]) * _GB[match[2].lower()] if match else 0.0

@@ -1,4 +1,4 @@
-"""The provider itself, asked directly: what exists with our labels, and what it costs.
+"""The interface to a cloud provider's own API: machines with our labels, and prices.
 
 SkyPilot's database can be lost; the provider's own list cannot.
 """
@@ -15,54 +15,54 @@ class Instance:
     """A machine in the provider's list that carries our labels and still costs money."""
 
     id: ReplicaId
-    key: str  # the provider's own name of it
+    key: str  # the provider's own id of the machine
     placement: Placement
     labels: Mapping[str, str]
     public_ip: str = ""
     launched_at: float = 0.0  # seconds since the epoch
-    running: bool = True  # or about to; a stopped one's disk still costs
+    running: bool = True  # or starting; a stopped machine still costs money for its disk
 
 
 class NotAllowedError(Exception):
-    """This account may not list machines: SkyPilot's list has to do."""
+    """The account lacks a permission. For machines, SkyPilot's list is used instead."""
 
 
 class Provider(Protocol):
-    """One cloud, by its own interface: what is left out is not known. From any thread, with limits.
+    """One cloud's own API. Optional methods default to "unknown". Thread-safe, with time limits.
 
-    All raise `CloudUnreachable` when the cloud cannot tell, or it is not known whether it heard,
-    and `NotAllowedError` where the account may not.
+    All raise `CloudUnreachable` if the cloud does not answer or may not have got the request,
+    and `NotAllowedError` if the account lacks the permission.
     """
 
     cloud: str  # as in `Placement.cloud`
 
     def instances(self, regions: Iterable[str] | None, pool_uid: str = "") -> Sequence[Instance]:
-        """List what has our labels, of one pool or (empty) all, in some regions or (None) all."""
+        """List instances with our labels, of one pool (empty: all), in some regions (None: all)."""
 
     def terminate(self, instance: Instance) -> None:
-        """Ask for the end of an instance. One that is gone is no error."""
+        """Request the termination of an instance. No error if it is gone."""
 
     def end_when_shut_down(self, instance: Instance) -> None:
-        """Have a machine on demand end, and not merely stop, when it shuts itself down."""
+        """Make an on-demand machine terminate, rather than stop, when it shuts itself down."""
         return
 
     def firewall(self, region: str, ports: Iterable[int], sources: Iterable[str]) -> str:
-        """Let only some networks reach some ports; return the rule's name, empty for none.
+        """Allow only some networks to reach some ports; return the rule's name, empty for none.
 
-        Repeatable. Raises `CloudError` where something else goes by that name.
+        Idempotent. Raises `CloudError` if a different rule has that name.
         """
         return ""
 
     def warning(self) -> str:
-        """Return what a VM there may do that it need not; empty where nothing is known."""
+        """Return a warning about unneeded permissions of VMs; empty if none are known."""
         return ""
 
     def credentials_end_at(self) -> float | None:
-        """Return when the credentials here end, in seconds since the epoch; None for unknown."""
+        """Return when the local credentials expire, in seconds since the epoch; None: unknown."""
         return None
 
     def quota(self, region: str, code: str) -> float | None:
-        """Return how many vCPUs an account may run there at once; None where that is unknown."""
+        """Return how many vCPUs the account may run in a region at once; None if unknown."""
         return None
 
     def spot_prices(self, region: str, instances: Iterable[str]) -> Mapping[tuple[str, str], float]:

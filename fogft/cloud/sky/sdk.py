@@ -1,7 +1,7 @@
 """Plain values for SkyPilot's answers and errors. Pure.
 
-No object of its own gets past `installed`. The line that matters: "nobody knows" (the API server,
-the network, the credentials) against "the answer is no". From the first nothing may be concluded.
+SkyPilot's own objects do not leave `installed`. The key distinction is between "unknown" (API
+server, network or credentials failed) and "the answer is no": conclude nothing from the first.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ class RefusedError(CloudError):
 
 @dataclass(frozen=True)
 class Request:
-    """A launch request that the API server knows of. `queued`: no worker has begun with it."""
+    """A launch request that the API server knows. `queued`: no worker has started on it."""
 
     id: str
     active: bool
@@ -36,7 +36,7 @@ class Request:
 
 
 class ClusterState(Enum):
-    """SkyPilot's word for a cluster. What was terminated or preempted is not listed at all."""
+    """SkyPilot's state of a cluster. Terminated and preempted clusters are not listed at all."""
 
     INIT = "INIT"  # being launched, or in a state that SkyPilot does not understand
     UP = "UP"
@@ -46,14 +46,14 @@ class ClusterState(Enum):
 
 @dataclass(frozen=True)
 class Cluster:
-    """A record of SkyPilot's list."""
+    """A cluster in SkyPilot's list."""
 
     name: str
     state: ClusterState
-    placement: Placement | None = None  # none while SkyPilot has not decided, or when it forgot
+    placement: Placement | None = None  # None if SkyPilot has not decided yet, or has forgotten
     head_ip: str = ""
     launched_at: float = 0.0  # seconds since the epoch
-    progress: str = ""  # what SkyPilot says it is doing, or why the state is what it is
+    progress: str = ""  # SkyPilot's current activity, or the reason for the state
     labels: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -61,14 +61,14 @@ class Cluster:
 class Sale:
     """The offers that SkyPilot has for a `resources` section."""
 
-    offers: Sequence[Offer]  # of each location several that would do, at the catalogue's prices
-    left_out: Mapping[str, str] = field(default_factory=dict)  # cloud -> why not there
-    # Instance type and whether spot -> the quota's code, and how many vCPUs it needs.
+    offers: Sequence[Offer]  # several that match in each location, at the catalogue's prices
+    left_out: Mapping[str, str] = field(default_factory=dict)  # cloud -> why it has no offers
+    # (instance type, whether spot) -> the quota's code, and how many vCPUs the machine needs.
     quotas: Mapping[tuple[str, bool], tuple[str, float]] = field(default_factory=dict)
 
 
 class JobState(Enum):
-    """What became of the job that runs the server proxy."""
+    """The state of the job that runs the server proxy."""
 
     PENDING = "pending"
     SETTING_UP = "setting up"
@@ -78,7 +78,7 @@ class JobState(Enum):
     MISSING = "missing"
 
 
-# Their meaning is "nobody knows": the server, the network or the credentials, not the cluster.
+# Errors that mean "unknown": of the server, the network or the credentials, not the cluster.
 UNKNOWN = frozenset(
     (
         *("ApiServerConnectionError", "ApiServerAuthenticationError", "APIVersionMismatchError"),
@@ -103,7 +103,7 @@ _CREDENTIALS = ("NoCloudAccessError", "CloudUserIdentityError", "InvalidCloudCre
 
 
 def translated(error: BaseException, subject: str) -> CloudError:
-    """Return what an exception out of SkyPilot means: `CloudUnreachable` or `RefusedError`."""
+    """Convert an exception from SkyPilot to `CloudUnreachable` or `RefusedError`."""
     if isinstance(error, CloudError):
         return error
     kind = type(error).__name__
@@ -115,7 +115,7 @@ def translated(error: BaseException, subject: str) -> CloudError:
 
 @contextlib.contextmanager
 def as_answer() -> Iterator[None]:
-    """Take an exception as SkyPilot's answer, except those that say nothing is known."""
+    """Convert exceptions to `RefusedError`, except those that mean "unknown"."""
     try:
         yield
     except Exception as error:
@@ -129,7 +129,7 @@ def as_answer() -> Iterator[None]:
 def _is_unknown(error: BaseException) -> bool:
     if type(error).__name__ in UNKNOWN or isinstance(error, OSError):
         return True
-    # A bare RuntimeError may speak of the API server, as SkyPilot's `get` words it.
+    # SkyPilot's `get` raises a bare RuntimeError for some failures of the API server.
     return type(error) is RuntimeError and str(error).startswith(
         ("Failed to get request", "Failed to connect", "SkyPilot API server")
     )
@@ -154,7 +154,7 @@ def _hint(kind: str) -> str:
 
 
 def cluster_of(record: Any) -> Cluster:
-    """Return a `StatusResponse` of SkyPilot's as our record."""
+    """Convert SkyPilot's `StatusResponse` to a `Cluster`."""
     state = getattr(record.status, "value", str(record.status))
     chosen = getattr(record.handle, "launched_resources", None)
     placement = None
@@ -178,14 +178,14 @@ def cluster_of(record: Any) -> Cluster:
 
 
 def request_of(payload: Any) -> Request:
-    """Return a `RequestPayload` of SkyPilot's as our record."""
+    """Convert SkyPilot's `RequestPayload` to a `Request`."""
     return Request(
         payload.request_id, active=payload.status not in ENDED, queued=payload.status in _QUEUED
     )
 
 
 def told_reasons(output: str) -> dict[str, str]:
-    """Return cloud -> reason, out of what ``sky check`` prints of clouds that do not work."""
+    """Return cloud -> reason for the unusable clouds in the output of ``sky check``."""
     reasons: dict[str, str] = {}
     cloud = ""
     for line in map(plain, output.splitlines()):

@@ -1,8 +1,8 @@
 """SkyPilot settings that fogft applies to a launch, unless the user has set them.
 
-A VM gets no credentials: by default it would get those of every cloud, and with any of them
-SkyPilot's own ssh key. On AWS a guard ends it where no replica ever runs on it: SkyPilot sets
-`autostop` only when a machine is wholly set up. To an API server elsewhere goes the guard only.
+A VM gets no credentials: SkyPilot's default is those of every cloud and, with any of them, its own
+ssh key. On AWS a guard script ends a VM on which no replica runs: SkyPilot sets `autostop` only
+once a machine is fully set up. A remote API server gets the guard, but decides on credentials.
 """
 
 import base64
@@ -20,8 +20,8 @@ from fogft.model.replica import ReplicaId
 NO_UPLOAD, UPLOAD = "NO_UPLOAD", "LOCAL_CREDENTIALS"
 ENDED_BY_FILES = frozenset({"nebius", "oci", "vast"})
 """Clouds whose VMs have no identity of their own: to end itself one needs its cloud's files."""
-GROUP = ("aws", "security_group_name")  # by patterns of clusters' names
-GUARD = ("aws", "post_provision_runcmd")  # handed to the machine with the order itself
+GROUP = ("aws", "security_group_name")  # by patterns of cluster names
+GUARD = ("aws", "post_provision_runcmd")  # part of the launch request itself
 EACH_BOOT = "/var/lib/cloud/scripts/per-boot"
 ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60
 """A launch takes 15 minutes at most (`following.LAUNCH_LIMIT_S`), a set-up its own limit."""
@@ -29,7 +29,7 @@ NO_REPORTS = "SKYPILOT_DISABLE_USAGE_COLLECTION"
 
 
 def guard() -> str:
-    """Return the guard's command for cloud-init: one line, for a shell, which returns at once."""
+    """Return the shell line with which cloud-init installs and starts the guard, not waiting."""
     text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(ALONE_MINUTES))
     packed = base64.b64encode(text.encode()).decode()
     script = f"{EACH_BOOT}/fogft-guard"
@@ -38,15 +38,15 @@ def guard() -> str:
 
 
 class Settings:
-    """The settings of this process, which SkyPilot keeps for all of it."""
+    """SkyPilot's settings, which are global to this process."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._set: dict[str, str] = {}  # cloud -> what was written here, and not by the user
+        self._set: dict[str, str] = {}  # cloud -> the value written here, not by the user
         self._launched: set[str] = set()
 
     def apply(self, clouds: Iterable[str], id: ReplicaId | None = None, group: str = "") -> None:
-        """Set what a launch is to have, beside the user's own; `group`: its security group."""
+        """Apply a launch's settings on top of the user's own; `group`: its security group."""
         config = importlib.import_module("sky.skypilot_config")
         with self._lock:
             self._launched |= ENDED_BY_FILES.intersection(clouds)
@@ -67,7 +67,7 @@ class Settings:
                 config.apply_cli_config(changes)  # as `sky launch --config` does
 
     def uploaded(self, clouds: Iterable[str]) -> list[str] | None:
-        """Return the credentials' files that a VM gets anyway; None: a server elsewhere decides."""
+        """Return the credential files that a VM gets anyway; None: a remote API server decides."""
         self.apply(clouds)
         if _is_elsewhere():
             return None
@@ -79,7 +79,7 @@ class Settings:
 
 
 def _with_group(config: Any, clusters: str, group: str) -> list[str]:
-    """Return the change that gives clusters a security group, if there is one to make."""
+    """Return the setting that gives clusters a security group; empty if it is set already."""
     found = config.get_nested(GROUP, None) or []
     given = [{"*": found}] if isinstance(found, str) else list(found)
     wanted = [one for one in given if clusters not in one]
@@ -93,14 +93,14 @@ def _is_elsewhere() -> bool:
 
 
 def _with_identity() -> list[str]:
-    """Return the clouds for which SkyPilot's own schema knows the setting."""
+    """Return the clouds that have `remote_identity` in SkyPilot's own schema."""
     schema = importlib.import_module("sky.utils.schemas").get_config_schema()
     parts = schema["properties"].items()
     return [name for name, part in parts if "remote_identity" in part.get("properties", {})]
 
 
 def _identity(config: Any, cloud: str) -> Any:
-    """Return what is set for a cloud, in the workspace that is active or for all of them."""
+    """Return a cloud's `remote_identity`, set in the active workspace or globally."""
     return config.get_effective_workspace_region_config(
         cloud=cloud.lower(), region=None, keys=("remote_identity",), default_value=None
     )

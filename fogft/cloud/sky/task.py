@@ -1,6 +1,6 @@
-"""Make the SkyPilot task of one replica: the pool file's task on `templates/sky_task.yaml`.
+"""Build a replica's SkyPilot task: the pool file's task merged with `templates/sky_task.yaml`.
 
-All else passes through untouched; fields that a pool decides itself are refused, not ignored.
+Other fields pass through unchanged; fields that the pool controls are rejected, not ignored.
 """
 
 import copy
@@ -18,12 +18,12 @@ from fogft.model.replica import Placement
 from fogft.poolfile.named_clouds import alternatives, place, sells
 
 OURS = "~/.fogft"
-DISK_GB = 64  # where the pool file names none; SkyPilot takes 256
+DISK_GB = 64  # default if the pool file sets none; SkyPilot's default is 256
 _CHOICES = (
     *("infra", "cloud", "region", "zone", "any_of", "ordered"),
     *("instance_type", "use_spot", "accelerators"),
 )
-FEATURES = ("use_spot", "ports", "autostop")  # what a cloud may lack, whatever it sells
+FEATURES = ("use_spot", "ports", "autostop")  # a cloud may lack these for all its machines
 _REFUSED_RESOURCES = {
     "ports": "only the link's port is opened; robots reach the services through it",
     "autostop": "a replica runs as long as its pool needs it",
@@ -32,7 +32,7 @@ _REFUSED_RESOURCES = {
 
 
 def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
-    """Raise `SpecError` for a field of a checked pool file's task that a pool decides itself."""
+    """Raise `SpecError` if a checked pool file's task sets a field that the pool controls."""
     for target in task.get("file_mounts") or {}:
         if os.path.normpath(str(target)).startswith(OURS):
             raise SpecError.of_key(f"file_mounts.{target}", f"`{OURS}` is fogft's own folder")
@@ -53,7 +53,7 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
 
 
 def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a `resources` section with all that a launch adds and a cloud may not have."""
+    """Return `resources` plus what a launch adds to it, which a cloud may not support."""
     ours = dict(read()["resources"])
     ours["ports"] = list(resources.get("ports", [LINK_PORT]))
     if not ours["ports"]:
@@ -63,7 +63,7 @@ def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[str, Any]:
-    """Return the alternative of a section that a placement was bought by."""
+    """Return the alternative in `resources` that a placement was offered for."""
     machine = placement.instance.partition("+")[0]
     for _, entry in alternatives(resources):
         if (
@@ -85,7 +85,7 @@ def build(
 ) -> dict[str, Any]:
     """Return the task of one replica, for exactly one location.
 
-    `instead` is tried, in order, where there is no capacity.
+    `instead`: placements to try, in order, if there is no capacity.
     """
     refuse_what_cannot_be_honoured(order.task)
     template = read()
@@ -114,9 +114,9 @@ def build(
 
 
 def setup_of(asked: Mapping[str, Any], template: Mapping[str, Any]) -> str:
-    """Return the set-up of a pool file's task, which makes the environment and installs fogft."""
+    """Return the set-up script for a task, which creates the environment and installs fogft."""
     setup = str(asked.get("setup") or ":").rstrip()
-    # The user's text last, as it is.
+    # The user's text is filled in last, so that marks in it stay unchanged.
     marks = {"@SETUP_LIMIT_S@": str(SETUP_LIMIT_S), "@SETUP@": setup}
     return str(_filled(template["setup"], marks))
 

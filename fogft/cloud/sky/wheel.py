@@ -1,6 +1,6 @@
-"""What a VM installs: the running fogft as a wheel, and a lock file of its dependencies.
+"""Build what a VM installs: the running fogft as a wheel, and a lock file of its dependencies.
 
-The wheel has the same bytes each time. `up` makes the lock; a generation keeps its first one.
+The wheel is reproducible byte for byte. `up` makes the lock; a generation keeps its first lock.
 """
 
 import base64
@@ -30,11 +30,11 @@ FILES = {"requirements.txt": "fogft", "requirements-ros.txt": "fogft[ros]"}
 _COMPILE = ("pip", "compile", "--quiet", "--generate-hashes", "--no-header", "--no-annotate")
 _FOR_ALL = ("--universal", "--python-version", "3.10", "--no-emit-package", "fogft", "-")
 _LIMIT_S = 120.0
-_SHOWN = 400  # characters of what `uv` says
+_SHOWN = 400  # characters of `uv`'s output
 
 
 def make(folder: Path) -> Path:
-    """Write the wheel into a folder below `folder` that is named after its content; return that."""
+    """Write the wheel to a subfolder of `folder` named by its hash; return the subfolder."""
     name, content = pack()
     target = folder / hashlib.sha256(content).hexdigest()[:16]
     if not (target / name).is_file():
@@ -117,7 +117,7 @@ def _compiled(wanted: str) -> str:
 
 
 class LockFolder:
-    """The locks on disk: the newest of each wheel, and each generation's."""
+    """Lock files on disk: the newest one for each wheel, and each generation's own."""
 
     def __init__(self, folder: Path, resolve: Callable[[Path], Locks]) -> None:
         make_folder(folder)
@@ -125,7 +125,7 @@ class LockFolder:
         self._resolve = resolve
 
     def renew(self, wheel: Path) -> Mapping[str, bytes]:
-        """Renew the lock for a wheel's next generations; return it. CloudError: there is none."""
+        """Update the lock for a wheel's next generations; return it. CloudError: there is none."""
         newest = self._newest(wheel)
         try:
             write_json(newest, to_plain(self._resolve(wheel)))
@@ -135,14 +135,14 @@ class LockFolder:
         return _as_files(read_as(Locks, newest))
 
     def of(self, generation: str, wheel: Path) -> Mapping[str, bytes]:
-        """Return a generation's lock as files; none where none can be made at its first launch."""
+        """Return a generation's lock as files; empty if none could be made at its first launch."""
         kept = self._folder / f"{generation}-{wheel.name}.json"
         with locked(self._folder / "locks.lock"):
             found = read_as(Locks, kept)
             if found is None:
                 found = read_as(Locks, self._newest(wheel)) or Locks({})
                 if not found.files:
-                    with contextlib.suppress(CloudError):  # as `up` has told
+                    with contextlib.suppress(CloudError):  # `up` has warned of it
                         found = self._resolve(wheel)
                 write_json(kept, to_plain(found))
         return _as_files(found)

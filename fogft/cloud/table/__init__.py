@@ -2,7 +2,7 @@
 
 ``InstanceType, vCPUs, MemoryGiB, AcceleratorName, AcceleratorCount, Region,
 AvailabilityZone, Price, SpotPrice``; with ``Cloud``, ``AsOf`` (YYYY-MM-DD) and ``Source``
-where a table spans clouds or is dated. Without ``Cloud`` the file's folder names it.
+if a table spans clouds or is dated. Without ``Cloud``, the file's folder names the cloud.
 """
 
 import csv
@@ -25,12 +25,12 @@ _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
 
 @dataclass(frozen=True)
 class Row:
-    """A machine in a place. Prices are NaN where it is not sold in that way."""
+    """An instance type in a place. A price is NaN if it is not sold in that way."""
 
     place: tuple[str, str, str]  # cloud, region, zone
     instance: Instance
-    as_of: float  # when the prices were true, in seconds since the epoch; 0 for not known
-    source: str  # who says so
+    as_of: float  # when the prices were valid, in seconds since the epoch; 0 if unknown
+    source: str  # of the prices
 
 
 class PriceTable:
@@ -42,7 +42,7 @@ class PriceTable:
         self._places = {row.place for row in self._rows}
 
     def offers(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """List of each place the cheapest machine that suits, the cheapest first."""
+        """List the cheapest matching machine in each place, cheapest first."""
         best: dict[object, Offer] = {}
         for where, entry in alternatives(resources):
             spot = bool(entry.get("use_spot"))

@@ -1,6 +1,6 @@
-"""The same package as the project's own pyproject.toml describes, for colcon.
+"""Build the package of the project's own pyproject.toml with colcon.
 
-Everything is read from there: what a workspace installs and what pip installs are one.
+All values are read from pyproject.toml, so a workspace installs the same package as pip.
 """
 
 import os

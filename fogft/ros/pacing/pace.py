@@ -1,11 +1,11 @@
-"""When a response may be sent, so that no client's queue overflows. Pure: time is an argument.
+"""Decide when to send a response, so that no client's queue overflows. Pure: time is an argument.
 
-All clients of a service share one topic for its responses, and each has a queue of its own: of ten,
-by default, from which the eleventh pushes the first, whoever it is for. So what counts for a client
-is how many responses, of anybody's, were sent since the oldest of its own that it may not have
-taken. What shows that it takes: docs/design/serialised-services.md.
+All clients of a service share one response topic, and each has its own queue: of ten by default,
+where the eleventh response pushes out the first, whichever client it is for. So a client's queue
+depends on how many responses, to any client, were sent since the oldest of its own that it may not
+have taken. What shows that it takes responses: docs/design/serialised-services.md.
 
-Owns: that account. Not here: sending, probing, waiting (`pacer`).
+Owns: this accounting. Not here: sending, probing, waiting (`pacer`).
 """
 
 import math
@@ -14,24 +14,24 @@ from collections.abc import Iterator
 from enum import Enum, auto
 from typing import Any
 
-QUEUE = 10  # of rmw_qos_profile_services_default
-WINDOW = 5  # of them, where nothing shows how quickly a client takes
-PROBED_WINDOW = 8  # C++ executors answer a probe before they take, in the same turn
+QUEUE = 10  # the depth of rmw_qos_profile_services_default
+WINDOW = 5  # unconfirmed responses, while nothing shows how quickly a client takes them
+PROBED_WINDOW = 8  # C++ executors answer a probe before they take a response, in the same turn
 WINDOW_LIMIT = 64
-PROBES = 4  # at once
-# What waits for one client; what comes beyond is sent at once, as a fast service would.
+PROBES = 4  # in flight at once
+# Limits of what waits for one client. Further responses are sent at once, as by a fast service.
 WAITING_LIMIT, WAITING_BYTES_LIMIT = 1024, 64 << 20
-EVERY_S = 0.005  # so a burst may meet a client that takes nothing for 25 ms
-# A client may ask before discovery has told the way back to it. ROS waits 0.1 s a try.
+EVERY_S = 0.005  # per response: a burst is safe with a client that takes nothing for 25 ms
+# A request may arrive before discovery has found its client. ROS waits 0.1 s per attempt.
 FIND_LIMIT_S = 10.0
-_QUIET_S = 0.05  # after so long without a request a client must prove anew that it is quick
-_USUAL_GROWS = 4  # each `EVERY_S`, and by a twentieth of what is open: faster is a burst
+_QUIET_S = 0.05  # after this long without a request, a client must prove again that it is fast
+_USUAL_GROWS = 4  # per `EVERY_S`, plus a twentieth of the open requests: faster is a burst
 _CLIENTS_KEPT = 64
-_PROBE_AGAIN_S = 1.0  # one was lost
-_SILENT_S = 0.2  # who answers no probe for so long holds up none but itself
-_GIVEN_UP_S = 30.0  # who answers none for so long gets its responses by time
-# Who takes more slowly than it asks is behind for good. Once the oldest response has waited for so
-# long, the newest goes first: in turn, each would come when its caller has given up.
+_PROBE_AGAIN_S = 1.0  # in case a probe was lost
+_SILENT_S = 0.2  # a client that answers no probe for this long blocks only itself
+_GIVEN_UP_S = 30.0  # after this long without an answer, responses are paced by time
+# A client that takes more slowly than it asks stays behind. Once its oldest response has waited
+# this long, the newest goes first: in order, each would arrive after its caller has given up.
 BEHIND_S = 1.0
 
 
@@ -45,24 +45,24 @@ class Probing(Enum):
 
 
 class ClientPace:
-    """One client."""
+    """The pacing state of one client."""
 
     def __init__(self, now: float, sent: int) -> None:
         self.waiting: deque[tuple[Any, bytes, float]] = deque()  # handle, response, since when
-        self.untaken: deque[int] = deque()  # numbers of its responses, oldest first
+        self.untaken: deque[int] = deque()  # its responses' numbers, oldest first
         self.probing = Probing.UNASKED
-        self.probed_at: float | None = None  # the oldest probe that is not answered
-        self.finding_until: float | None = None  # None where discovery has found it
+        self.probed_at: float | None = None  # since when a probe is unanswered
+        self.finding_until: float | None = None  # None if discovery has found it
         self.find_again_at = now
-        self.ask_again_at = now  # whether its node answers probes
+        self.ask_again_at = now  # for whether its node answers probes
         self.asked_at = now
-        self._probes: deque[int] = deque()  # the last response before each that is not answered
+        self._probes: deque[int] = deque()  # the last response before each unanswered probe
         self._probe_again_at = now
         self._waiting_bytes = 0
-        self._taken = sent  # all up to this number have left its queue
-        self._open = 0  # asked and not answered; one that is never answered stays: no harm
-        # Of one whose node answers no probes.
-        self._usual = WINDOW  # no more open than this is nothing new
+        self._taken = sent  # all responses up to this number have left its queue
+        self._open = 0  # requests without a response; one that never gets any is harmless
+        # For clients whose node answers no probes.
+        self._usual = WINDOW  # this many open requests are nothing new
         self._window = WINDOW
         self._proofs = 0
         self._refilled_at = self._grown_at = now
@@ -73,7 +73,7 @@ class ClientPace:
         return self.probing in (Probing.ASKED, Probing.YES)
 
     def requested(self, now: float, *, together: bool = False) -> None:
-        """Note a request; `together` with another if it cannot be a reaction to a response."""
+        """Record a request; `together`: with another, so it cannot react to a response."""
         self.refill(now)
         if now - self.asked_at > _QUIET_S:
             self._window, self._proofs, self._usual = WINDOW, 0, WINDOW
@@ -85,7 +85,7 @@ class ClientPace:
         if together and self.probing is Probing.UNASKED:
             self.probing = Probing.ASKED
         if together if self.strict else self._open > self._usual:
-            # It only asks for more, and who asks in a burst does not take meanwhile.
+            # No progress: the client only asks for more, and it takes nothing during a burst.
             self._proofs, self._refilled_at = 0, now
         elif self.untaken:
             self._took(self.untaken[0])
@@ -110,17 +110,17 @@ class ClientPace:
         return handle, payload
 
     def not_found(self, handle: Any, payload: bytes, now: float) -> None:
-        """Queue a response again that was sent before the client was discovered."""
+        """Requeue a response that was sent before the client was discovered."""
         self.waiting.appendleft((handle, payload, now))
         self._waiting_bytes += len(payload)
         self.finding_until = self.finding_until or now + FIND_LIMIT_S
         self.find_again_at = now + EVERY_S
         self._open += 1
-        self.untaken.clear()  # what was sent together with it did not reach it either
+        self.untaken.clear()  # responses sent along with it were lost, too
 
     def sent(self, number: int) -> None:
-        """Note that a response to it was sent."""
-        if not self.untaken:  # the older ones of others that it has not taken lie before it
+        """Record that a response to this client was sent."""
+        if not self.untaken:  # others' responses that it has not taken precede it in its queue
             self._taken = min(max(self._taken, number - QUEUE), number - 1)
         self.untaken.append(number)
         self._open = max(self._open - 1, 0)
@@ -135,13 +135,13 @@ class ClientPace:
         return PROBED_WINDOW if self.probing is Probing.YES else WINDOW
 
     def answered_probe(self, now: float) -> None:
-        """Note an answered probe: the executor had a turn."""
+        """Record an answered probe: the executor had a turn."""
         if self._probes:
             self._took(min(self._taken + 1, self._probes.popleft()))
         self.probed_at = now if self._probes else None
 
     def probes_due(self, now: float, sent: int) -> int:
-        """Return how many probes to send now; those count as sent."""
+        """Return how many probes to send now; they count as sent."""
         if self.probing is not Probing.YES or (self._probes and now < self._probe_again_at):
             return 0
         self._probes = deque([sent] * min(PROBES, len(self.untaken)))
@@ -151,11 +151,11 @@ class ClientPace:
         return len(self._probes)
 
     def silent(self, now: float, limit_s: float = _SILENT_S) -> bool:
-        """Whether it has not answered probes for long."""
+        """Whether a probe has been unanswered for longer than `limit_s`."""
         return self.probed_at is not None and now - self.probed_at > limit_s
 
     def refill(self, now: float) -> None:
-        """Update the estimate from elapsed time."""
+        """Update the estimates from elapsed time."""
         if now - self._refilled_at >= EVERY_S:
             steps = int((now - self._refilled_at) / EVERY_S)
             self._refilled_at += steps * EVERY_S
@@ -177,14 +177,14 @@ class ClientPace:
 
 
 class Pace:
-    """The clients of one service."""
+    """The pacing state of one service's clients."""
 
     def __init__(self) -> None:
         self.clients: dict[bytes, ClientPace] = {}
         self.sent = 0
 
     def client(self, id: bytes, now: float) -> ClientPace:
-        """Return a client, adding it if new; the least recent ones are forgotten."""
+        """Return a client, adding it if new; the least recently active ones are forgotten."""
         pace = self.clients.get(id)
         if pace is None:
             if len(self.clients) >= _CLIENTS_KEPT:
@@ -199,19 +199,19 @@ class Pace:
     def take(self, client: ClientPace, now: float) -> bool:
         """Whether a response to a client may be sent now; if so, it counts as sent."""
         if not client.untaken:
-            client.refill(now)  # also where there is room: time is not saved up
+            client.refill(now)  # even if there is room: time must not accumulate
         if any(self.in_the_way(client, now)):
             return False
         self.send(client)
         return True
 
     def send(self, client: ClientPace) -> None:
-        """Count a response as sent, in any case."""
+        """Count a response as sent, even if there was no room."""
         self.sent += 1
         client.sent(self.sent)
 
     def in_the_way(self, client: ClientPace, now: float) -> Iterator[tuple[bytes, ClientPace]]:
-        """Return the clients whose queues block a response to this one."""
+        """Yield the clients whose queues block a response to this one."""
         for id, other in self.clients.items():
             if other.untaken:
                 other.refill(now)

@@ -1,11 +1,11 @@
 """Send responses no faster than their clients take them.
 
-A client keeps the last ten responses that it has not taken yet and silently loses more; what its
-queue has no room for waits here. One that discovery has not found yet gets its first response again
-until it has; the others wait behind it.
+A client keeps the last ten responses that it has not taken yet and silently loses older ones, so
+responses that do not fit in its queue wait here. For a client that discovery has not found yet, the
+first response is retried until it has; the others wait behind it.
 
-Owns: the responses that wait, the thread that sends them, and probes of clients' nodes. Not here:
-when one may be sent (`pace`), sending it (`entities`).
+Owns: the waiting responses, the thread that sends them, and probes of clients' nodes. Not here:
+when a response may be sent (`pace`), sending it (`entities`).
 """
 
 import contextlib
@@ -25,12 +25,12 @@ from fogft.ros.port import NotFoundYet, RosClient
 
 log = logging.getLogger(__name__)
 
-# Whether a node answers probes. On a busy machine discovery takes long to tell.
+# For checking whether a node answers probes. On a busy machine discovery is slow.
 _ASK_EVERY_S, _ASK_LIMIT_S, _ASK_AGAIN_S = 0.02, 2.0, 10.0
 _LOOK_EVERY_S = 0.2
 _GUID_BYTES = 16
 PROBED, PROBED_TYPE = "get_parameter_types", "rcl_interfaces/srv/GetParameterTypes"
-EMPTY_LIST = b"\x00\x01\x00\x00" + bytes(4)  # of names of parameters
+EMPTY_LIST = b"\x00\x01\x00\x00" + bytes(4)  # of parameter names
 KEPT = 64
 
 _Due = tuple[bytes, ClientPace, Any, bytes]  # a response to a client, by its id and handle
@@ -38,15 +38,15 @@ _Due = tuple[bytes, ClientPace, Any, bytes]  # a response to a client, by its id
 
 @dataclass(eq=False)
 class NodeProbes:
-    """Probes of the nodes in one ROS domain, for the clients of all services. Any thread.
+    """Probes the nodes of all services' clients in one ROS domain. Any thread.
 
-    A node answers the services of its parameters by the same executor that takes its clients'
-    responses, one in each turn: an answer means that there was a turn.
+    A node's executor serves its parameter services and takes its clients' responses, one of each
+    per turn, so an answer to a probe means that there was a turn.
 
     Args:
         make_client: As `RosNode.client`.
-        same_node_serves: Returns the full name of the service of a last name, of the node that a
-            client of a service belongs to: None while it is not discovered, empty without one.
+        same_node_serves: Takes a service's last name, another service and a client of the latter.
+            Returns the first one's full name on the client's node; None: unknown, empty: none.
     """
 
     make_client: Callable[[str, str], RosClient]
@@ -58,7 +58,7 @@ class NodeProbes:
         self._lock = threading.Lock()
 
     def answers(self, service: str, client: bytes) -> bool | None:
-        """Whether the node of a service's client answers probes; None while it is not known."""
+        """Whether the node of a service's client answers probes; None while unknown."""
         asked = self.same_node_serves(PROBED, service, client)
         if not asked:
             return None if asked is None else False
@@ -73,13 +73,13 @@ class NodeProbes:
                     return False
             if not end.available():
                 return None
-            if len(self._by_client) >= 4 * KEPT:  # long gone
+            if len(self._by_client) >= 4 * KEPT:  # the oldest is long gone
                 self._by_client.pop(next(iter(self._by_client)))
             self._by_client[client] = end
         return True
 
     def same_node(self, client: bytes, other: bytes) -> bool:
-        """Whether two clients' nodes have one name: one was started again as the other."""
+        """Whether two clients' nodes have the same name: one is a restart of the other."""
         return self._by_client.get(client) is self._by_client.get(other)
 
     def send(self, client: bytes, on_answer: Callable[[], None]) -> None:
@@ -93,8 +93,8 @@ class Pacer:
     """Sends the responses of one service, at each client's pace. Any thread.
 
     Args:
-        probes: Asks the clients' nodes.
-        client_of: Returns who asked, of a request's handle: of its header in DDS, if not given.
+        probes: Probes the clients' nodes.
+        client_of: Returns the client's id from a request's handle; default: from its DDS header.
     """
 
     send: Callable[[Any, bytes], None]
@@ -106,15 +106,15 @@ class Pacer:
 
     def __post_init__(self) -> None:
         self._pace = Pace()
-        self._held: dict[bytes, ClientPace] = {}  # those whose responses wait
-        self._asked: dict[bytes, float] = {}  # whose nodes may answer probes: until when
+        self._held: dict[bytes, ClientPace] = {}  # clients with waiting responses
+        self._asked: dict[bytes, float] = {}  # clients to check for probes: until when
         self._lock = threading.Lock()
         self._wake = threading.Condition(self._lock)
-        self._thread: threading.Thread | None = None  # made when there is something to wait for
+        self._thread: threading.Thread | None = None  # started on demand
         self._closed = False
 
     def requested(self, handle: Any, *, together: bool = False) -> None:
-        """Note a request as it is taken; `together` with the one before it."""
+        """Record a request when it is taken; `together` with the one before it."""
         now = self.clock()
         id = self.client_of(handle)
         with self._lock:
@@ -122,7 +122,7 @@ class Pacer:
             client.requested(now, together=together)
             if client.probing in (Probing.ASKED, Probing.NO) and now >= client.ask_again_at:
                 client.ask_again_at = now + _ASK_AGAIN_S
-                # Of a node that has long been known one look is enough.
+                # For a node that has been known for long, one check is enough.
                 self._asked[id] = now + (_ASK_LIMIT_S if client.strict else 0.0)
                 self._begin()
             elif client.waiting:
@@ -146,7 +146,7 @@ class Pacer:
         self._try(id, client, handle, payload)
 
     def _try(self, id: bytes, client: ClientPace, handle: Any, payload: bytes) -> None:
-        """Send now; have it wait if the client is not found yet. Raises RosError."""
+        """Send now; requeue it if the client is not discovered yet. Raises RosError."""
         try:
             self.send(handle, payload)
         except NotFoundYet:
@@ -162,7 +162,7 @@ class Pacer:
 
     def _begin(self) -> None:
         if self._thread is None:
-            # Where that fails, the next response tries it again.
+            # If that fails, the next response tries again.
             self._thread = on_thread(self._run, name="ros-pacer")
         self._wake.notify()
 
@@ -187,7 +187,7 @@ class Pacer:
                 self._ask(id)
 
     def _step(self, now: float) -> tuple[list[_Due], list[bytes], float | None]:
-        """Return what to send now, whom to probe, each as often, how long to wait if nothing."""
+        """Return the due responses, a client id per probe, and how long to wait if none."""
         due: list[_Due] = []
         in_the_way: dict[bytes, ClientPace] = {}
         for id, client in list(self._held.items()):
@@ -227,12 +227,12 @@ class Pacer:
             client = self._pace.client(id, now)
             later = [i for i, o in self._pace.clients.items() if o.asked_at > client.asked_at]
             if client.silent(now) and any(self.probes.same_node(id, other) for other in later):
-                return  # or what a killed node left open would push out its successor's responses
+                return  # else responses to a killed node would push out its successor's
             client.answered_probe(now)
             self._wake.notify()
 
     def close(self) -> None:
-        """Stop sending; queued responses are dropped. Repeatable."""
+        """Stop sending; queued responses are dropped. Idempotent."""
         with self._wake:
             self._closed = True
             self._wake.notify()
