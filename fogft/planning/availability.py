@@ -1,9 +1,9 @@
-"""How often a replica, and a whole pool of them, is down. Pure arithmetic.
+"""The fraction of time that a replica, or a whole pool, is down. Pure arithmetic.
 
 docs/design/availability.md describes the model, which is exact for any replicas.
 
 Source: FogROS2-FT, section III.C, which prints the fraction for N upside down.
-Not here: how many are launched (`sizing`).
+Not here: how many replicas are launched (`sizing`).
 """
 
 import itertools
@@ -15,15 +15,15 @@ from dataclasses import dataclass
 from fogft.model.choices import Assumption, Correlation
 from fogft.model.replica import Placement
 
-# Decimal fractions are not exact in binary: without it, two replicas of 0.99 miss 0.9999.
+# Decimal fractions are not exact in binary: without this, two replicas of 0.99 miss 0.9999.
 _ROUNDING = 1 + 1e-9
 
 
 def unavailability(uptime_s: float, recovery_s: float) -> float:
     """Return the fraction of time, in [0, 1), that one replica does not answer.
 
-    `uptime_s` is the mean time from ready to gone, `recovery_s` that from gone to ready again
-    elsewhere. Raises ValueError: an argument is out of range or not finite.
+    `uptime_s` is the mean time from ready to gone, `recovery_s` the mean time from gone to ready
+    again elsewhere. Raises ValueError: an argument is out of range or not finite.
     """
     if not (math.isfinite(uptime_s) and uptime_s > 0):
         raise ValueError(f"uptime_s must be finite and above 0, not {uptime_s}")
@@ -78,8 +78,8 @@ def expected(
 ) -> Expected:
     """Return the availability of a pool with replicas in these placements; 0 for none.
 
-    `sold` are the locations of spot machines, where nothing else replaces them; none: there is
-    always something that does.
+    `sold` are the locations that offer spot machines, if nothing else can replace those; empty if
+    on-demand machines can.
     """
     down = [unavailability_of(assumed, spot=place.spot) for place in placements]
     each = list(zip(placements, down, strict=True))
@@ -93,11 +93,11 @@ def expected(
 
 
 def full_together(sold: Collection[Placement], assumed: Assumption) -> float:
-    """Return the fraction of time without capacity anywhere, now or one recovery ago.
+    """Return the fraction of time without capacity anywhere, now or one recovery time ago.
 
-    Locations that are full together for a share f of the time are like log(f) / log(`no_room`)
-    that are full independently: so often does one of them end it. Spot machines are up while their
-    location has room.
+    Locations that are full together for a fraction f of the time are modelled as
+    log(f) / log(`no_room`) independent ones, and the shortage ends as soon as one of them has room.
+    Spot machines are up while their location has room.
     """
     share = assumed.no_room
     full = joint_unavailability([(place, share) for place in sold], assumed.correlation)
@@ -112,8 +112,8 @@ def joint_unavailability(
 ) -> float:
     """Return the fraction of time that all replicas are down together.
 
-    Each is given by where it is, and the fraction of time that it is down. Raises ValueError: one
-    is not in [0, 1].
+    Each replica is given by its placement and the fraction of time that it is down. Raises
+    ValueError: a fraction is not in [0, 1].
     """
     tree: dict[str, dict[str, dict[str, list[float]]]] = defaultdict(
         lambda: defaultdict(lambda: defaultdict(list))
@@ -150,7 +150,7 @@ class _Grid:
         self._starts = steps[:-1]
 
     def down(self, members: Sequence[float], follow: float) -> list[float]:
-        """Return how likely all members are down, given their zone's value."""
+        """Return the probability that all members are down, given their zone's value."""
         return [
             math.prod(follow * (start < q) + (1 - follow) * q for q in members)
             for start in self._starts

@@ -1,6 +1,6 @@
-"""Turn needs into launches, within surge, budget and offers. Pure.
+"""Turn needs into planned launches, within surge, budget and offers. Pure.
 
-Not here: the order among offers (`placement`) and what is needed (`needs`).
+Not here: which offer is preferred (`placement`) and which launches are needed (`needs`).
 """
 
 import math
@@ -33,7 +33,7 @@ from fogft.planning.sizing import Inputs, Size
 
 
 class PlannedLaunch(NamedTuple):
-    """Order a machine for a slot, under a generation never used before."""
+    """A machine to order for a slot, under a new generation; a standby keeps its own."""
 
     slot: int
     generation: int
@@ -110,10 +110,10 @@ class Buyer:
         return True
 
     def _is_within_limit(self, *, on_demand: bool) -> bool:
-        """Whether one more machine of a market may be had within this hour; a note if not."""
+        """Whether the hourly limit of a market allows one more launch; adds a note if not."""
         had = within_an_hour(self.history, self.observed.now, on_demand=on_demand)
         planned = sum(x.offer.placement.spot is not on_demand for x in self.launches)
-        usual = sum(group.replicas for group in self.groups)  # had before it was scaled down
+        usual = sum(group.replicas for group in self.groups)  # the pool's size before a scale-down
         most = LAUNCHES_AN_HOUR * max(1, usual, self.sized.total)
         if len(had) + planned < most:
             return True
@@ -123,7 +123,7 @@ class Buyer:
     def market(self, group: Group, spot: bool | None, *, at_leisure: bool = False) -> Market:
         """Return the offers for a group, spot or on-demand only unless `spot` is None.
 
-        Nothing that refused lately is in it for one that need not be launched (`at_leisure`).
+        For a launch that can wait (`at_leisure`), supplies that failed lately are left out.
         """
         full = self._full(group) if spot else frozenset()
         key = (group.name, spot, at_leisure, full)
@@ -150,7 +150,7 @@ class Buyer:
         )
 
     def _full(self, group: Group) -> frozenset[str]:
-        """Return the locations that hold enough of a group, where on-demand can stand in."""
+        """Return the locations with enough of a group's replicas, if on-demand can stand in."""
         if not group.on_demand.fallback or len(self._listing(group, True).supplies) < 2:
             return frozenset()
         if not self.market(group, False).rows:
@@ -192,7 +192,7 @@ class Buyer:
         return self._catalogue.listing(group.name, spot, self.intent.excluded, self.scale)
 
     def _in_spite(self, group: Group, spot: bool | None) -> Market | None:
-        """Return the market of what failed longest ago, where all backs off; None to wait."""
+        """Return the market of the supply that failed longest ago if all back off; None to wait."""
         coming = self.launches or any(
             not s.ever_ready for s in self.machines.good if s not in self.standing_in
         )
@@ -218,18 +218,18 @@ class Buyer:
         return on_demand >= group.on_demand.base
 
     def _placed(self, without: Assessment | None = None) -> list[tuple[int, Placement]]:
-        """Return slot and placement of the replicas that stay and of those that are ordered."""
+        """Return the slot and placement of each working replica and planned launch."""
         stay = (*self.machines.good, *self.machines.replaced)
         placed = [(s.slot, s.placement) for s in stay if s is not without]
         return placed + [(launch.slot, launch.offer.placement) for launch in self.launches]
 
     def places(self, without: Assessment | None, *, lasting: bool = False) -> list[Placement]:
-        """Return current and planned placements; `lasting`: not of stand-ins, which go again."""
+        """Return current and planned placements; `lasting` leaves out stand-ins."""
         placed = self._placed(without)
         return [place for slot, place in placed if not (lasting and is_stand_in(slot))]
 
     def price(self, replica: Assessment) -> float:
-        """Return a machine's price: today's if known, else that of its order."""
+        """Return a machine's current price if known, else the price it was ordered at."""
         group = group_of(self.groups, replica.slot).name
         return self._catalogue.today.get((group, replica.placement), replica.machine.usd_per_hour)
 
@@ -239,7 +239,7 @@ class Buyer:
         why = old.why if old is not None else None
         moves = why is not None and why.cause in MOVES
         is_outdated = why is not None and why.cause is Cause.OUTDATED
-        if old is not None and not (moves or is_outdated):  # the place is at fault
+        if old is not None and not (moves or is_outdated):  # the location is at fault
             avoid.add(old.placement.location)
         taken = self.places(old, lasting=not need.stands_in)
         spot = False if need.stands_in else self.kind(need.group, old)
@@ -253,11 +253,11 @@ class Buyer:
         return found, need.reason
 
     def _make_room(self, need: Need, cap: float) -> None:
-        """Under a cap, a silent machine that blocks its own replacement goes first."""
+        """Under a cap, end a silent machine first if it blocks its own replacement."""
         going = [*self.machines.ending, *(s for s, _ in self.ended_for_room)]
         left = cap - self._spent + sum(map(self.price, going))
         if self._choose(need, left)[0].offer is not None:
-            return  # what is being ended already makes room enough
+            return  # the machines that are ending make enough room
         for replica in self.machines.lost:
             if replica.verdict is not Verdict.UNRESPONSIVE or replica in going:
                 continue
@@ -267,11 +267,11 @@ class Buyer:
                 return
 
     def fits_beside(self, need: Need) -> bool:
-        """Whether the budget has room for a successor beside the one that it replaces."""
+        """Whether the budget has room for a successor beside the replica that it replaces."""
         return self._choose(need, self.budget)[0].offer is not None
 
     def fits_instead(self, need: Need, old: Assessment) -> bool:
-        """Whether there is room for a successor once the one that it replaces is gone."""
+        """Whether the budget has room for a successor once the replica it replaces is gone."""
         if self.cap is None:
             return True
         left = self.cap - self._spent + self.price(old)

@@ -1,6 +1,6 @@
 """Classify every machine of a pool: kept, to be replaced, or lost. Pure.
 
-Not here: health (`health`), and moving those that could be better placed (`migration`).
+Not here: health (`health`), and moving replicas to better locations (`migration`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.sizing import Inputs, Size
 
 _ORDER = {Cause.DRAINED: 0, Cause.EXCLUDED: 1, Cause.OUTDATED: 3}  # all others between
-_OUTDATED = Reason(Cause.OUTDATED)  # of many at once, at every tick
+_OUTDATED = Reason(Cause.OUTDATED)  # shared: many replicas need it at every tick
 _LOST = (Verdict.LEAVING, Verdict.UNRESPONSIVE)
 _DOUBTED = (Verdict.STUCK, Verdict.AT_RISK, Verdict.DISAGREES)
 
@@ -28,13 +28,13 @@ class Classification:
     """Every machine of the pool, by class."""
 
     good: list[Assessment] = field(default_factory=list)  # serve or will serve
-    # Work, but shall be replaced, new before old.
+    # Working, but to be replaced: the successor is launched before the old one ends.
     replaced: list[Assessment] = field(default_factory=list)
-    # Leaving or unresponsive: replaced at once, and not counted as machines.
+    # Leaving or unresponsive: replaced at once, not counted.
     lost: list[Assessment] = field(default_factory=list)
     # Launches that failed: ended at once, not counted.
     failed: list[Assessment] = field(default_factory=list)
-    # Not wanted as they are, and never served: ended at once.
+    # To be replaced, but never served: ended at once.
     aborted: list[Assessment] = field(default_factory=list)
     ending: list[Assessment] = field(default_factory=list)  # already asked to end
 
@@ -54,7 +54,7 @@ class Classification:
         return replace(self, good=good, replaced=replaced)
 
     def part(self, groups: Sequence[Group], group: Group) -> Classification:
-        """Return the part of a group; it must not be changed."""
+        """Return the machines of one group; the result must not be modified."""
         if len(groups) == 1:
             return self
         kinds = ([s for s in kind if group_of(groups, s.slot) is group] for kind in self._kinds)
@@ -62,7 +62,7 @@ class Classification:
 
     @property
     def live(self) -> int:
-        """Machines that count against `replicas + max_surge`: neither lost nor failed ones."""
+        """How many machines count against `replicas + max_surge`: neither lost nor failed ones."""
         exempt = (Verdict.FAILED, Verdict.LEAVING, Verdict.UNRESPONSIVE)
         kept = len(self.good) + len(self.replaced) + len(self.aborted)
         return kept + sum(s.verdict not in exempt for s in self.ending)
@@ -92,9 +92,9 @@ def classify(inputs: Inputs, health: Health, size: Size) -> Classification:
 
 
 def _supersede(machines: Classification, health: Health, size: Size) -> None:
-    """Of two good ones in one slot the older goes, where there is one too many.
+    """Replace the older of two good replicas in one slot, if their group has one too many.
 
-    So a replica that moves is ended when its successor serves, and not the other way round.
+    So after a migration the old replica ends, once its successor serves, and not the successor.
     """
     newest = {s.slot: s.id.generation for s in machines.good}  # in the order of generations
     if len(newest) == len(machines.good):
@@ -113,7 +113,7 @@ def _supersede(machines: Classification, health: Health, size: Size) -> None:
 def _unwanted(
     spec: PoolSpec, intent: Intent, replica: Assessment, blocks: Collection[int]
 ) -> Reason | None:
-    """Return why a working replica is to be replaced; None when it is not."""
+    """Return why a working replica is to be replaced; None if it is not."""
     machine, slot = replica.machine, replica.slot
     if intent.drained and intent.is_drained(slot, replica.id.generation):
         return Reason(Cause.DRAINED)
@@ -129,11 +129,11 @@ def _unwanted(
 
 
 def _never_served(replica: Assessment, health: Health) -> bool:
-    """Whether it certainly never served, so that it can be ended at once."""
+    """Whether a replica certainly never served, so that it can be ended at once."""
     if replica.machine.phase is MachinePhase.PROVISIONING:
         return True
     if health.uplink_suspected or not health.links_known or replica.ever_ready:
         return False
-    # An outdated one that answers probes and has no service ready is no loss.
+    # Ending an outdated replica that answers probes but has no service ready loses nothing.
     some_ready = replica.link is not None and bool(replica.link.ready)
     return not replica.answers or (replica.is_outdated and not some_ready)

@@ -1,7 +1,7 @@
 """The cost of a pool per hour and month, egress included. Pure arithmetic.
 
-Clouds charge for what leaves them: one response from each replica that is asked, the late ones
-included.
+Clouds charge for outgoing traffic: one response from each replica that gets a request, late
+responses included.
 """
 
 from collections.abc import Iterable, Sequence
@@ -22,29 +22,29 @@ class Cost:
     """US dollars per hour."""
 
     machines: float
-    egress: float  # for what leaves the clouds; 0 where the file says nothing of traffic
+    egress: float  # outgoing traffic; 0 if the pool file gives no `traffic`
 
     @property
     def usd_per_hour(self) -> float:
-        """All together."""
+        """The total per hour."""
         return self.machines + self.egress
 
     @property
     def usd_per_month(self) -> float:
-        """For 730 hours."""
+        """The total for 730 hours."""
         return self.usd_per_hour * HOURS_A_MONTH
 
 
 def cost(offers: Sequence[Offer], services: Iterable[ServiceSpec]) -> Cost:
-    """Return the cost of replicas (an offer each) that run these services."""
+    """Return the cost of replicas (one offer each) that run these services."""
     machines = sum(offer.usd_per_hour - offer.egress_usd_per_hour for offer in offers)
     each = egress_bytes_per_s(services, len(offers)) * 3600 / GB
     return Cost(machines, sum(each * egress_price(offer.placement.cloud) for offer in offers))
 
 
 def egress_bytes_per_s(services: Iterable[ServiceSpec], replicas: int) -> float:
-    """Return the egress of one of this many replicas."""
-    # Under `auto` a replica that is idle gets a copy of every request: the most that it may be.
+    """Return the egress of each of this many replicas, in bytes per second."""
+    # Under `auto` an idle replica gets a copy of every request: this is the upper bound.
     share = {HedgingMode.FAILOVER: 1.0 / max(1, replicas)}
     return sum(
         one.traffic.requests_per_s * one.traffic.response_bytes * share.get(one.hedging, 1.0)

@@ -1,10 +1,10 @@
 """Decide which machines end, and when. Pure.
 
-The law: a replica that serves, or may serve, ends only if enough others serve. "Others"
-never counts one that is itself to go, has a notice, or is silent. One whose link is up is
-first marked as draining, so that requests stop going there, and ends when it is idle.
+The law: a replica that serves, or may serve, ends only if enough others serve. Others that are to
+end too, have a preemption notice or are silent never count. A replica whose link is up is first
+marked as draining, so that it gets no new requests, and ends when it is idle.
 
-Not here: why a replica should go (`classification`, `health`).
+Not here: why a replica should end (`classification`, `health`).
 """
 
 from collections.abc import Collection, Iterable
@@ -17,7 +17,7 @@ from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.observed.history import History
 from fogft.planning.placement import crowding
 
-# After the mark, the client proxy needs a moment to read it and to report what is in flight.
+# The client proxy needs a moment to read the mark and to report how many requests are in flight.
 DRAIN_SETTLE_S = 2.0
 DRAIN_LIMIT_S = 10.0
 
@@ -47,12 +47,12 @@ def choose_endings(
     held: Collection[ReplicaId],
     first: Assessment | None,
 ) -> None:
-    """Add to `out` which lost, replaced and surplus machines of a group end.
+    """Add to `out` those of a group's lost, replaced and surplus machines that should end.
 
     Args:
-        held: Outdated ones that stay until a newcomer has proved itself.
-        first: One that makes room for its successor: it ends although it is missed.
-        dear_first: The pool is over its cap: of those that are too many the dearest go first.
+        held: Outdated replicas that stay until a new one has proved itself.
+        first: A replica that ends although it is needed, to make room for its successor.
+        dear_first: The pool is over its cap: the most expensive surplus replicas end first.
     """
     wanted, machines, standing_in = part.wanted, part.others, part.standing_in
     extra = fallback.surplus(part, now)
@@ -122,7 +122,7 @@ class _Chooser:
     counted_out: int = 0
 
     def end_lost(self, replica: Assessment, history: History) -> None:
-        """A lost one ends once it is replaced, or at once when it cannot serve."""
+        """End a lost replica once it is replaced, or at once if it cannot serve."""
         enough = len(self.pillars) >= self.wanted
         later_served = history.served[replica.slot] > replica.id.generation
         superseded = later_served and replica.verdict is Verdict.UNRESPONSIVE
@@ -134,7 +134,7 @@ class _Chooser:
     ) -> None:
         """End up to `count`, in order, where the law allows it.
 
-        While `coming` ones, which have yet to serve, are needed, one that should come back stays.
+        `coming` new replicas have yet to serve: until then, that many old ones stay, even silent.
         """
         for replica in replicas:
             if count <= 0:

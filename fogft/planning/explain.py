@@ -1,7 +1,7 @@
 """Explain a plan: the offers considered, those chosen, and why others were not. Pure.
 
-Each offer that was not chosen is held against each that was, and the comparison that it lost last
-is told: one that lost by its price came nearer than one that lost by the spread.
+Each rejected offer is compared with each chosen one, and the comparison that it came nearest to
+winning is reported: an offer that lost by its score came nearer than one that lost by the spread.
 
 Not here: the decisions (`planner`) and how they are shown (`fogft.cli`).
 """
@@ -39,35 +39,35 @@ class Considered:
     why_not: Reason | None
     rtt_s: float | None  # round trip to its region in seconds; None for not known
     losses: int  # replicas of this pool lost there in the last hours
-    losses_per_hour: float | None = None  # as the planner reckons with; None on demand
-    losses_assumed: bool = True  # this pool has asked for no spot machine there: it is the prior
+    losses_per_hour: float | None = None  # the rate that the planner uses; None on demand
+    losses_assumed: bool = True  # no spot history there: the rate is the prior
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """A plan that people can read."""
+    """A plan with its reasons, cost and expected availability, for people to read."""
 
     considered: tuple[Considered, ...]
     replicas: tuple[PlannedLaunch, ...]
     wanted: int
     cap: float | None  # US dollars per hour; None for none
     assumed: Assumption  # what the availability rests on
-    expected: Expected  # that a request can be answered
+    expected: Expected  # how often a request can be answered
     target: float | None
     cost: Cost
-    # The cheapest on-demand machine that would do alone, and its cost; None without a known price.
+    # The cheapest on-demand machine that could serve alone, and its cost; None without a price.
     single: tuple[Offer, Cost] | None
     notes: tuple[Reason, ...]
-    # That a request can be answered, and US dollars per hour, did on-demand machines stand in; None
-    # where they do, or cannot.
+    # Availability and US dollars per hour if on-demand machines stood in; None if they do already,
+    # or cannot.
     with_fallback: tuple[float, float] | None = None
 
     @property
     def is_cheapest(self) -> bool | None:
         """Whether the pool is cheaper than one on-demand machine for its target.
 
-        What does reaches the target; where there is none, what the pool is expected to be. None
-        where neither does, or a price is not known.
+        Only an option that reaches the target counts; without a target, the pool's expected
+        availability is the target. None if neither reaches it, or if no price is known.
         """
         if self.single is None:
             return None
@@ -80,7 +80,7 @@ class Explanation:
 
     @property
     def round_trips_s(self) -> list[float]:
-        """Round trips to the replicas where known, the shortest first."""
+        """The known round trips to the replicas in seconds, shortest first."""
         known = [self.rtt_s(planned.offer) for planned in self.replicas]
         return sorted(rtt_s for rtt_s in known if rtt_s is not None)
 
@@ -95,9 +95,9 @@ def explain(
     """Plan a pool from scratch, whatever runs, and explain the plan.
 
     Args:
-        inputs: Of the history the losses and failures of places count.
-        on_demand: What one on-demand machine of this kind costs, for comparison.
-        recovery_s: How long launches have taken, in place of what is assumed where nobody said.
+        inputs: Of the history, only the losses and failures of locations count.
+        on_demand: Offers of one on-demand machine of this kind, for comparison.
+        recovery_s: How long launches have taken; replaces the default, not the pool file's value.
     """
     spec, intent, observed, history = inputs
     inputs = inputs._replace(
@@ -136,7 +136,7 @@ def explain(
 def _with_fallback(
     launches: Sequence[PlannedLaunch], assumed: Assumption, full: float, on_demand: Offer | None
 ) -> tuple[float, float] | None:
-    """Return what stand-ins would give and cost: each runs while its spot machine is away."""
+    """Return availability and cost with stand-ins: each runs while its spot machine is away."""
     if on_demand is None:
         return None
     away = 1.0 - (1.0 - full) * (1.0 - unavailability_of(assumed, spot=True))
@@ -150,7 +150,7 @@ def _with_fallback(
 
 
 class _Pick(NamedTuple):
-    """A launch, and what stood when it was chosen."""
+    """A launch, with the crowding and the budget at the time it was chosen."""
 
     launch: PlannedLaunch
     crowd: Counter[str]
@@ -158,7 +158,7 @@ class _Pick(NamedTuple):
 
 
 class _Reasons:
-    """Says of each offer why it was not chosen."""
+    """Tells why each offer was not chosen."""
 
     def __init__(
         self, inputs: Inputs, launches: Sequence[PlannedLaunch], cap: float | None
@@ -183,7 +183,7 @@ class _Reasons:
             spent += launch.offer.usd_per_hour
 
     def of(self, offer: Offer) -> Considered:
-        """Return an offer with what became of it."""
+        """Return an offer with the slots that got it, or why it was not chosen."""
         slots = tuple(self._slots.get(offer, ()))
         location = offer.placement.location
         recent = [t for t in self._losses.get(location, ()) if 0 <= self._now - t < LATELY_S]
@@ -209,7 +209,7 @@ class _Reasons:
         return max((self._lost_to(offer, pick) for pick in picks), key=itemgetter(0))[1]
 
     def _lost_to(self, offer: Offer, pick: _Pick) -> tuple[int, Reason]:
-        """Return how near an offer came to a chosen one (higher is nearer), and why it lost."""
+        """Return how close an offer came to a chosen one (higher is closer), and why it lost."""
         chosen = pick.launch.offer
         slot = pick.launch.slot
         if offer.placement.spot != chosen.placement.spot:

@@ -1,11 +1,11 @@
 """On-demand machines that fill in while too few spot machines are ready. Pure.
 
-Where a group has `fallback`, on-demand machines in slots of their own stand in, ordered beside
-another spot machine. What counts is readiness, not whether every location refused. While an
-on-demand machine serves, which nobody takes away, spot is asked for alone, and another one stands
-in only once that was refused. Nor is a slot short whose first machine is still booting.
+If a group has `fallback`, on-demand machines in slots of their own stand in, each ordered together
+with another spot machine. Readiness decides, not whether every location refused. While an on-demand
+machine serves, which cannot be preempted, only spot is ordered at first, and another stand-in only
+once that was refused. A slot whose first machine is still booting needs no stand-in.
 
-Not here: where they are bought (`buying`) and the two steps of an ending (`endings`).
+Not here: where stand-ins are bought (`buying`) and the two steps of an ending (`endings`).
 """
 
 from bisect import bisect_right
@@ -17,33 +17,33 @@ from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment
 from fogft.planning.observed.history import History
 
-# Longer would cost more than the few losses that it bridges: others serve.
+# A longer overlap would cost more than the few losses that it bridges: other replicas serve.
 SETTLED_S = 20.0
-# Under a cap that has no room for both, a stand-in makes way for a spot machine after so long.
+# Under a cap without room for both, a stand-in makes way for a spot machine after this time.
 STAYS_S = 600.0
-# Where so many spot machines were lost within so long, one is on demand: losses come in clusters,
-# and without one all that are left may go at once.
+# After OFTEN losses of spot machines within OFTEN_S, one on-demand machine is kept: losses come in
+# clusters, and without it all remaining machines may be lost at once.
 OFTEN = 2
 OFTEN_S = 1800.0
 
 
 class Part(NamedTuple):
-    """A group's share of what is wanted and of the machines."""
+    """The wanted number of replicas of one group, and its machines."""
 
     group: Group
     wanted: int
-    others: Classification  # its machines but for `standing_in`
+    others: Classification  # its machines except `standing_in`
     standing_in: Sequence[Assessment]
-    held: int  # so many of those that stand in are kept in place of spot machines
-    surge: int  # so many more stand-ins boot while nobody serves
+    held: int  # how many stand-ins are kept in place of spot machines
+    surge: int  # how many extra stand-ins boot while no replica serves
 
 
 def held(
     group: Group, wanted: int, standing_in: Sequence[Assessment], history: History, now: float
 ) -> int:
-    """Return how many of a group's stand-ins replace spot machines, for which no search is made.
+    """Return how many of a group's stand-ins are kept instead of looking for spot machines.
 
-    None in place of a lone one: that would be to give up spot machines.
+    0 if the group wants a single spot machine: keeping one would give up spot altogether.
     """
     spot = wanted - group.on_demand.base
     if not group.on_demand.fallback or spot < 2:
@@ -61,15 +61,15 @@ def losses_of_late(history: History, now: float) -> list[float]:
 
 
 def is_first(slot: int, generation: int, history: History, *, safe: bool) -> bool:
-    """Whether a spot machine is the first of its slot, or the first since that last served."""
+    """Whether a generation is its slot's first or, if `safe`, the first since the slot served."""
     return generation == (history.served[slot] if safe else 0) + 1
 
 
 def missing(part: Part, begun: int, history: History, *, safe: bool) -> int:
     """Return how many more stand-ins a group needs.
 
-    So many of its slots get their first machine now (`begun`); one serves that is not preempted
-    (`safe`).
+    `begun` is how many of its slots get their first machine now; `safe` means that a machine serves
+    that cannot be preempted.
     """
     wanted, kept = part.wanted - begun, (*part.others.good, *part.others.replaced)
     standing_in = [s for s in part.standing_in if not s.unwanted]
@@ -81,9 +81,9 @@ def missing(part: Part, begun: int, history: History, *, safe: bool) -> int:
 
 
 def surplus(part: Part, now: float) -> int:
-    """Return how many stand-ins are no longer needed, given enough others that have settled.
+    """Return how many stand-ins are no longer needed because enough other replicas have settled.
 
-    Beside one that is held, and serves, a spot machine needs no time to settle.
+    While a stand-in is kept (`held`) and one serves, spot machines need no time to settle.
     """
     settled_s = 0.0 if part.held and any(s.serving for s in part.standing_in) else SETTLED_S
     others = (*part.others.good, *part.others.replaced)
@@ -94,7 +94,7 @@ def surplus(part: Part, now: float) -> int:
 
 
 def _racing(part: Part, wanted: int, standing_in: Sequence[Assessment]) -> int:
-    """Return how many more boot where none serves yet: of many at once the fastest decides."""
+    """Return how many extra stand-ins boot while none serves: the fastest one ends the gap."""
     if part.group.on_demand.standbys >= part.wanted or any(s.serving for s in standing_in):
         return 0  # stopped standbys start sooner
     return min(part.surge, 2 * wanted - 1)

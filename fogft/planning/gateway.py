@@ -1,9 +1,9 @@
-"""What becomes of the machine of a gateway that a pool launches for itself. Pure.
+"""Launch, replace and end the machine of the gateway that a pool runs for itself. Pure.
 
 There is one, on demand. It is replaced when it fails, when its robot no longer reaches it, or when
-the file asks for another; not before it is gone, since its ports may be those of its successor.
+the file asks for another, but only once it is gone: its successor may use the same ports.
 
-Not here: the gateway's order (`fogft.pool.manager.configuration`).
+Not here: what is launched on it (`fogft.pool.manager.configuration`).
 """
 
 import hashlib
@@ -29,11 +29,11 @@ _WHEREABOUTS = ("infra", "cloud", "region", "zone")
 class GatewayPlan(NamedTuple):
     """What to do about the gateway's machine."""
 
-    host: str = ""  # where it is; empty while nobody knows
+    host: str = ""  # its address; empty while unknown
     ends: tuple[tuple[ReplicaId, Reason], ...] = ()  # machines to end, with the reason
     failed: frozenset[ReplicaId] = frozenset()  # those of `ends` whose launch has failed
     launch: Offer | None = None  # what to buy; None for nothing
-    note: Reason | None = None  # why no replica is launched before it is there
+    note: Reason | None = None  # why no replica is launched before the gateway runs
 
 
 def version(spec: PoolSpec) -> str:
@@ -43,7 +43,7 @@ def version(spec: PoolSpec) -> str:
 
 
 def resources(spec: PoolSpec) -> dict[str, Any]:
-    """Return the `resources` of the gateway's machine: where the replicas may be, and small."""
+    """Return the `resources` of the gateway's machine: small, and where the replicas may be."""
     shared = spec.task.get("resources") or {}
 
     def where(section: Mapping[str, Any]) -> dict[str, Any]:
@@ -68,8 +68,8 @@ def plan_gateway(
     """Return the next step; the cloud must have answered.
 
     Args:
-        offers: On-demand machines that would do, the cheapest first.
-        heard_at: When the robot's link to it was last seen up, or nobody looked.
+        offers: Suitable on-demand machines, the cheapest first.
+        heard_at: When the robot's link to it was last up, or last not observed.
     """
     here = [m for m in observed.gateway if m.id not in observed.ending]
     newest = max((m.id for m in here), default=None)
@@ -124,7 +124,7 @@ def _chosen(
     good = [o for o in offers if not intent.is_excluded(o.placement.location)]
     if not good:
         return None, Reason(Cause.NOTHING_OFFERED)
-    cap = cap_usd(spec, observed)  # replicas make room: without it nobody reaches them
+    cap = cap_usd(spec, observed)  # replicas make room: without a gateway they are unreachable
     if cap is not None and good[0].usd_per_hour > cap:
         least = good[0].usd_per_hour
         return None, Reason(Cause.OVER_BUDGET, usd_per_hour=least, limit_usd_per_hour=cap)

@@ -1,7 +1,7 @@
 """When a pool shuts down because of `max_hours`. Pure.
 
-Nothing is written when the time has come: every tick finds it out anew, so no manager can
-forget it, and a file with a larger `max_hours` gives more time to one that still runs.
+The end is not stored: every tick computes it again, so no manager can forget it, and a file with a
+larger `max_hours` gives more time to a pool that still runs.
 """
 
 from dataclasses import replace
@@ -16,7 +16,7 @@ SOON_S = 600.0
 
 
 def begun_at(intent: Intent, created_at: float, history: History) -> float:
-    """Return when a pool's `max_hours` began, by today's clock, which may have been set since."""
+    """Return when `max_hours` began, by the current clock, which may have been set since."""
     return history.by_clock(intent.began_at or created_at)
 
 
@@ -38,12 +38,12 @@ def is_over(spec: PoolSpec, begun_at: float, now: float) -> bool:
 
 
 def revived(spec: PoolSpec, intent: Intent, begun_at: float, now: float) -> Intent:
-    """Return the intent after an `up`: hours that have passed start again."""
+    """Return the intent after an `up`: `max_hours` start again if they have passed."""
     return replace(intent, began_at=now) if is_over(spec, begun_at, now) else intent
 
 
 def notes(spec: PoolSpec, begun_at: float, now: float) -> list[Reason]:
-    """Return notes on `max_hours`: nothing, that the end is near, or that it has come."""
+    """Return a note if `max_hours` end soon or have passed; nothing otherwise."""
     end = ends_at(spec, begun_at)
     if end is None or now < end - SOON_S:
         return []

@@ -2,9 +2,9 @@
 
     score = ln(usd_per_hour) + weight * ln(round trip)
 
-The lower the better. In logarithms the order of two offers depends on those two alone, and a
-margin of hysteresis is a percentage. The last tuple of offers keeps what was worked out of it:
-thousands take longer to sort than a whole plan takes.
+Lower is better. With logarithms, the order of two offers depends on those two alone, and a
+hysteresis margin is a percentage. Results for the latest tuple of offers are cached: sorting
+thousands takes longer than a whole plan.
 
 Not here: choosing among them (`placement`).
 """
@@ -20,21 +20,21 @@ from zlib import crc32
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement, supply
 
-# Below these, less no longer matters.
+# Lower values count as these.
 PRICE_FLOOR_USD = 0.001
 LATENCY_FLOOR_S = 0.010
-# A region nobody has measured is taken for one on another continent.
+# A region without a measured round trip counts as one on another continent.
 UNKNOWN_RTT_S = 0.150
 
 
 @dataclass(frozen=True)
 class Scale:
-    """How offers are compared."""
+    """How offers are scored: the weight of round trips, and those that are known."""
 
     weight: float = 1.0  # of round trips
-    # Known ones by `cloud/region`, in seconds.
+    # Known round trips by `cloud/region`, in seconds.
     rtt_s: Mapping[str, float] = field(default_factory=dict)
-    pool: str = ""  # whose: what is otherwise equal comes in another order for each
+    pool: str = ""  # its name: pools order otherwise equal offers differently
 
     def latency(self, placement: Placement) -> float | None:
         """Return the round trip to a placement's region in seconds; None if it is not known."""
@@ -73,16 +73,16 @@ class Listing:
     """The cheapest offer of each supply, best score first; no other is ever chosen."""
 
     rows: tuple[Row, ...]
-    trouble: Reason | None = None  # why there is no row; None where there is one
+    trouble: Reason | None = None  # why there is no row; None if there is one
 
     @cached_property
     def supplies(self) -> frozenset[str]:
-        """Of all rows."""
+        """The supplies of all rows."""
         return frozenset(row.supply for row in self.rows)
 
     @cached_property
     def clouds(self) -> frozenset[str]:
-        """Of all rows."""
+        """The clouds of all rows."""
         return frozenset(row.cloud for row in self.rows)
 
 
@@ -95,7 +95,7 @@ class Catalogue:
 
     @cached_property
     def today(self) -> Mapping[tuple[str, Placement], float]:
-        """Group and placement -> the least that is asked for it."""
+        """Group and placement -> the lowest price."""
         out: dict[tuple[str, Placement], float] = {}
         for offer in filter(is_possible, self.offers):
             key = offer.group, offer.placement
@@ -111,7 +111,7 @@ class Catalogue:
     def listing(
         self, group: str | None, spot: bool | None, excluded: Collection[str], scale: Scale
     ) -> Listing:
-        """Return the offers for a group (None: for all), of one kind only unless `spot` is None."""
+        """Return a group's offers (None: all); only spot or on-demand unless `spot` is None."""
         far = tuple(sorted(scale.rtt_s.items()))
         key = group, spot, frozenset(excluded), scale.weight, far, scale.pool
         if key not in self._listings:
@@ -128,7 +128,7 @@ _latest = Catalogue(())
 
 
 def catalogue(offers: Sequence[Offer]) -> Catalogue:
-    """Return the catalogue of some offers; the last one is cached."""
+    """Return the catalogue of these offers; the last one is cached."""
     global _latest  # noqa: PLW0603 - a memory of one pure result; see the module's header
     if _latest.offers is not offers or not isinstance(offers, tuple):
         _latest = Catalogue(offers)
@@ -160,7 +160,7 @@ def _listing(offers: Sequence[Offer], excluded: Collection[str], scale: Scale) -
 
 
 def _rows(offers: Iterable[Offer], scale: Scale) -> Iterator[Row]:
-    """Yield the rows of offers. There may be thousands: what is equal is worked out once."""
+    """Yield the rows of offers. There may be thousands: shared values are computed once."""
     regions: dict[tuple[str, str], tuple[str, float]] = {}
     lots: dict[str, int] = {}
     for offer in offers:

@@ -1,10 +1,10 @@
-"""Move a replica to where it would be launched today if that is much better. Pure.
+"""Move a replica to the location where it would be launched today, if that is much better. Pure.
 
-Only a pool that is whole and quiet moves anything, one replica at a time, the new one first, for
-the reasons in docs/design/planner.md. To move back, prices must swing by twice `gain`: so with
-steady offers every move lowers the crowding or the sum of the scores, and moves come to an end.
+Only a pool that is complete and quiet moves replicas, one at a time, new before old, for the
+reasons in docs/design/planner.md. To move back, prices must swing by twice `gain`: so with steady
+offers every move lowers the crowding or the sum of the scores, and moves come to an end.
 
-Not here: carrying it out, which is a replacement like any other (`needs`, `buying`).
+Not here: carrying out a move, which is a replacement like any other (`needs`, `buying`).
 """
 
 import math
@@ -43,9 +43,9 @@ class Move:
 def restless(buyer: Buyer) -> frozenset[ReplicaId]:
     """Return the replicas that would move if no location backed off and none had moved lately.
 
-    Nobody else moves before something happens, however long that takes: what a location that
-    backs off no longer sells has been in question already. Neither time nor events come into it, so
-    the last answer is kept: a quiet pool asks the same again and again.
+    However much time passes, no other replica moves until an input changes: offers in backoff are
+    considered here, too. Time and events do not matter, so the last answer is cached: a quiet pool
+    asks the same question at every tick.
     """
     spec, observed, rules = buyer.spec, buyer.observed, buyer.spec.migration
     if rules is None:
@@ -69,7 +69,7 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
 
 
 def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | None:
-    """Return the replica of a quiet pool that gains most by a move; None if none should move."""
+    """Return the move of a quiet pool's replica that gains most; None if none should move."""
     rules = buyer.spec.migration
     if rules is None:
         return None
@@ -83,9 +83,9 @@ def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | N
 
 
 def _move(buyer: Buyer, rules: MigrationSpec, replica: Assessment, *, at_most: bool) -> Move | None:
-    """Return the move to the best place if that is so much better.
+    """Return the move to the best location if the gain is large enough.
 
-    `at_most`: could it, or a worse one, be worth a move if no location backed off?
+    With `at_most`: could this move, or a lesser one, be worth it if no location backed off?
     """
     group, placement = group_of(buyer.groups, replica.slot), replica.placement
     kind = buyer.kind(group, replica)

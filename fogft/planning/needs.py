@@ -1,6 +1,6 @@
 """Which launches are needed: missing replicas at once, replacements one at a time. Pure.
 
-Not here: where they go and whether they can be paid (`buying`).
+Not here: where they go and whether the budget allows them (`buying`).
 """
 
 import itertools
@@ -20,8 +20,8 @@ class Need(NamedTuple):
     slot: int
     reason: Reason
     group: Group
-    replaces: Assessment | None = None  # whom it replaces; None to fill an empty slot
-    stands_in: bool = False  # an on-demand machine is to serve until a spot one does
+    replaces: Assessment | None = None  # the replica it replaces; None to fill an empty slot
+    stands_in: bool = False  # an on-demand machine that serves until a spot one does
 
 
 def needed_launches(
@@ -32,7 +32,7 @@ def needed_launches(
     *,
     settling: bool = False,
 ) -> list[Need]:
-    """Return the launches needed; none is replaced while a newcomer proves itself (`settling`)."""
+    """Return the launches needed; no replacement while a new replica proves itself (`settling`)."""
     needs: list[Need] = []
     for group, wanted in zip(groups, counts, strict=True):
         here = machines.part(groups, group)
@@ -40,7 +40,7 @@ def needed_launches(
             needs += _missing(group, wanted, here, history)
     if needs or not machines.replaced or machines.ending or settling:
         return needs
-    if any(not s.ever_ready for s in machines.good):  # one is coming
+    if any(not s.ever_ready for s in machines.good):  # one is on its way
         return []
     return _replacement(groups, counts, machines)
 
@@ -48,12 +48,12 @@ def needed_launches(
 def _replacement(
     groups: Sequence[Group], counts: Sequence[int], machines: Classification
 ) -> list[Need]:
-    """Return the launch of one successor; none where none is called for."""
+    """Return the launch of one successor; empty if no replica needs one."""
     for replica in machines.replaced:
         group = group_of(groups, replica.slot)
         here = machines.part(groups, group)
         if len(here.good) + len(here.replaced) <= counts[list(groups).index(group)]:
-            # Its slot, unless a good one lives there: that one then stands for another.
+            # In the same slot, unless a good replica is there, which fills in for another slot.
             used = {s.slot for s in (*here.good, *here.replaced)}
             taken = {s.slot for s in here.good}
             free = replica.slot not in taken and group.owns(replica.slot)

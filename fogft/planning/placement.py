@@ -1,7 +1,7 @@
 """Choose where the next replica goes. Pure and deterministic.
 
 Spread first, price and distance second: replicas in one zone are preempted together, and a cloud or
-a region fails as a whole. What is equal in both is drawn by lot, for each pool another.
+a region fails as a whole. Ties are broken by lot, differently for each pool.
 
 Not here: the order within a rank (`listing`), how long a location is avoided (`observed.backoff`).
 """
@@ -42,7 +42,7 @@ class Market:
 
     Args:
         backing_off: Supplies in backoff, see `Placement.supply`.
-        avoid: Locations to use only when no other is left: one was lost there lately.
+        avoid: Locations to use only when no other is left: a replica was lost there lately.
         full: Locations that hold as many replicas as may be lost at once.
         hazards: Location -> losses per hour, as far as known.
     """
@@ -59,7 +59,7 @@ class Market:
         pauses = backing_off or {}
         self._avoid = frozenset(avoid)
         self._nothing = listing.trouble
-        self.backing_off: Mapping[str, Backoff] = {}  # of all that it sells, where all of it does
+        self.backing_off: Mapping[str, Backoff] = {}  # of all supplies, if all back off
         self.rows, self._clouds = listing.rows, listing.clouds
         if hazards:
             self.rows = _weighed(self.rows, hazards)
@@ -89,7 +89,7 @@ class Market:
         avoid: Collection[str] = (),
         budget_usd_per_hour: float | None = None,
     ) -> Choice:
-        """Choose an offer, given where the replicas that stay are, or how many are where."""
+        """Choose an offer, given the placements of the replicas that stay, or their crowding."""
         if self._nothing:
             return Choice(None, self._nothing)
         count = (taken if isinstance(taken, Counter) else crowding(taken)).get
@@ -98,7 +98,7 @@ class Market:
         ideal = (False, min([count(cloud, 0) for cloud in self._clouds]), 0, 0)
         best: Row | None = None
         best_rank: Rank | None = None
-        for row in self.rows:  # by score, so the first of a rank is the best of it
+        for row in self.rows:  # sorted by score, so the first of a rank is its best
             if row.usd_per_hour > limit:
                 continue
             rank = (
@@ -120,7 +120,7 @@ class Market:
 
 
 def _weighed(rows: Sequence[Row], hazards: Mapping[str, float]) -> tuple[Row, ...]:
-    """Return rows in the order of their scores, losses counted in."""
+    """Return rows sorted by score, with the penalty for losses added."""
     unknown = penalty(UNKNOWN)
     known = [
         row._replace(score=row.score + penalty(hazards[row.location]) - unknown)

@@ -1,8 +1,8 @@
 """Decide how a pool should change. Pure: no clock, no cloud, no randomness.
 
-The reconciler observes, calls `plan` and applies the result. All that the decision depends on is an
-argument, so planning again after a crash is always safe. Here are the order of the steps, and what
-holds the pool within its cap. docs/design/planner.md has the flow.
+The reconciler observes, calls `plan` and applies the result. The decision depends on the arguments
+alone, so planning again after a crash is always safe. This module orders the steps and keeps the
+pool within its cap. docs/design/planner.md shows the flow.
 """
 
 from collections.abc import Sequence
@@ -24,12 +24,12 @@ from fogft.planning.sizing import Inputs, size
 
 __all__ = ["Plan", "PlannedEnd", "PlannedLaunch", "plan"]
 
-# A plan is planned on again so often; two passes are what nearly every world needs.
+# The most times that a plan is extended; two passes are nearly always enough.
 MOST_PASSES = 8
 
 
 class PlannedEnd(NamedTuple):
-    """End a machine."""
+    """A machine to end, and why."""
 
     id: ReplicaId
     reason: Reason
@@ -44,20 +44,20 @@ class Plan(NamedTuple):
     # Replicas to mark as draining in the membership; they end a little later.
     draining: tuple[ReplicaId, ...] = ()
     notes: tuple[Reason, ...] = ()  # why the pool is not yet as wanted
-    health: Health | None = None  # what the plan was based on; None when the cloud could not tell
-    # It is known without trying that planning again while it is under way adds nothing.
+    health: Health | None = None  # what the plan was based on; None if the cloud did not answer
+    # It is certain, without another pass, that planning on from here adds nothing.
     closed: bool = False
-    # For a location's backoff to end: a launch that is needed, or a stand-in's return.
+    # A needed launch, or a stand-in's return, waits for a location's backoff to end.
     waits: bool = False
-    # Who would move if they had stayed long enough and no location backed off.
+    # Replicas that would move if they had stayed long enough and no location backed off.
     restless: frozenset[ReplicaId] = frozenset()
 
 
 def plan(pool_uid: str, inputs: Inputs, *, health: Health | None = None) -> Plan:
     """Plan changes that bring the pool closer to its spec, within the safety rules.
 
-    It is planned again on the world as it is once a plan is under way, until nothing is added.
-    `health` is what `judge` makes of these very inputs, where that is known already.
+    Planning repeats on the state that follows from the plan so far, until nothing is added.
+    `health` is the result of `judge` for the same inputs, if it is already known.
     """
     health = health or judge(pool_uid, inputs.spec, inputs.observed, inputs.history)
     decided = latest = plan_once(inputs, health)
@@ -93,7 +93,7 @@ def _newly_marked(decided: Plan, history: History) -> list[ReplicaId]:
 
 
 def _under_way(pool_uid: str, inputs: Inputs, decided: Plan) -> Inputs:
-    """Return the observation and history that follow if nothing but the plan happens."""
+    """Return the observation and history that result if only the plan happens."""
     spec, _, observed, history = inputs
     now = observed.now
     ordered, events = [], []
@@ -187,7 +187,7 @@ def plan_once(inputs: Inputs, health: Health) -> Plan:
             buyer.buy(need, room=room)
     outdated = [s.id for s in others.replaced if s.is_outdated and not s.draining_since]
     endings = Endings()
-    # No group's surplus is another's.
+    # Each group by itself: a surplus in one does not fill in for another.
     for part in parts:
         makes_room = first is not None and group_of(sized.groups, first.slot) is part.group
         choose_endings(
@@ -215,9 +215,9 @@ def plan_once(inputs: Inputs, health: Health) -> Plan:
         draining=tuple(s.id for s in endings.draining),
         notes=tuple(dict.fromkeys(notes)),
         health=health,
-        # Launches alone, where nobody is to go, leave all as it is but for those who are coming.
-        # Who moves is not to go before the one that comes serves: all others do, and are needed.
-        # Room kept for stand-ins that they did not take is left for the next pass.
+        # Launches alone, if no machine is to end, give the next pass nothing new to decide.
+        # A replica that moves ends only once its successor serves: all others serve and are needed.
+        # Room that was kept for stand-ins, but not used by them, is left for the next pass.
         closed=not (going or endings.draining or machines.ending or excess)
         and (found is not None or not machines.replaced)
         and not (kept_free and waits),
@@ -227,10 +227,10 @@ def plan_once(inputs: Inputs, health: Health) -> Plan:
 
 
 def _urgent_first(buyer: Buyer, short: Sequence[Need], room: int) -> int:
-    """Order stand-ins before all else where nobody serves; return how much room is kept for them.
+    """Order stand-ins first if no replica serves; return how much room is kept for them.
 
-    One machine's, as long as somebody serves. Else spot, which may be refused and boots no faster,
-    has what they leave; under a cap it comes first, for one dear machine might be all there is.
+    While a replica serves, that is room for one. Otherwise spot, which may be refused and boots no
+    faster, gets the rest; under a cap spot comes first, as one expensive machine might use it up.
     """
     serves = any(s.may_serve for s in (*buyer.machines.good, *buyer.machines.replaced))
     if buyer.cap is None and not serves:
@@ -244,7 +244,7 @@ def _urgent_first(buyer: Buyer, short: Sequence[Need], room: int) -> int:
 def _stand_ins_missing(
     parts: Sequence[fallback.Part], begun: Sequence[Need], history: History, safe: bool
 ) -> list[Need]:
-    """Return the stand-ins called for, where some slots get their first machine now."""
+    """Return the stand-ins needed; the slots of `begun` get their first machine now."""
     needs: list[Need] = []
     for part in parts:
         if not part.group.on_demand.fallback:
@@ -258,7 +258,7 @@ def _stand_ins_missing(
 
 
 def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Assessment | None:
-    """Return the outdated one that has to end before its successor can be launched, if it may."""
+    """Return the outdated replica that must, and may, end before its successor is launched."""
     old = need.replaces
     if old is None or not old.is_outdated or old not in buyer.machines.replaced:
         return None
@@ -275,8 +275,8 @@ def _first_to_go(need: Need, buyer: Buyer, wanted: int, max_surge: int) -> Asses
 def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessment | None:
     """Return the stand-in that makes room under the cap for a spot machine, if one may.
 
-    All others that are wanted serve, and it has stayed for `fallback.STAYS_S`: should no spot
-    machine be had, it is ordered again.
+    It may if all other wanted replicas serve and it was first ready `fallback.STAYS_S` ago. If no
+    spot machine can be launched, it is ordered again.
     """
     if buyer.cap is None:
         return None
@@ -297,10 +297,10 @@ def _stand_in_to_go(need: Need, buyer: Buyer, wanted: int, room: int) -> Assessm
 
 
 def _within_cap(buyer: Buyer) -> tuple[Sequence[int], list[Reason]]:
-    """Return how many are wanted of each group: one fewer while those at hand exceed the cap.
+    """Return the wanted number of each group: one fewer while the good replicas exceed the cap.
 
-    For a cap that was lowered: no launch exceeds it. A price that has risen since the order counts
-    for nothing, and one that has fallen does: with it more were launched. One replica always stays.
+    This is for a cap that was lowered: no launch exceeds it. A price rise since the order does not
+    count; a price drop does, as more were launched because of it. One replica always stays.
     """
     machines = buyer.machines
     cap, counts, groups = buyer.cap, list(buyer.sized.counts), buyer.groups
@@ -310,7 +310,7 @@ def _within_cap(buyer: Buyer) -> tuple[Sequence[int], list[Reason]]:
     if cost <= cap + EPSILON_USD:
         return counts, []
     if machines.replaced or machines.ending or len(machines.good) > sum(counts):
-        return counts, []  # it shrinks already
+        return counts, []  # it is shrinking already
     index = max(i for i, group in enumerate(groups) if machines.part(groups, group).good)
     counts[index] = min(counts[index], len(machines.part(groups, groups[index]).good) - 1)
     return counts, [Reason(Cause.OVER_CAP, usd_per_hour=cost, limit_usd_per_hour=cap)]

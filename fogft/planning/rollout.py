@@ -1,9 +1,9 @@
 """Roll out a changed pool file replica by replica, or roll it back. Pure.
 
 A *version* is what a replica runs: `replica_hash` names it. The *good* file is the last one with
-which the pool was wholly ready. Rules: docs/design/rolling-update.md.
+which the pool was fully ready. Rules: docs/design/rolling-update.md.
 
-Not here: launches and endings (`planner`), what is remembered (`fogft.pool.manager.updating`).
+Not here: launches and endings (`planner`), stored state (`fogft.pool.manager.updating`).
 """
 
 import math
@@ -19,13 +19,13 @@ from fogft.planning.classification import Classification
 from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.observed.history import OWN_FAULTS, History, fault_of
 
-# A new replica has to serve for so long before the next one is replaced, or its version is good.
+# A new replica must serve this long before the next one is replaced, or its version is good.
 SETTLE_S = 5.0
-# So often `run` has ended, some eight seconds after it was first started: it will not stay.
+# Once `run` has ended this often, some eight seconds after its first start, it will not stay up.
 CRASH_LOOP = 4
-# Launches that failed for a reason that may be the cloud's: so many together are the version's.
+# This many launch failures, each of which may be the cloud's fault, are the version's fault.
 CLOUD_FAILURES = 3
-# Fewer errors than this are chance; and a share of errors counts from this much above the old's.
+# Fewer errors than this are chance; the share of errors must exceed the old version's by this much.
 ERRORS_MIN = 5
 ERRORS_MARGIN = 0.02
 _SURE = 3.0  # standard deviations: chance alone stops about one update in a thousand
@@ -36,8 +36,8 @@ class UpdateState(str, Enum):
     """The state of an update. Only IN_PROGRESS can succeed."""
 
     IN_PROGRESS = "in progress"
-    STOPPED = "stopped"  # given up; replicas of it are still there, or good ones are missing
-    ROLLED_BACK = "rolled back"  # the pool is wholly ready with the good file
+    STOPPED = "stopped"  # given up; some of its replicas still exist, or good ones are missing
+    ROLLED_BACK = "rolled back"  # the pool is fully ready with the good file
 
 
 _NOTES = {
@@ -51,9 +51,9 @@ _NOTES = {
 class Trial:
     """The trial of the last applied file."""
 
-    file: str = ""  # its digest: what is remembered holds for no other
+    file: str = ""  # its digest: the rest applies to no other file
     began_at: float = 0.0  # when the manager first saw it, in seconds since the epoch
-    fault: Reason | None = None  # why it was given up; None while it is not
+    fault: Reason | None = None  # why it was given up; None while it was not
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Update:
     """An update's progress, for people and programs."""
 
     state: UpdateState
-    done: int  # replicas of the version that is wanted now which serve
+    done: int  # serving replicas of the version that is wanted now
     of: int  # how many are wanted
     fault: Reason | None = None  # why it was given up; None while it was not
 
@@ -79,9 +79,9 @@ def differs(spec: PoolSpec, good: PoolSpec, slots: Iterable[int]) -> bool:
 def fault(
     spec: PoolSpec, good: PoolSpec, health: Health, history: History, began_at: float
 ) -> Reason | None:
-    """Return the proof that the new version is bad, since it began; None without one.
+    """Return proof since the start of the update that the new version is bad; None without any.
 
-    The pool is judged by `spec`, the file that is being applied.
+    `health` was judged by `spec`, the file that is being applied.
     """
     if spec is good:
         return None
@@ -113,7 +113,7 @@ def _does_not_start(judged: Assessment) -> Reason | None:
 
 
 def _errors(new: list[Assessment], old: list[Assessment]) -> Reason | None:
-    """Return how the new version's answers are worse than the old one's, if they surely are."""
+    """Return how the new version's share of errors is worse, if it surely is."""
     failed, asked = _counts(new)
     old_failed, old_asked = _counts(old)
     usual = old_failed / old_asked if old_asked else 0.0
@@ -132,7 +132,7 @@ def _counts(replicas: list[Assessment]) -> tuple[int, int]:
 
 def at_least(hits: int, of: int) -> float:
     """Return the lower end of Wilson's interval, at three standard deviations, for a share."""
-    if not hits:  # nothing, whatever rounding would make of it
+    if not hits:  # exactly 0, whatever the rounding
         return 0.0
     share, square = hits / of, _SURE * _SURE
     spread = _SURE * math.sqrt(share * (1 - share) / of + square / (4 * of * of))
@@ -140,7 +140,7 @@ def at_least(hits: int, of: int) -> float:
 
 
 def _launches_fail(history: History, began_at: float) -> Reason | None:
-    """Return that launches keep failing since the update began, and none has come to serve."""
+    """Return a reason if launches keep failing since the update began and none became ready."""
     proven_at = max((history.proven_at(place) for place in history.failures), default=began_at)
     since = max(began_at, proven_at)
     causes = [
@@ -156,7 +156,7 @@ def _launches_fail(history: History, began_at: float) -> Reason | None:
 
 
 def is_whole(spec: PoolSpec, health: Health, *, wanted: int, now: float, settle_s: float) -> bool:
-    """Whether exactly the wanted replicas run this file's version and have served for so long."""
+    """Whether the wanted replicas are there, and all are of this file and served for `settle_s`."""
     if not health.links_known or health.uplink_suspected:
         return False
     stay = [judged for judged in health.replicas if judged.verdict is not Verdict.FAILED]
@@ -177,7 +177,7 @@ def describe(
 ) -> Update | None:
     """Return the update in progress, or the one given up; None without one.
 
-    `spec` is the file in force, by which `health` was judged: after a rollback the good one.
+    `spec` is the file in force (after a rollback, the good one), by which `health` was judged.
     """
     if good is None:
         return None
@@ -188,7 +188,7 @@ def describe(
         back = not outdated and done >= wanted
         state = UpdateState.ROLLED_BACK if back else UpdateState.STOPPED
         return Update(state, done, wanted, trial.fault)
-    # Of one and the same file they differ where another fogft has launched them.
+    # With the same file, replicas are outdated if another version of fogft launched them.
     is_same = not differs(spec, good, [judged.id.slot for judged in health.replicas])
     if is_same and all(judged.verdict is not Verdict.GOOD for judged in outdated):
         return None
@@ -210,7 +210,7 @@ def is_settling(machines: Classification, now: float) -> bool:
 def may_go_first(replica: Assessment, machines: Classification, wanted: int) -> bool:
     """Whether an outdated replica may end before its successor exists: all others serve.
 
-    So at least one always answers, and never more than one is missing.
+    So at least one always answers, and at most one is missing.
     """
     if not replica.may_serve:
         return True
@@ -220,6 +220,6 @@ def may_go_first(replica: Assessment, machines: Classification, wanted: int) -> 
 
 
 def has_room(spec: PoolSpec, usd_per_hour: float, cheapest: float) -> bool:
-    """Whether a pool of this price may have its `cheapest` further replica in a replacement."""
+    """Whether a pool of this price may add one replica, at `cheapest`, during a replacement."""
     cap = spec.max_usd_per_hour
     return spec.max_surge > 0 and (cap is None or usd_per_hour + cheapest <= cap + 1e-9)

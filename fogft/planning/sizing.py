@@ -1,9 +1,9 @@
 """Decide how many replicas are wanted now, and up to what price. Pure.
 
-A target's number is that of a pool laid out from nothing over all that is offered: it depends on
-the offers alone, not on what runs, so it does not change with every preemption.
+The number for an availability target is that of a pool placed from scratch over all offers: it
+depends on the offers alone, not on what runs, so it does not change with every preemption.
 
-Not here: what is missing (`planner`), the arithmetic (`availability`).
+Not here: which launches are missing (`planner`), the arithmetic (`availability`).
 """
 
 from typing import NamedTuple
@@ -20,12 +20,12 @@ from fogft.planning.listing import Listing, Scale, catalogue
 from fogft.planning.observed.history import History
 from fogft.planning.placement import Market
 
-# Where a target is out of reach, no replica is had that would take away less of the outages.
+# If a target is out of reach, the downtime may exceed the lowest possible one by this factor.
 MUCH_THE_SAME = 1.1
 
 
 class Inputs(NamedTuple):
-    """All that a plan follows from."""
+    """Everything that a plan depends on."""
 
     spec: PoolSpec
     intent: Intent
@@ -37,9 +37,9 @@ class Size(NamedTuple):
     """The wanted number of replicas, and the cap."""
 
     groups: tuple[Group, ...]  # in the order of their slots
-    counts: tuple[int, ...]  # how many of each
+    counts: tuple[int, ...]  # replicas of each
     max_usd_per_hour: float | None  # the cap that holds now; None for none
-    notes: tuple[Reason, ...] = ()  # what may surprise
+    notes: tuple[Reason, ...] = ()  # what may surprise the user
 
     @property
     def total(self) -> int:
@@ -50,8 +50,8 @@ class Size(NamedTuple):
 def size(inputs: Inputs, running: int = 0) -> Size:
     """Return the wanted number of replicas of each group, and the cap.
 
-    `running` is how many there are: near the cap, or while nothing is offered, a target's number
-    does not fall below it.
+    `running` is the current number: near the cap, or while nothing is offered, the number for a
+    target does not fall below it.
     """
     spec, intent, observed, _ = inputs
     groups = groups_of(spec)
@@ -69,12 +69,12 @@ def size(inputs: Inputs, running: int = 0) -> Size:
 
 
 def cap_usd(spec: PoolSpec, observed: Observed) -> float | None:
-    """Return what the cap that holds now leaves beside gateway and standbys; None for no cap."""
+    """Return what is left of the current cap after gateway and standbys; None for no cap."""
     return observed.below(wish(spec, observed.wall_clock).max_usd_per_hour)
 
 
 def spot_sold(inputs: Inputs) -> list[Placement]:
-    """Return a placement in each location with spot offers, if nothing fills in."""
+    """Return a placement in each location with spot offers; empty if on-demand stands in."""
     groups = groups_of(inputs.spec)
     if any(group.on_demand.fallback for group in groups):
         return []
@@ -112,9 +112,9 @@ def _layout(inputs: Inputs, cap: float | None) -> list[Placement]:
 def _for_target(
     inputs: Inputs, asked: AvailabilitySpec, cap: float | None, running: int
 ) -> tuple[int, Reason | None]:
-    """Return the fewest replicas that reach the target, or all but reach what can be reached.
+    """Return the fewest replicas that reach the target, or that come close to the best possible.
 
-    The reason says why the target cannot be reached; None where it can.
+    The reason says why the target cannot be reached; None if it can.
     """
     least = inputs.spec.replicas
     if not inputs.observed.offers:
@@ -129,7 +129,7 @@ def _for_target(
         if down[-1] <= 1.0 - asked.target + 1e-12 and count >= least:
             return count, None
     enough = next((n for n, share in enumerate(down, 1) if share <= MUCH_THE_SAME * down[-1]), 0)
-    # Not below what runs: near the cap, prices that waver would make the number waver.
+    # Not below what runs: near the cap, fluctuating prices would make the number fluctuate.
     count = max(1, least, enough, min(running, len(laid)))
     most = Reason(Cause.MOST_REPLICAS, count=MAX_REPLICAS)
     why = Reason(Cause.OVER_CAP) if len(laid) < MAX_REPLICAS else most

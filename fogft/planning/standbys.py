@@ -1,7 +1,7 @@
 """On-demand machines that are stopped when spot is back, and started when it is lost again. Pure.
 
-The planner knows nothing of them: what it ends is stopped, and what it buys is started, where that
-is the same to it.
+The planner does not know of them: afterwards, a planned end becomes a stop, and a planned launch
+becomes a start, where the effect on the plan is the same.
 
 Not here: who stands in, and when (`fallback`).
 """
@@ -21,10 +21,10 @@ from fogft.planning.sizing import Inputs
 def started(
     inputs: Inputs, launches: Iterable[PlannedLaunch], slack_usd: float | None = None
 ) -> Mapping[int, PlannedLaunch]:
-    """Return, by the slot of a planned stand-in, the start of a standby in its place.
+    """Return, by the slot of a planned stand-in, the standby to start in its place.
 
-    It may be of a type that came instead of the one ordered, where all types of a location are
-    about as dear. By `slack_usd` an hour it may cost more than what was planned; None for any.
+    It may have an instance type other than the planned one if all types of a location cost about
+    the same. It may cost `slack_usd` an hour more than the planned machine; None for any amount.
     """
     spec, intent, observed, _ = inputs
     groups = groups_of(spec)
@@ -51,7 +51,7 @@ def started(
 def stopped(
     spec: PoolSpec, ends: Iterable[PlannedEnd], observed: Observed
 ) -> Mapping[ReplicaId, PlannedLaunch]:
-    """Return the launches that are stopped rather than ended: enough spot machines are back."""
+    """Return the machines to stop rather than end, because enough spot machines are back."""
     groups = groups_of(spec)
     machines = {machine.id: machine for machine in observed.machines or ()}
     room = {

@@ -1,7 +1,7 @@
-"""Bind a TCP port, and make room where too many have connected that have not proved who they are.
+"""Bind a TCP port, and make room if too many connections are not authenticated yet.
 
-One host cannot keep others out for longer than these take to greet: where the room is used up, the
-oldest connection of the host that has most of them is ended.
+One host cannot keep others out for longer than their handshakes take: if all places are taken, the
+oldest connection of the host with the most connections is closed.
 """
 
 import ipaddress
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def oldest_of_most(greeting: Mapping[T, str]) -> T:
-    """Return who has to go of those (oldest first) that are greeting, each with its host."""
+    """Return the connection to close, of those in a handshake (oldest first) with their hosts."""
     networks = {one: network_of(host) for one, host in greeting.items()}
     (most, _), *_ = Counter(networks.values()).most_common(1)
     return next(one for one, network in networks.items() if network == most)
@@ -25,7 +25,7 @@ def oldest_of_most(greeting: Mapping[T, str]) -> T:
 
 @lru_cache(maxsize=1024)
 def network_of(host: str) -> str:
-    """Return the network of an IPv6 address, 64 bits, as its first address; else the host."""
+    """Return the /64 network of an IPv6 address, as its first address; else the host."""
     try:
         address = ipaddress.ip_address(host.partition("%")[0])
     except ValueError:

@@ -27,14 +27,14 @@ class _File:
 
 
 def write(path: Path, records: Sequence[SignedRecord]) -> None:
-    """Replace the file."""
+    """Replace the file's content with these records."""
     content = [to_plain(one) for one in records]
     whole = {"version": VERSION, "checksum": checksum(content), "records": content}
     disk.write_json(path, whole)
 
 
 def read(path: Path) -> list[SignedRecord]:
-    """Return the records of the file; none if there is no file."""
+    """Return the records in the file; none if there is no file."""
     raw = disk.read_json(path)
     if raw is None:
         return []
@@ -50,10 +50,10 @@ def read(path: Path) -> list[SignedRecord]:
 
 
 def restore(path: Path, records: RecordSet, ca: Path) -> bool:
-    """Restore the records on disk, expired certificates' too; return false for a damaged file."""
+    """Restore the records on disk, even of expired certificates; False if the file is damaged."""
     try:
         known = read(path)
-    except StateError as error:  # whoever connects brings them back
+    except StateError as error:  # peers send them again
         log.error("cache_damaged reason=%r", error.message)
         return False
     any_time = Verifier(ca, any_time=True)

@@ -1,6 +1,6 @@
 """A process's membership records: kept on disk, exchanged with every rendezvous it can reach.
 
-It dials all endpoints and keeps on dialling; nothing waits for it.
+The client dials all endpoints in the background, again and again; no caller waits for it.
 
 Not here: what records mean (`fogft.records.roster`).
 """
@@ -49,7 +49,7 @@ class Known:
 
 @dataclass(eq=False)
 class RendezvousClient:
-    """The records of one process.
+    """Keeps the records of one process, and exchanges them with every rendezvous.
 
     `changed` is called on the client's thread after anything changed; it must not block.
     """
@@ -96,7 +96,7 @@ class RendezvousClient:
         *,
         sequence: int | None = None,
     ) -> None:
-        """Publish our own record from now on; without `sequence` above all before. Any thread."""
+        """Publish our own record from now on; without `sequence`, above older ones. Any thread."""
         own = _Own(generation, dict(content), sequence)
         self._loop.call_soon_threadsafe(self._say, kind, subject, own)
 
@@ -144,7 +144,7 @@ class RendezvousClient:
             self._exchange.abort()
 
     async def _call(self, endpoint: str) -> None:
-        """Keep one rendezvous connected for ever."""
+        """Keep one rendezvous connected forever."""
         while True:
             began = time.monotonic()
             try:
@@ -174,7 +174,7 @@ class RendezvousClient:
         self._look_after_own()
 
     def _assert_own(self, kind: RecordKind, subject: str, own: _Own) -> None:
-        """See that what stands for us is what we say now, signed by our present certificate."""
+        """Ensure that our current content is the record that counts, under our certificate."""
         found = self._records.get(kind, subject)
         held = None if found is None else found.record
         if found is not None and found.record.content == own.content:
@@ -187,7 +187,7 @@ class RendezvousClient:
                 return
         sequence = own.sequence
         if sequence is None:
-            # A former self may have said more than we remember: go on above it.
+            # An earlier process of ours may have published more than we know: continue above it.
             said = held is not None and held.generation == own.generation
             sequence = held.sequence + 1 if held is not None and said else 1
         record = Record(

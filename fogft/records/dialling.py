@@ -1,9 +1,9 @@
 """Open a connection to a rendezvous, soon after it becomes reachable, and verify it.
 
-A new attempt begins every 0.25 s while earlier ones are still under way: TCP repeats one that was
-lost only after 1, 3, 7 seconds, and one that crosses a slow link needs seconds.
+A new attempt begins every 0.25 s while earlier ones are still in progress: TCP repeats a lost one
+only after 1, 3 and 7 seconds, and an attempt over a slow link takes seconds.
 
-Not here: what is exchanged then (`exchange`).
+Not here: the exchange of records (`exchange`).
 """
 
 import asyncio
@@ -33,9 +33,9 @@ async def connect(
     """Return an authenticated connection to a rendezvous, and our address as seen there.
 
     Raises:
-        WireError: Somebody else is there, or it does not let us in.
-        RecordError: What it says is no greeting.
-        OSError: It cannot be reached, or TLS fails.
+        WireError: It cannot be reached, or it is no rendezvous of our pool.
+        RecordError: Its first message is not a challenge.
+        OSError: DNS or TLS fails. EOFError, asyncio.TimeoutError: It sends no challenge.
     """
     raw = await _reach(endpoint)
     try:
@@ -47,7 +47,7 @@ async def connect(
 
 
 async def _reach(endpoint: str) -> socket.socket:
-    """Return the first of several overlapping attempts that gets through."""
+    """Return the socket of the first overlapping attempt that completes, or raise its error."""
     attempts: set[asyncio.Task[socket.socket]] = set()
     loop = asyncio.get_running_loop()
     try:
@@ -60,7 +60,7 @@ async def _reach(endpoint: str) -> socket.socket:
                 tick.cancel()
             for attempt in [a for a in attempts if a.done()]:
                 attempts.discard(attempt)
-                return attempt.result()  # an error, too: it is told, then tried again
+                return attempt.result()  # or raises: the caller reports it and retries
     finally:
         for attempt in attempts:
             attempt.cancel()
@@ -75,7 +75,7 @@ async def _attempt(endpoint: str) -> socket.socket:
     found = await asyncio.wait_for(
         loop.getaddrinfo(host, port, type=socket.SOCK_STREAM), _ATTEMPT_TIMEOUT_S
     )
-    # Any of its addresses: the next attempt may take another.
+    # A random one of its addresses: the next attempt may take another.
     family, kind, protocol, _, address = secrets.choice(found)
     raw = socket.socket(family, kind, protocol)
     try:
@@ -114,9 +114,9 @@ async def _greet(
 
 
 def client_context(ca: Path) -> ssl.SSLContext:
-    """Return what verifies a certificate of the pool's CA. Raises CredentialError."""
+    """Return a TLS context that verifies certificates of the pool's CA. Raises CredentialError."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    context.check_hostname = False  # its role and pool are what must be right, not its host
+    context.check_hostname = False  # its role and pool are checked, not its host
     try:
         context.load_verify_locations(ca)
     except (OSError, ssl.SSLError):
@@ -125,7 +125,7 @@ def client_context(ca: Path) -> ssl.SSLContext:
 
 
 def _check(link: Any, endpoint: str, pool_uid: str) -> bytes:
-    """See that a rendezvous of our pool is there; return what ties our greeting to it."""
+    """Check that the peer is a rendezvous of our pool; return what binds our greeting to it."""
     subject = dict(entry for part in link.getpeercert()["subject"] for entry in part)
     name, role = subject.get("commonName", ""), subject.get("organizationalUnitName", "")
     if role != "rendezvous" or not name.endswith(f".{pool_uid}"):

@@ -1,6 +1,6 @@
 """Keep a set of records in sync with all connected peers. On one event loop.
 
-Both ends do the same: tell what they have, send what the other lacks, pass on at once what is new.
+Both ends do the same: list their records, send what the other end lacks, pass on new ones at once.
 
 Not here: making connections (`server`, `dialling`).
 """
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 SILENCE_S = 3.0  # TCP alone would wait for minutes behind a black hole
 PING_EVERY_S = 1.0
-HAVE_EVERY = 5  # pings: heals whatever was missed
+HAVE_EVERY = 5  # pings: repairs missed updates
 OF_ONE_LIMIT = 8  # connections of one certificate; a newer one ends the oldest
 _WAITING_LIMIT = 4 << 20
 _READ_BYTES = 64 << 10
@@ -48,7 +48,7 @@ class Connection:
 
         Raises asyncio.TimeoutError if nothing came for `SILENCE_S`.
         """
-        found = list(self.unframer.feed(b""))  # what came along with a greeting
+        found = list(self.unframer.feed(b""))  # received along with the greeting
         while not found:
             data = await asyncio.wait_for(self.reader.read(_READ_BYTES), SILENCE_S)
             if not data:

@@ -1,7 +1,7 @@
 """The messages between a rendezvous and its callers, as bytes. Pure.
 
-Each message is a JSON object behind its length. Whatever bytes come in, and however they are
-cut, a reader gives messages or raises `RecordError`, and holds no more than one frame.
+Each message is its length, then a JSON object. Whatever bytes come in, and however they are
+split, a reader returns messages or raises `RecordError`, and buffers no more than one frame.
 """
 
 import json
@@ -29,7 +29,7 @@ NONCE_BYTES = 32
 _LENGTH = struct.Struct(">I")
 _BATCH_BYTES = 64 << 10
 _DIGEST_LIMIT = 4096
-_GREETING_PREFIX = b"fogft caller 1\n"  # so that no other signature is good for this
+_GREETING_PREFIX = b"fogft caller 1\n"  # so that no other signature is valid here
 
 
 class Unframer:
@@ -100,7 +100,7 @@ def ping() -> bytes:
 
 
 def have(digest: Digest) -> bytes:
-    """Return a digest of our records, so that the other side can send missing ones."""
+    """Return a message with our records' digest, so that the other side can send missing ones."""
     return frame({"type": "have", "digest": [[*key, *order] for key, order in digest.items()]})
 
 
@@ -113,7 +113,7 @@ def read_have(message: dict[str, Any]) -> dict[Key, Order]:
 
 
 def records(all: Sequence[SignedRecord]) -> Iterator[bytes]:
-    """Yield messages that carry these records, none of them large."""
+    """Yield messages that carry these records, in batches of limited size."""
     batch: list[dict[str, str]] = []
     size = 0
     for one in all:
@@ -129,7 +129,7 @@ def records(all: Sequence[SignedRecord]) -> Iterator[bytes]:
 
 
 def read_records(message: dict[str, Any]) -> list[SignedRecord]:
-    """Return the records of a message, not yet judged."""
+    """Return the records of a message, not verified yet."""
     rows = message.get("records")
     if not isinstance(rows, list):
         raise RecordError("malformed", "records that are no list")
@@ -142,7 +142,7 @@ def pack(all: Sequence[SignedRecord]) -> bytes:
 
 
 def unpack(data: bytes) -> list[SignedRecord]:
-    """Return the records of `pack`, not yet judged."""
+    """Return the records of `pack`, not verified yet."""
     message = read_json(data, FRAME_LIMIT)
     check_version(message)
     return read_records(message)

@@ -1,6 +1,6 @@
 """Membership records, each signed by its only allowed writer. Pure.
 
-What travels is its body as bytes, with the writer's certificate and signature over exactly
+A record is sent as the bytes of its body, with the writer's certificate and signature over exactly
 these bytes, so anybody may pass a record on and nobody can change it.
 
 Not here: merging (`record_set`), what contents mean (`roster`), cryptography (passed in).
@@ -22,10 +22,10 @@ from fogft.model.names import PoolUid
 from fogft.model.plain import Count
 
 VERSION = 2
-BODY_LIMIT = 180 << 10  # a frame holds it as text
+BODY_LIMIT = 180 << 10  # it must fit into a frame, as text
 CERTIFICATE_LIMIT = 4 << 10
 SIGNATURE_LIMIT = 256
-_SIGNED_PREFIX = b"fogft record 1\n"  # a signature for this purpose is good for no other
+_SIGNED_PREFIX = b"fogft record 1\n"  # a signature for this purpose is valid for no other
 _SUBJECT = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.-]{0,63})?")
 T = TypeVar("T")
 
@@ -42,17 +42,17 @@ class RecordError(ValueError):
 
 
 class RecordKind(str, Enum):
-    """What a record is about; its writer follows from it."""
+    """The kind of a record, which determines its writer."""
 
-    ADMISSION = "admission"  # manager: which generation of which slot is let in
-    REVOCATION = "revocation"  # manager: certificates that are good no more
-    LEASE = "lease"  # manager: how long replicas serve without hearing of it again
+    ADMISSION = "admission"  # manager: which generation of which slot is admitted
+    REVOCATION = "revocation"  # manager: certificates that are no longer valid
+    LEASE = "lease"  # manager: how long replicas serve without hearing from it again
     SLOT = "slot"  # replica: its endpoint, services, state and load
     ROBOT = "robot"  # robot: where replicas may dial in
     GATEWAY = "gateway"  # gateway: its endpoint
 
 
-# All others are the manager's.
+# The manager writes all other kinds.
 _WRITERS = {
     RecordKind.SLOT: Role.REPLICA,
     RecordKind.ROBOT: Role.ROBOT,
@@ -68,7 +68,7 @@ class Record:
     kind: RecordKind
     subject: Annotated[str, only(_SUBJECT.fullmatch, "a subject")]
     generation: Count  # of the slot or the certificate; the manager's epoch
-    sequence: Count  # counts what the writer wrote within a generation
+    sequence: Count  # counts the writer's records within a generation
     content: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -106,7 +106,7 @@ Sign = Callable[[bytes], tuple[bytes, bytes]]
 
 
 def sign_record(record: Record, sign: Sign) -> SignedRecord:
-    """Sign a record. Raises ValueError for one that could not be read back, such as too large."""
+    """Sign a record. Raises ValueError: it could not be read back, for example as too large."""
     value = {"v": VERSION, **plain.to_plain(record)}
     body = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
     if _decode(body) != record:
@@ -133,7 +133,7 @@ def verified_writer(record: Record, signed: SignedRecord, verify: Verify) -> Wri
 
 
 def expected_writer(record: Record) -> Holder:
-    """Return the only one who may write this record.
+    """Return the only holder that may write this record.
 
     A replica's certificate names its generation: it cannot write a later one's record.
     """
@@ -167,7 +167,7 @@ def check_version(raw: Mapping[str, Any]) -> None:
 
 
 def read(cls: type[T], raw: Any) -> T:
-    """Return the value that plain data describes."""
+    """Return plain data as a value of a class. Raises RecordError."""
     try:
         return plain.from_plain(cls, raw)
     except ValueError as error:
@@ -201,7 +201,7 @@ def to_plain(signed: SignedRecord) -> dict[str, str]:
 
 
 def from_plain(raw: Any) -> SignedRecord:
-    """Read a signed record from JSON data; its body is not read."""
+    """Read a signed record from JSON data, without parsing its body."""
     try:
         body, certificate, signature = (raw[k] for k in ("body", "certificate", "signature"))
         signed = SignedRecord(

@@ -1,6 +1,6 @@
-"""Records merged by (generation, sequence): the same set, whatever order they came in. Pure.
+"""Records merged by (generation, sequence): their order of arrival does not matter. Pure.
 
-Not here: a record's bytes (`record`), its meaning (`roster`), how it travels (`exchange`).
+Not here: a record's bytes (`record`), its meaning (`roster`), sending it (`exchange`).
 """
 
 from collections import Counter
@@ -31,14 +31,14 @@ class Verdict(str, Enum):
     """The verdict on an offered record."""
 
     ACCEPTED = "accepted"
-    KNOWN = "known"  # the very same stands already
-    OLDER = "older"  # a later one stands
-    REFUSED = "refused"  # no good; the counters say why
+    KNOWN = "known"  # the same one is held already
+    OLDER = "older"  # a later one is held
+    REFUSED = "refused"  # invalid; the counters say why
 
 
 @dataclass(frozen=True)
 class Held:
-    """A record that stands, as it was verified."""
+    """The latest record of a key, verified."""
 
     record: Record
     signed: SignedRecord
@@ -74,7 +74,7 @@ class RecordSet:
             raise RecordError("pool", "a record of another pool")
         held = self._held.get(record.key)
         if held is not None:
-            # Of two that a writer said under one number, all must settle on the same one.
+            # If a writer published two under one number, all peers must settle on the same one.
             new, old = (record.order, signed.body), (held.record.order, held.signed.body)
             if new <= old:
                 return Verdict.KNOWN if new == old else Verdict.OLDER
@@ -91,7 +91,7 @@ class RecordSet:
         return Verdict.ACCEPTED
 
     def _revoke(self, names: frozenset[str]) -> None:
-        """Forget what revoked certificates have signed, whatever its order."""
+        """Drop records that revoked certificates have signed, whatever their order."""
         self.revoked = names
         for key in [k for k, held in self._held.items() if held.writer.common_name in names]:
             if key[0] != RecordKind.REVOCATION.value:
@@ -113,7 +113,7 @@ class RecordSet:
         return len(self._held)
 
     def get(self, kind: RecordKind, subject: str = "") -> Held | None:
-        """Return what stands for a key."""
+        """Return the latest record of a key; None without one."""
         return self._held.get((kind.value, subject))
 
     def of(self, kind: RecordKind) -> list[Record]:
@@ -122,5 +122,5 @@ class RecordSet:
 
 
 def _urgency(key: Key) -> tuple[bool, bool, Key]:
-    # Revocations first, then admission: what follows is judged by them.
+    # Revocations first, then admission: the other records are judged by them.
     return (key[0] != RecordKind.REVOCATION.value, key[0] != RecordKind.ADMISSION.value, key)

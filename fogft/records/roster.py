@@ -1,9 +1,9 @@
 """Combine records into a membership: the replicas and their endpoints. Pure.
 
-A replica's own record counts only while its generation is the one that the manager admitted. What
-is no content of its kind raises `RecordError`.
+A replica's own record counts only while its generation is the one that the manager admitted.
+Content that does not fit the kind of its record raises `RecordError`.
 
-Not here: who may write them (`record`) and which one stands (`record_set`).
+Not here: who may write a record (`record`) and which one is the latest (`record_set`).
 """
 
 from collections.abc import Callable, Iterable
@@ -25,8 +25,8 @@ LEASE_LIMIT_S = 366 * 86_400.0
 class SlotState:
     """A replica's own record."""
 
-    endpoint: EndpointOrEmpty = ""  # where it can be reached, as it was told; empty if it was not
-    observed_endpoint: EndpointOrEmpty = ""  # the same as a rendezvous saw it: only a guess
+    endpoint: EndpointOrEmpty = ""  # where it can be reached, as configured; empty if not set
+    observed_endpoint: EndpointOrEmpty = ""  # the same, as a rendezvous saw it: only a guess
     dials_out: bool = False  # it cannot be reached: it dials robots and gateways itself
     services: tuple[Line, ...] = ()
     draining: bool = False
@@ -99,8 +99,8 @@ READERS: dict[RecordKind, Callable[[Record], object]] = {
 def located(membership: Membership, slots: Iterable[Record]) -> Membership:
     """Return a membership completed with admitted replicas' own records.
 
-    A replica that was told its address knows best, then the manager's word counts, then what
-    a rendezvous saw. One that dials out has no endpoint: it is waited for.
+    The address configured on a replica comes first, then the manager's, then the one that a
+    rendezvous saw. A replica that dials out has no endpoint: its connection is awaited.
     """
     said = {(int(r.subject), r.generation): slot_state(r) for r in slots}
     members = (_located(m, said.get((m.id.slot, m.id.generation))) for m in membership.members)
@@ -108,9 +108,9 @@ def located(membership: Membership, slots: Iterable[Record]) -> Membership:
 
 
 def gateways_of(membership: Membership, holder: Holder) -> tuple[Member, ...] | None:
-    """Return the gateways of a robot or gateway, as members; None for the replicas.
+    """Return the gateways of a robot or gateway, as members; None if it uses the replicas directly.
 
-    While a gateway's certificate is being replaced there are two of it, one of which answers.
+    While a gateway's certificate is being replaced, it has two members, one of which answers.
     """
     gateways = membership.topology.neighbours(holder)
     if not gateways:

@@ -1,6 +1,6 @@
 """The rendezvous server, which stores and passes on a pool's records.
 
-What comes from nobody of the pool, or is no message, ends that connection and is counted by reason.
+A caller from outside the pool, or an invalid message, ends the connection and is counted by reason.
 
 Not here: records (`exchange`), the process (`fogft.pool.commands.rendezvous`).
 """
@@ -83,7 +83,7 @@ class RendezvousServer:
                 self._greeting[task] = host
                 self._tasks.add(task)
                 task.add_done_callback(self._tasks.discard)
-                await asyncio.sleep(0)  # where many wait to be accepted, `sock_accept` never waits
+                await asyncio.sleep(0)  # `sock_accept` never yields while many are waiting
         finally:
             self.close()
 
@@ -106,7 +106,7 @@ class RendezvousServer:
             log.info("caller_left name=%s host=%s", connection.name, host)
 
     async def _greet(self, raw: socket.socket, host: str) -> Connection:
-        """Shake hands; return the connection of a caller that has proved itself."""
+        """Do the handshake; return the connection of an authenticated caller."""
         loop = asyncio.get_running_loop()
         self._renew_context()
         binding = self._binding
@@ -135,7 +135,7 @@ class RendezvousServer:
             transport.abort()
             raise
         writer = asyncio.StreamWriter(transport, protocol, reader, loop)
-        unframer.limit = frames.FRAME_LIMIT  # for one who has proved who he is
+        unframer.limit = frames.FRAME_LIMIT  # for an authenticated caller
         return Connection(reader, writer, unframer, caller.common_name)
 
     def _check(self, caller: Writer) -> None:
@@ -147,7 +147,7 @@ class RendezvousServer:
             raise RecordError("revoked", f"the certificate of `{caller.common_name}` is revoked")
 
     def _renew_context(self) -> None:
-        """Load certificate and key, again when they were replaced."""
+        """Load certificate and key; reload them when they were replaced."""
         ours = self._credentials
         try:
             version = disk.version(ours.certificate)
@@ -160,7 +160,7 @@ class RendezvousServer:
             der = ssl.PEM_cert_to_DER_cert(ours.certificate.read_text())
         except (OSError, ValueError) as error:
             if self._context is not None:
-                return  # being replaced: the old pair is as good as it was
+                return  # being replaced: the old pair is still good
             raise CredentialError(
                 f"`{ours.certificate}` or its key cannot be used",
                 "issue the rendezvous a certificate of the pool's CA",

@@ -1,7 +1,7 @@
 """Sign with a certificate's key, and verify signatures: for records and greetings.
 
-The pair that a process has for TLS signs what it says of itself: no further keys have to be handed
-out, and whoever may not open a link may not write a record either.
+A process signs its records with its TLS key: no further keys have to be distributed, and a process
+that may not open a link cannot write a record either.
 
 Not here: what may be signed by whom (`fogft.records.record`), making keys (`fogft.pool`).
 """
@@ -37,7 +37,7 @@ class Signer:
 
     @property
     def certificate(self) -> bytes:
-        """The present certificate (DER)."""
+        """The current certificate (DER)."""
         self._load()
         return self._der
 
@@ -69,7 +69,7 @@ class Signer:
             key = load_pem_private_key(self._key_path.read_bytes(), password=None)
         except (OSError, ValueError, TypeError):
             if self._key is not None:
-                return  # it is being replaced: the old pair is as good as it was
+                return  # it is being replaced: the old pair is still good
             raise CredentialError(
                 f"`{self._certificate_path}` or its key cannot be used",
                 "`fogft up` writes the pool's certificates",
@@ -87,8 +87,8 @@ class Signer:
 class Verifier:
     """Verifies signatures by currently valid certificates of the pool's CA.
 
-    With `any_time` also by others: for what was verified before. With `lazy` the CA is read on
-    first use; one that cannot be used is a `RecordError` then.
+    With `any_time`, certificates may have expired: for records verified before. With `lazy`, the CA
+    is read on first use; if it cannot be used, that raises `RecordError`.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class Verifier:
         self._known: dict[bytes, x509.Certificate] = {}
 
     def __call__(self, certificate: bytes, signature: bytes, message: bytes) -> Writer:
-        """Return who signed `message`; what is no good raises `RecordError`."""
+        """Return who signed `message`. Raises RecordError: certificate or signature is invalid."""
         from cryptography.exceptions import InvalidSignature
         from cryptography.hazmat.primitives import hashes
         from cryptography.hazmat.primitives.asymmetric import ec
@@ -113,7 +113,7 @@ class Verifier:
         if not self._any_time:
             self._check_time(known)
         key = known.public_key()
-        assert isinstance(key, ec.EllipticCurvePublicKey)  # `_judged` saw to it
+        assert isinstance(key, ec.EllipticCurvePublicKey)  # checked by `_judged`
         try:
             key.verify(signature, message, ec.ECDSA(hashes.SHA256()))
         except InvalidSignature:
@@ -171,7 +171,7 @@ def _issued(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
 
 
 def attribute(certificate: x509.Certificate, which: str) -> str:
-    """Return a certificate's common name (``CN``) or unit (``OU``); empty unless it has one."""
+    """Return a certificate's common name (``CN``) or unit (``OU``); empty unless there is one."""
     from cryptography import x509
 
     oids = {"CN": x509.NameOID.COMMON_NAME, "OU": x509.NameOID.ORGANIZATIONAL_UNIT_NAME}

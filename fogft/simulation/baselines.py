@@ -1,7 +1,7 @@
 """Fixed policies that fogft is compared with, on the same machines and prices.
 
-Each sees a notice, a lost machine and a refusal as soon as fogft does, and is not charged for
-what it needs besides its replicas. A machine with a notice is replaced, and serves until it ends.
+Each sees a notice, a lost machine and a refusal as soon as fogft does, and is charged for its
+replicas only. `Search` replaces a machine with a notice at once; it serves until it ends.
 """
 
 from __future__ import annotations
@@ -85,10 +85,10 @@ class Static:
 
 
 class Search:
-    """Spot machines placed by a rule, and `extra` ones besides.
+    """Spot machines placed by a rule: one for each replica, and `extra` ones.
 
-    `on_demand` runs for each spot machine that is not ready, but for no more than the replicas.
-    After a refusal in every location it waits a minute.
+    An `on_demand` machine runs for each spot machine that is not ready, but at most one for each
+    replica. After as many refusals in a row as there are locations, the search pauses for a minute.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class Search:
 
 
 class Rule:
-    """A rule for where the next spot machine is ordered: cheapest first, fewest replicas first."""
+    """Where to order the next spot machine: fewest replicas, then oldest failure, then price."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
         self._spot = spot
@@ -172,7 +172,7 @@ class Rule:
         self._preempted: set[str] = set()
 
     def place(self, taken: Sequence[Offer]) -> Offer:
-        """Return the offer to order, given those in use; ties go to the oldest failure."""
+        """Return the offer to order, given those in use."""
         used = Counter(o.placement.location for o in taken)
         return min(
             (o for o in self._spot if o.placement.location not in self._preempted),
@@ -192,7 +192,7 @@ class Rule:
 
 
 class InTurn(Rule):
-    """Round robin: the next location of a list, wherever the others are."""
+    """Round robin: the next location of a list, wherever other replicas are."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
         super().__init__(spot)

@@ -1,8 +1,8 @@
 """The lower bound of cost for replicas that are always ready, with perfect foresight.
 
-Whoever serves was ordered a boot before, in a location that had room from then on, and the boot is
-paid. All else is free: whoever is no longer needed ends at once. So replicas are units of a flow
-through time, each in some location or on demand, and the cheapest flow is the bound.
+A machine that serves was ordered one boot earlier, in a location with room since then, and its boot
+is paid for. All else is free: a machine that is not needed ends at once. So replicas are units of a
+flow through time, each in some location or on demand, and the cheapest flow is the bound.
 
 Owns: the flow. Not here: what policies reach (`comparison`).
 """
@@ -20,7 +20,7 @@ HOUR_S = 3600.0
 
 
 class _Stay(NamedTuple):
-    """So many machines of one price can serve in one location from a time to another."""
+    """A period in which a number of machines of one price can serve in one location."""
 
     begin_s: float
     end_s: float
@@ -42,8 +42,8 @@ def least_usd_per_hour(
     Args:
         timelines: Location -> its room for spot machines.
         spot: Location -> US dollars per hour of a spot machine there.
-        on_demand: Of an on-demand machine, which can always be had; None for none.
-        boot_s: From the order until a machine serves. Machines of the beginning are paid for it.
+        on_demand: US dollars per hour of an on-demand machine, always available; None for none.
+        boot_s: From the order until a machine serves. The first machines are charged for it, too.
     """
     stays = [
         stay
@@ -69,7 +69,7 @@ def _stays(
 
 
 def _spells(line: Timeline, level: int, length_s: float) -> Iterator[tuple[float, float]]:
-    """Yield the times in which there is room for so many machines."""
+    """Yield the periods in which there is room for `level` machines."""
     changes = of_changes(((at, int(n >= level)) for at, n in line.changes), length_s).changes
     ends = [*(at for at, _ in changes[1:]), length_s]
     for (begin, has_room), end in zip(changes, ends, strict=True):
@@ -78,7 +78,7 @@ def _spells(line: Timeline, level: int, length_s: float) -> Iterator[tuple[float
 
 
 class _Flow:
-    """Successive cheapest paths through time; exact, for no edge costs less than nothing."""
+    """Min-cost flow by successive cheapest paths through time; exact, as no cost is negative."""
 
     def __init__(self, stays: Sequence[_Stay], boot_s: float, length_s: float) -> None:
         ends = (at for stay in stays for at in (stay.begin_s, stay.end_s))
@@ -86,7 +86,7 @@ class _Flow:
         index = {at: number for number, at in enumerate(times)}
         self._goal = len(times) - 1
         self._out: list[list[int]] = [[] for _ in times]
-        self._to: list[int] = []  # by edge; each is followed by the one that takes it back
+        self._to: list[int] = []  # by edge; each is followed by its reverse edge
         self._room: list[int] = []
         self._usd: list[float] = []
         for stay in stays:
@@ -113,7 +113,7 @@ class _Flow:
             self._room.append(free)
 
     def cheapest(self, units: int) -> float | None:
-        """Return the price of a flow; None if there is no such flow."""
+        """Return the cost of the cheapest flow of this many units; None if there is none."""
         potential = [0.0] * len(self._out)
         total = 0.0
         while units:

@@ -1,6 +1,6 @@
-"""Run policies side by side in the same markets, one market a seed.
+"""Run policies side by side in the same markets, one market per seed.
 
-Not here: how it is shown (`fogft.cli`, `plot`).
+Not here: showing the results (`fogft.cli`, `plot`).
 """
 
 import logging
@@ -42,7 +42,7 @@ FIGURES = (
     "preemptions_per_day",
     "outages_per_day",
 )
-# Figure -> the sums of days that it is the ratio of, and its unit.
+# Figure -> the two sums over days whose ratio it is, and its unit.
 _OF_DAYS = {
     "available": ("up_s", "wanted_s", 1.0),
     "under_target": ("under_s", "wanted_s", 1.0),
@@ -59,14 +59,14 @@ class Scenario:
     spec: PoolSpec
     find: FindOffers  # what a cloud offers for a task's `resources`
     timing: Timing
-    model: MarketModel  # to make them up from
-    # Location -> what was recorded there; empty to make markets up.
+    model: MarketModel  # from which markets are generated
+    # Location -> its recorded capacity; empty to generate markets.
     recorded: Mapping[str, Timeline] = field(default_factory=dict)
     days: float = 7.0  # how long each run is measured, after the first hour
     seeds: Sequence[int] = tuple(range(20))  # one run each
-    # Location -> its own MTTF and MTTR, where they are not the model's.
+    # Location -> its own MTTF and MTTR, if they differ from the model's.
     zones: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    # Location -> price of a spot machine over time, where it is not what `find` says.
+    # Location -> price of a spot machine over time, if it is not that of `find`.
     prices: Mapping[str, Timeline] = field(default_factory=dict)
 
     @property
@@ -76,7 +76,7 @@ class Scenario:
 
     @property
     def replays_all(self) -> bool:
-        """Whether every seed replays all that was recorded, two days or more."""
+        """Whether every seed replays the whole recording, two days or more."""
         known_s = min((line.length_s for line in self.recorded.values()), default=math.inf)
         return known_s - 1.0 < self.length_s and self.days >= 2.0
 
@@ -95,7 +95,7 @@ class Scenario:
 
     @cached_property
     def sold(self) -> tuple[list[Offer], list[Offer]]:
-        """What suits the pool's largest group: spot; and on demand, the cheapest first."""
+        """The spot and the on-demand offers for the pool's largest group; the latter by price."""
         kind = max(groups_of(self.spec), key=lambda group: group.replicas).resources
         market = self.market(self.seeds[0])
         spots = [o for o in market.offers(with_spot(kind, True)) if o.placement.spot]
@@ -103,7 +103,7 @@ class Scenario:
         return spots, sorted(reserved, key=lambda o: (o.usd_per_hour, o.placement))
 
     def target(self) -> Target:
-        """Return how many replicas the pool file wants at a time, nothing launched ahead."""
+        """Return a function from time to the wanted number of replicas, without prelaunches."""
         schedule = self.spec.schedule
         if schedule is None:
             return lambda now: self.replicas
@@ -157,9 +157,9 @@ class Row:
 
     name: str
     outcomes: tuple[Outcome, ...]
-    # Of the first seed: from when how many served, in seconds from the beginning.
+    # Of the first seed: times in seconds from the beginning, with the number serving from then on.
     curve: tuple[tuple[float, int], ...] = ()
-    same_days: bool = False  # all seeds replay the same ones
+    same_days: bool = False  # all seeds replay the same days
 
     def estimate(self, figure: str) -> Estimate:
         """Return a figure's mean and interval; ``..._per_day`` is per day."""
@@ -173,7 +173,7 @@ class Row:
         return estimate(values)
 
     def _over_days(self, above: str, below: str, unit: float) -> Estimate:
-        """Return a ratio with its interval by block bootstrap: whole days are drawn anew."""
+        """Return a ratio with its interval by block bootstrap: whole days are resampled."""
         days = [
             [
                 sum(getattr(outcome.days[index], sums) for outcome in self.outcomes)
@@ -215,7 +215,7 @@ Factory = Callable[[World], Policy]
 def policies(scenario: Scenario) -> dict[str, Factory]:
     """Return a factory of each policy, by name; fogft first.
 
-    The fixed ones have the machines of the pool's largest group, as many as the pool has.
+    The fixed policies use machines of the pool's largest group, as many as the pool has replicas.
     """
     spec, target, replicas = scenario.spec, scenario.target(), scenario.replicas
     spots, reserved = scenario.sold
@@ -237,7 +237,7 @@ def policies(scenario: Scenario) -> dict[str, Factory]:
 
 
 def static_places(offers: Sequence[Offer], count: int) -> list[Offer]:
-    """Return a careful fixed placement of this many replicas."""
+    """Return a well-spread fixed placement of this many replicas."""
     chosen: list[Offer] = []
     market = Offered(catalogue(offers).listing(None, None, (), Scale()))
     for _ in range(count):
@@ -268,7 +268,7 @@ def compare(
     rows = [Row(name, tuple(outcomes[name]), curves[name], same) for name in made]
     known = [bound(scenario, scenario.market(seed)) for seed in scenario.seeds]
     reached = tuple(outcome for outcome in known if outcome is not None)
-    # The bound knows one kind of machine, at list prices, and one number of them.
+    # The bound assumes one kind of machine, list prices, and a constant number of replicas.
     varies = scenario.prices or scenario.spec.schedule or scenario.spec.groups
     if len(reached) == len(known) and not varies:
         rows.append(Row(BOUND, reached))
@@ -276,7 +276,7 @@ def compare(
 
 
 def bound(scenario: Scenario, market: Market) -> Outcome | None:
-    """Return the cost with perfect foresight of always having all ready; None if impossible."""
+    """Return the cost of all replicas always ready, with perfect foresight; None if impossible."""
     spots, reserved = scenario.sold
     cheapest = {
         o.placement.location: o.usd_per_hour for o in sorted(spots, key=lambda o: -o.usd_per_hour)

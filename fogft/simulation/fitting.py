@@ -1,9 +1,9 @@
 """Fit a market model to recorded traces.
 
-Owns: the estimates. MTTF and MTTR are times with and without room over the number of times
-that they ended (the maximum likelihood of an exponential, the last, unfinished spells
-included); correlations are means over pairs of locations, `together` the share of losses
-in which another zone of the region was lost at the same time. `regime_s` is not estimated.
+Owns: the estimates. MTTF and MTTR are the total times with and without room, divided by how often
+such a spell ended (the maximum likelihood of an exponential, including the last, unfinished
+spells). Correlations are means over pairs of locations; `together` is the share of losses in which
+another zone of the region was lost at the same time. `regime_s` is not estimated.
 """
 
 import itertools
@@ -21,8 +21,8 @@ from fogft.simulation.timeline import Timeline
 def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
     """Return the model of some locations' timelines.
 
-    A correlation that no pair of locations can tell is that of the next narrower domain,
-    and 0 between clouds. Negative ones become 0, and no wider one exceeds a narrower one.
+    If no pair of locations shows the correlation within a region or a cloud, that of the other is
+    used; between clouds, 0. Negative ones become 0, and no wider domain's exceeds a narrower one's.
     """
     means = _means(timelines.values())
     for mean, what in zip(means, ("full", "free"), strict=True):
@@ -48,7 +48,7 @@ def fit(timelines: Mapping[str, Timeline]) -> MarketModel:
 
 
 def feasible(model: MarketModel) -> MarketModel:
-    """Return a model that a market can have: its correlations are lowered together where needed."""
+    """Return a feasible model: if needed, all its correlations are lowered by the same factor."""
     for percent in range(100, 0, -1):
         share = percent / 100
         lower = replace(
@@ -85,7 +85,7 @@ def _means(timelines: Iterable[Timeline]) -> tuple[float | None, ...]:
 
 
 def _together(timelines: Mapping[str, Timeline]) -> float:
-    """Return how likely a zone is lost when a free one of its region is, at that moment."""
+    """Return how likely a free zone is lost at the moment when another one of its region is."""
     met = lost = 0
     for one, other in itertools.permutations(sorted(timelines), 2):
         if one.rsplit("/", 1)[0] != other.rsplit("/", 1)[0]:

@@ -1,8 +1,8 @@
-"""The pool as fogft runs it: the real reconciler, planner, history and quarantine.
+"""The pool as fogft runs it: the real reconciler, planner, history and backoff.
 
-Only the cloud, the links and the clock are simulated. Nothing here decides anything.
+Only the cloud, the links and the clock are simulated. This module makes no decisions.
 
-Owns: the links' report, and when the manager can next have something to do.
+Owns: the link reports, and when the manager may next have something to do.
 """
 
 from collections.abc import Callable
@@ -31,7 +31,7 @@ _COMPACT_AFTER = 2_000
 
 
 class _Memory(PoolStore):
-    """What the reconciler uses of a store, in memory: of a pool file that never changes."""
+    """An in-memory store for the reconciler, with a pool file that never changes."""
 
     def __init__(self, spec: PoolSpec, now: float) -> None:
         self.the_spec = spec
@@ -94,7 +94,7 @@ class Managed:
     def __init__(self, world: World, spec: PoolSpec, target: Target) -> None:
         self.world = world
         self.wanted = target
-        self.store = _Memory(replace(spec, max_hours=None), world.now)  # a run is as long as asked
+        self.store = _Memory(replace(spec, max_hours=None), world.now)  # `days` limits a run
         health = spec.health
         patience_s = health.replace_after_s
         world.silences = [
@@ -116,7 +116,7 @@ class Managed:
         before = self.store.published
         tick = self._reconciler.tick()
         after = self.store.published
-        if after is not before and _ids(after) - _ids(before):  # its next look sees links to them
+        if after is not before and _ids(after) - _ids(before):  # the next tick sees their links
             return now + TICK_S
         return min(now + LOOK_EVERY_S, self._next_timer(tick))
 
@@ -152,16 +152,16 @@ class Managed:
         return min([at for at in times if at > now], default=NEVER)
 
     def _is_suspicion_felt(self) -> bool:
-        """Whether anything can follow from it that one more link is suspect.
+        """Whether one more suspect link can have any effect.
 
-        That one serves no more holds endings and moves back, and calls for nothing: it matters
-        only where one is to go, or another is silent too.
+        A replica that stops serving only holds back endings and moves: that matters only if a
+        replica is to end, or if another one is silent, too.
         """
         gone = sum([vm.gone_at < NEVER for vm in self.world.vms.values()])
         return gone > 1 or any(r.draining_since is not None for r in self.store.history().open())
 
     def _submit(self, call: Callable[[], None]) -> None:
-        """Make a call of the cloud. That it accepts an order makes no difference until it boots."""
+        """Submit a cloud call. An accepted order has no effect on the manager until it boots."""
         vms = self.world.vms
 
         def answer() -> object:
@@ -172,7 +172,7 @@ class Managed:
         self.world.submit(answer)
 
     def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...]:
-        """Report as the client proxy does: of the published members, by what was heard."""
+        """Report the links to the published members, as the client proxy does."""
         reports = []
         for member in self.store.published.members if self.store.published else ():
             vm = self.world.vms.get(member.id)

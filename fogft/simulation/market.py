@@ -31,12 +31,12 @@ def remembered(find: FindOffers) -> FindOffers:
 
 @dataclass(frozen=True)
 class Market:
-    """The offers, and each location's capacity for spot machines (none: on demand only)."""
+    """The offers, and each location's capacity for spot machines (empty: on demand only)."""
 
     find: FindOffers
     timelines: Mapping[str, Timeline]
     timing: Timing = field(default_factory=Timing)
-    # Location -> price of a spot machine over time, where it is not what `find` says.
+    # Location -> price of a spot machine over time, if it is not that of `find`.
     prices: Mapping[str, Timeline] = field(default_factory=dict)
 
     def offers(self, resources: Mapping[str, Any]) -> list[Offer]:
@@ -52,16 +52,16 @@ class Market:
 class Change:
     """A change of a location's capacity."""
 
-    at_s: float  # from here on no more machines than `capacity` are accepted
+    at_s: float  # from then on, no more machines than `capacity` are accepted
     location: str
     capacity: int
-    ends_s: float  # when machines beyond it end; after `at_s` where there is a notice
+    ends_s: float  # when surplus machines end; after `at_s` if there is a notice
 
 
 def changes(market: Market, tick_s: float) -> Iterator[Change]:
-    """Yield the changes, times rounded up to whole ticks, in no order between locations.
+    """Yield the changes, times rounded up to whole ticks, not sorted across locations.
 
-    A loss is announced `notice_s` before, but not before the room that is lost was there.
+    A loss is announced `notice_s` ahead, but not before the lost capacity was there.
     """
     for location, timeline in market.timelines.items():
         before = 0

@@ -8,7 +8,7 @@ DAY_S = 86_400.0
 
 @dataclass
 class Sums:
-    """Sums over a day, from the beginning of what is measured, or over all of it."""
+    """Sums over one day, counted from the start of the measurement, or over all of it."""
 
     seconds: float = 0.0
     wanted_s: float = 0.0
@@ -33,14 +33,14 @@ class Outcome:
     """One policy in one market, measured over `seconds`."""
 
     seconds: float
-    available: float  # fraction of the time in which any replica is wanted that one served
+    available: float  # fraction of the time with a wanted replica that at least one served
     under_target: float  # fraction of that time that fewer served than the pool file wants
     mean_ready: float
     usd_per_hour: float
-    launches: int  # machines that a cloud agreed to
+    launches: int  # orders that a cloud accepted
     refusals: int  # orders that it refused
-    preemptions: int  # machines that were taken away or failed
-    outages: int  # how often the pool stopped to answer, and how long the longest was
+    preemptions: int  # machines that were preempted or failed
+    outages: int  # how often the pool stopped answering, and how long the longest was
     longest_outage_s: float
     days: tuple[Sums, ...] = ()
 
@@ -59,15 +59,15 @@ class Meter:
     curve: list[tuple[float, int]] = field(default_factory=list)
     days: list[Sums] = field(default_factory=list)
     _down_s: float = 0.0
-    _pending: tuple[float, int, int, float] = (0.0, -1, 0, 0.0)  # unlike any other
+    _pending: tuple[float, int, int, float] = (0.0, -1, 0, 0.0)  # unlike any state
 
     def pass_time(
         self, now_s: float, seconds: float, *, ready: int, wanted: int, usd_per_hour: float
     ) -> None:
         """Account for a span before `now_s` without changes.
 
-        Stretches in which all stays the same are one, however often somebody looked: so the sums
-        are the same to the last bit.
+        Consecutive spans with equal values are merged, so the sums are the same to the last bit,
+        however often this is called.
         """
         seconds = min(seconds, now_s - self.begin_s)
         if seconds <= 0:

@@ -1,7 +1,7 @@
 """The generator of spot markets: its parameters, and the resulting times with capacity.
 
-docs/design/simulation.md tells how. Every random number comes from the generator handed in.
-Not here: finding the numbers in traces (`fitting`).
+docs/design/simulation.md explains it. Every random number comes from the given generator.
+Not here: estimating the parameters from traces (`fitting`).
 """
 
 import math
@@ -22,10 +22,10 @@ HINT = "write `KEY=VALUE,...`, such as `mttf_s=54000,mttr_s=3600,correlation=0.2
 
 @dataclass(frozen=True)
 class Timing:
-    """How fast machines come and go. Seconds."""
+    """Delays, in seconds, and failure rates of simulated machines."""
 
     # From the order until the service answers, on average; each launch takes between 3/4 and
-    # 5/4 of it, all equally likely.
+    # 5/4 of it, uniformly distributed.
     boot_s: float = 240.0
     notice_s: float = 120.0  # between a preemption notice and the end. 0: no notice
     # Until the cloud accepts or refuses an order; as measured through SkyPilot on an emulated AWS.
@@ -33,10 +33,10 @@ class Timing:
     detect_s: float = 5.0  # until the loss of a machine without a notice is seen
     # Mean time to the failure of an on-demand machine, as `availability` assumes; 0: never.
     on_demand_mttf_s: float = Assumption.on_demand_uptime_s
-    on_demand_refused: float = 0.0  # share of the orders of on-demand machines
-    launch_fails: float = 0.0  # share of the machines that are accepted and never serve
+    on_demand_refused: float = 0.0  # share of on-demand orders that are refused
+    launch_fails: float = 0.0  # share of the accepted machines that never serve
     slow_setup: float = 0.0  # share of the machines whose boot takes `SLOW` times as long
-    spot_quota: float = 0.0  # the most spot machines of a region; 0: any number
+    spot_quota: float = 0.0  # the most spot machines per region; 0: any number
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class MarketModel:
     """Zones with capacity for `mttf_s`, then without for `mttr_s`, on average.
 
     The defaults were fitted to the public traces of AWS V100 machines (nine zones, 45 days
-    of 2023): scarce machines, so on the safe side for common ones.
+    of 2023): scarce machines, so they are pessimistic for common ones.
     """
 
     mttf_s: float = 12_000.0
@@ -53,8 +53,8 @@ class MarketModel:
     # Between zones of two regions of one cloud; at most that of a region.
     correlation_cloud: float = 0.14
     correlation_world: float = 0.0  # between zones of two clouds; at most that of a cloud
-    # Share of a zone's changes that strike its whole region at one moment. Where
-    # `correlation_region` is too low for it, as much as that allows.
+    # Share of a zone's changes that strike its whole region at one moment; if
+    # `correlation_region` is too low for this, the highest share that it allows.
     together: float = 0.16
     # How long times of scarcity and plenty last: the correlation time.
     regime_s: float = 12 * 3600.0
@@ -158,10 +158,10 @@ def applied(
     return market, timing
 
 
-_BURN_IN = 12  # mean times between strikes, until nothing is left of how it began
+_BURN_IN = 12  # mean times between strikes, until the initial state does not matter
 
-# When, and a number from 0 to 1: a zone has room while it is below the zone's availability. So one
-# result for several zones leaves each as available as it is alone.
+# A time, and a number from 0 to 1: a zone has room while the number is below the zone's
+# availability. So sharing numbers between zones does not change how available each one is.
 Moments = list[tuple[float, float]]
 
 
@@ -174,8 +174,8 @@ def generate(
 ) -> Mapping[str, Timeline]:
     """Return a timeline for each ``cloud/region/zone``, with capacity for all or for none.
 
-    The market is stationary: it has run for a while before it is looked at. `zones` have an MTTF
-    and an MTTR of their own.
+    The market is stationary: it has run for a while before the timelines begin. `zones` have their
+    own MTTF and MTTR.
     """
     own = {
         place: replace(model, mttf_s=mttf_s, mttr_s=mttr_s)
@@ -197,7 +197,7 @@ class _Generator:
         self, locations: Sequence[str], zones: Mapping[str, MarketModel]
     ) -> dict[str, Timeline]:
         of_all = {place: rates(zones.get(place, self._model)).strikes for place in locations}
-        # What strikes a region strikes each of its zones: no oftener than the calmest is struck.
+        # A region's strike hits each of its zones: no more often than the calmest zone is hit.
         calmest = min(of_all.values(), default=0.0)
         shared = calmest * self._rates.together
         common: dict[str, Moments] = {}

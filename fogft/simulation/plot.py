@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ENDINGS = (".png", ".svg", ".pdf")
-_COLOURS = ("#0072b2", "#666666", "#e69f00", "#009e73", "#cc79a7")  # told apart by all eyes
-MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">", "p")  # told apart without colour
+_COLOURS = ("#0072b2", "#666666", "#e69f00", "#009e73", "#cc79a7")  # safe for colour-blind readers
+MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", "*", ">", "p")  # distinct without colour
 _SHOWN_DAYS = 3.0
 _STYLE: Any = {"font.size": 9, "axes.spines.right": False, "axes.spines.top": False}
 

@@ -38,7 +38,7 @@ class Report:
 
     @property
     def one_on_demand(self) -> float | None:
-        """US dollars per hour of the cheapest on-demand machine; None where none is sold."""
+        """US dollars per hour of the cheapest on-demand machine; None if none is sold."""
         _, reserved = self.scenario.sold
         return reserved[0].usd_per_hour if reserved else None
 
@@ -59,14 +59,14 @@ class Report:
         return min(enough, key=lambda row: row.estimate("usd_per_hour").mean, default=None)
 
     def in_machines(self, row: Row) -> tuple[float, float] | None:
-        """Return what a policy costs in units of one on-demand machine, and of one a replica."""
+        """Return a policy's cost in units of one on-demand machine, and of one for each replica."""
         if not self.one_on_demand or not self.scenario.replicas:
             return None
         of_one = row.estimate("usd_per_hour").mean / self.one_on_demand
         return of_one, of_one / self.scenario.replicas
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything, seed by seed."""
+        """Return everything as JSON data, including each seed's results."""
         units = [self.in_machines(row) or (None, None) for row in self.rows]
         scenario = self.scenario
         return {
@@ -96,7 +96,7 @@ def simulate_scenario(
     notes: Sequence[str] = (),
     told: Callable[[int, int], None] = lambda done, of: None,
 ) -> Report:
-    """Run a scenario. Raises FogftError: it is too long, or longer than what was recorded."""
+    """Run a scenario. Raises FogftError: it is too long, or a trace is too short."""
     scenario, more = _fitting(scenario)
     return Report(scenario, tuple(compare(scenario, told)), (*notes, *more))
 
@@ -156,8 +156,8 @@ def simulate(
     Args:
         prices: A folder of spot prices, laid out like the traces, in US dollars per hour.
         model: ``KEY=VALUE,...``, see `fogft.simulation.model`.
-        cloud: Whose prices; None for the one that the pool file names, else `local`.
-        told: Called with how many runs are done, and of how many.
+        cloud: The cloud whose prices count; None for the one the pool file names, else `local`.
+        told: Called with the number of runs done and in total.
     """
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.resolve().parent)
@@ -232,7 +232,7 @@ def simulate(
 
 
 def _pricing(find: FindOffers, source: str, file: Path) -> FindOffers:
-    """Return the same, whose errors name the line of the pool file."""
+    """Return `find` with errors that name the line of the pool file."""
 
     def ask(resources: Mapping[str, Any]) -> Sequence[Offer]:
         try:
@@ -244,7 +244,7 @@ def _pricing(find: FindOffers, source: str, file: Path) -> FindOffers:
 
 
 def _everything(spec: PoolSpec, find: FindOffers) -> list[Placement]:
-    """Return what can be bought anywhere; at least what the pool may use."""
+    """Return the placements offered anywhere; at least those that the pool may use."""
     sold = [o for group in groups_of(spec) for o in find(with_spot(group.resources, True))]
     with contextlib.suppress(FogftError):  # not every cloud lists all that it has
         sold += find({"use_spot": True})

@@ -1,6 +1,6 @@
 """How many spot machines fit into one location, over time.
 
-Not here: where it comes from (`traces`, `model`) and who is taken away (`market`).
+Not here: where timelines come from (`traces`, `model`) and which machines are preempted (`world`).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def of_samples(counts: Sequence[int], gap_s: float) -> Timeline:
 
 
 def of_changes(changes: Iterable[tuple[float, int]], length_s: float) -> Timeline:
-    """Return the timeline of changes in order of time, those without effect left out."""
+    """Return the timeline of changes in order of time; those without effect are left out."""
     return Timeline(tuple(_distinct(changes)), length_s)
 
 

@@ -1,14 +1,14 @@
 """Read recorded spot traces, and match them to locations.
 
-A trace is a JSON file: ``{"metadata": {"gap_seconds": 300}, "data": [1, 1, 0, ...]}``, each
-sample the number of machines that could be had then. Optional: ``times``, the seconds at
-which the samples were taken, by which holes and clock jumps are found; ``prices``, one a sample:
-where a file of a folder has them, they are the prices, and files without have none.
+A trace is a JSON file: ``{"metadata": {"gap_seconds": 300}, "data": [1, 1, 0, ...]}``; each
+sample is the number of machines available then. Optional: ``times``, the seconds at which the
+samples were taken, used to find gaps and clock jumps; ``prices``, one per sample: if any file of a
+folder has them, prices are read from these, and files without them are ignored.
 
 Its location is its path below the folder, ``aws/us-west-2/us-west-2b.json``, or the zone
-alone, ``us-west-2b_v100_1.json``: what follows the first underscore is only a remark.
+alone, ``us-west-2b_v100_1.json``: the part from the first underscore on is ignored.
 
-Not here: what is made of them (`comparison`).
+Not here: the use of traces (`comparison`).
 """
 
 import itertools
@@ -53,7 +53,7 @@ class _Written:
 def read(folder: Path, per_unit: int = 1) -> list[Trace]:
     """Read every ``.json`` file in and below a folder; an invalid trace is an error.
 
-    `per_unit` is what one of what was sampled counts: 1 for machines, `PER_USD` for prices.
+    `per_unit` is the factor that samples are multiplied by: 1 for machines, `PER_USD` for prices.
     """
     if not folder.is_dir():
         raise FogftError(f"{folder}: is not a folder of traces", FORMAT)
@@ -126,16 +126,16 @@ def _check_times(times: Sequence[float], samples: int, gap_s: float, file: str) 
 
 
 def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, Timeline]:
-    """Return the timelines by location, of traces whose location is offered.
+    """Return the timelines of traces by location.
 
-    `offered` is what can be bought anywhere, not only what this pool may buy. Raises FogftError: a
-    trace is of a place that does not exist, two are of the same, or of different `gap_seconds`.
+    `offered` are all placements that are sold, not only those for this pool. Raises FogftError: a
+    location is unknown, ambiguous or given twice, or traces differ in `gap_seconds`.
     """
     traces = list(traces)
     found: dict[str, tuple[str, Timeline]] = {}
     for trace in traces:
         places = sorted({p.location for p in offered if trace.place in _names(p)})
-        if not places:  # in folders that name no cloud and region, as they are published
+        if not places:  # published traces are in folders without cloud and region
             zone = trace.place.rpartition("/")[2]
             places = sorted({p.location for p in offered if zone in _names(p)})
         if not places:
@@ -167,6 +167,6 @@ def located(traces: Iterable[Trace], offered: Sequence[Placement]) -> dict[str, 
 
 
 def _names(placement: Placement) -> set[str]:
-    """Return what a trace may call a placement's zone: clouds prefix it with the region."""
+    """Return a zone's possible names in traces: clouds prefix it with the region."""
     region, zone = placement.region, placement.zone
     return {placement.location, zone, region + zone, f"{region}-{zone}"}

@@ -1,9 +1,9 @@
 """A cloud and its machines under simulated time, event by event.
 
-Between two events nothing changes, so time jumps from one to the next. A policy is asked
-after each event and when it wanted to be asked; it acts through the cloud port only.
+Between two events nothing changes, so time jumps from one to the next. A policy is called
+after each event, and when it asked to be; it acts through the cloud port only.
 
-Not here: who decides (`managed`, `baselines`) and what the market does (`market`).
+Not here: the policies (`managed`, `baselines`) and the market's changes (`market`).
 """
 
 import heapq
@@ -49,9 +49,9 @@ class Vm:
     launched_at: float
     ready: bool = False  # it runs and its service answers
     noticed: bool = False
-    gone_at: float = NEVER  # it was taken away then, and may still be listed
-    machine: Machine | None = None  # as listed; None when that has to be made anew
-    report: LinkReport | None = None  # of its link while it answers; likewise
+    gone_at: float = NEVER  # when it was lost; it may still be listed
+    machine: Machine | None = None  # as listed; None if it must be rebuilt
+    report: LinkReport | None = None  # of its link while it answers; None likewise
 
 
 class World:
@@ -72,9 +72,9 @@ class World:
         self.market = market
         self.vms: dict[ReplicaId, Vm] = {}
         self.meter = Meter(EPOCH + settle_s)
-        self.asked = 0  # how often the policy was
-        # A policy that goes by links can notice so long after that a machine is gone, if it then
-        # says so; any other one sees it at once.
+        self.asked = 0  # how often the policy was called
+        # Of a policy that watches links: how long after a loss it can notice that, and whether it
+        # then does. Any other policy sees a loss at once.
         self.silences: Sequence[tuple[float, Callable[[], bool]]] = ()
         self._find = remembered(market.offers)
         self._until = EPOCH + length_s
@@ -82,7 +82,7 @@ class World:
         self._capacity: dict[str, int] = {}
         self._queue: list[tuple[float, int, Happening]] = []
         self._order = itertools.count()
-        self._prices: dict[str, float] = {}  # location -> of a spot machine, where it is recorded
+        self._prices: dict[str, float] = {}  # location -> recorded spot price
         for place, line in market.prices.items():
             for at_s, price in line.changes:
                 self.at(EPOCH + rounded_up(at_s, TICK_S), partial(self._reprice, place, price))
@@ -93,7 +93,7 @@ class World:
     # -- time -------------------------------------------------------------------------------
 
     def at(self, time: float, happen: Happening) -> None:
-        """Schedule an event at a time; it returns `UNSEEN` if no one in the pool can notice."""
+        """Schedule an event; `happen` returns `UNSEEN` if the policy cannot notice it."""
         heapq.heappush(self._queue, (max(time, self.now), next(self._order), happen))
 
     def after(self, seconds: float, happen: Happening) -> None:
@@ -154,7 +154,7 @@ class World:
         self._find = remembered(self._sold)
 
     def _sold(self, resources: Mapping[str, Any]) -> Sequence[Offer]:
-        """Return what the market sells at the prices of now."""
+        """Return the market's offers at current prices."""
         return [
             replace(offer, usd_per_hour=self._price(offer.placement, offer.usd_per_hour))
             for offer in self.market.offers(resources)
@@ -164,7 +164,7 @@ class World:
         return self._prices.get(place.location, usual) if place.spot else usual
 
     def _spot_machines(self, location: str) -> list[Vm]:
-        """Return who takes up room there: not those that are already to go."""
+        """Return the spot machines that use capacity there: not gone, and without a notice."""
         return [
             vm
             for vm in self.vms.values()
@@ -235,7 +235,7 @@ class World:
         return bool(share) and self._chance.random() < share
 
     def _refusal(self, place: Placement) -> CloudError | None:
-        """Return why an order is refused; None where it is accepted."""
+        """Return why an order is refused; None if it is accepted."""
         timing = self.market.timing
         if not place.spot:
             refused = self._happens(timing.on_demand_refused)

@@ -1,9 +1,9 @@
 """How long a location is avoided after failures. Pure. The rule: docs/design/planner.md.
 
-A location's spot machines and its on-demand ones are two supplies, each of which backs off by
-itself. What is the pool file's fault counts against `EVERYWHERE`: a broken file is not tried in one
-location after the other. NO_ROOM_S lets a round over all locations end before the first is asked
-again. Events from the future, left by a clock that was set back, count for nothing.
+A location's spot machines and its on-demand machines are two supplies, and each backs off on its
+own. Failures caused by the pool file count against `EVERYWHERE`, so that a broken file is not tried
+in one location after the other. NO_ROOM_S is long enough to try all locations before the first is
+asked again. Events in the future, left by a clock that was set back, are ignored.
 """
 
 from bisect import bisect_right
@@ -25,18 +25,18 @@ _AT = itemgetter(0)
 
 
 class Backoff(NamedTuple):
-    """A supply that is not to be tried yet."""
+    """The pause of a supply that must not be tried yet."""
 
-    until: float  # from then on it may be tried again
+    until: float  # when it may be tried again, in seconds since the epoch
     failures: int  # how many in a row
-    cause: Cause  # of the last one
+    cause: Cause  # of the last failure
     since: float = 0.0  # of the last failure, in seconds since the epoch
 
 
 class _Supply(NamedTuple):
-    """What happened at a supply within FORGIVE_S, in order of time."""
+    """The failures of a supply within FORGIVE_S, in order of time."""
 
-    lately: Sequence[Failure]  # its failures
+    lately: Sequence[Failure]  # all of them
     bad: Sequence[Failure]  # those since it last proved itself
 
 
@@ -64,7 +64,7 @@ def _supplies(history: History, now: float) -> Mapping[str, _Supply]:
     """Return the supplies with a failure that is not forgiven."""
     found = {}
     for supply, failures in history.failures.items():
-        if failures[-1].at <= now - FORGIVE_S:  # as of most: there may be thousands
+        if failures[-1].at <= now - FORGIVE_S:  # true of most; there may be thousands
             continue
         first = bisect_right(failures, now - FORGIVE_S, key=_AT)
         lately = failures[first : bisect_right(failures, now, key=_AT)]
@@ -75,7 +75,7 @@ def _supplies(history: History, now: float) -> Mapping[str, _Supply]:
 
 
 def _pauses(supplies: Mapping[str, _Supply], now: float) -> dict[str, Backoff]:
-    """Return who backs off by itself: what was the pool file's fault is left out."""
+    """Return the backoff of each supply, without failures caused by the pool file."""
     found = {
         supply: backoff([f for f in one.bad if f.cause not in OWN_FAULTS], now)
         for supply, one in supplies.items()
@@ -94,7 +94,7 @@ def _everywhere(history: History, supplies: Mapping[str, _Supply], now: float) -
 def backing_off_longest(backing_off: Iterable[tuple[str, Backoff]], now: float) -> str | None:
     """Return the supply to try although all are backing off; None to wait.
 
-    Only what had no room is tried: a full account or a launch that fails does not get better by it.
+    Only one that had no capacity is tried: retrying fixes neither a quota nor a failing launch.
     """
     known = list(backing_off)
     if any(now - pause.since < EAGER_S for _, pause in known):
@@ -104,11 +104,11 @@ def backing_off_longest(backing_off: Iterable[tuple[str, Backoff]], now: float) 
 
 
 def backoff(recent: Sequence[Failure], now: float) -> Backoff | None:
-    """Return the pause that failures earn, of which none is forgiven, in order of time."""
+    """Return the backoff after failures that are not forgiven, in order of time; None if over."""
     if not recent:
         return None
     last = recent[-1]
-    # Waiting a little does not help where the account is full.
+    # A short pause does not help if the account's quota is used up.
     until = last.at + (LIMIT_S if last.cause is Cause.QUOTA else backoff_s(len(recent), last.cause))
     return None if now >= until else Backoff(until, len(recent), last.cause, since=last.at)
 
@@ -120,9 +120,9 @@ def backoff_s(failures: int, cause: Cause | None = None) -> float:
 
 
 def lost_lately(history: History, now: float) -> Mapping[str, float]:
-    """Return where replicas were lost within NO_ROOM_S, and until when that counts.
+    """Return the locations that lost replicas within NO_ROOM_S, and until when that counts.
 
-    Such a location is used only when no other is left: it has hardly room again.
+    They are used only when no other is left: they are unlikely to have capacity again.
     """
     found = {}
     for location, losses in history.losses.items():
@@ -133,7 +133,7 @@ def lost_lately(history: History, now: float) -> Mapping[str, float]:
 
 
 def next_change(history: History, now: float, *, waits: bool, restless: bool) -> float:
-    """Return when, without new events, another location may be chosen; infinity for never.
+    """Return when another location may be chosen even without new events; infinity for never.
 
     `waits` and `restless`: see `Plan`.
     """
@@ -157,7 +157,7 @@ def next_change(history: History, now: float, *, waits: bool, restless: bool) ->
 
 
 def _shortened(lately: Iterable[Failure], pause: Backoff) -> Sequence[float]:
-    """Return when failures are forgiven by which a pause may end early."""
+    """Return when failures are forgiven, if that may end a pause early; empty if not."""
     forgiven = [f.at + FORGIVE_S for f in lately if f.at + FORGIVE_S < pause.until]
     if backoff_s(pause.failures - len(forgiven), pause.cause) < pause.until - pause.since:
         return forgiven

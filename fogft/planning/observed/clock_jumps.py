@@ -1,20 +1,20 @@
 """Detect that the wall clock was set, or that the machine slept. Pure: readings come in.
 
-All that is remembered bears the time of the clock on the wall, for that outlives a reboot. What it
-gains on a steady clock that stands still while the machine sleeps is no time in which anybody
-looked: all that is remembered moves along with it, so that durations stay what they were.
+Recorded times are wall-clock times, since those remain valid after a reboot. Time that the wall
+clock gains on a monotonic clock that stops during sleep is time in which nothing was observed:
+recorded times are shifted by it, so that durations stay the same.
 
-Not here: reading clocks (`fogft.pool.manager.timekeeping`), moving what is remembered (`history`).
+Not here: reading clocks (`fogft.pool.manager.timekeeping`), shifting recorded times (`history`).
 """
 
 from dataclasses import dataclass
 
 from fogft.model.reason import Cause, Reason
 
-# Less is not worth a word: what a clock that is slewed gains between two looks, and a slow reading.
+# Smaller jumps are ignored: slewing between two readings, or a slow reading.
 LEAST_S = 5.0
-# A clock that was set is often set again at once. Until it has stood so long, nothing is launched
-# or ended because of the time of day.
+# A clock that was set is often set again soon. Until it has not been set for this long, nothing is
+# launched or ended because of the time of day.
 DOUBT_S = 60.0
 
 
@@ -23,16 +23,16 @@ class Reading:
     """Three clocks at one moment, in seconds."""
 
     wall_s: float  # since the epoch; may be set
-    awake_s: float  # steady, and stands still while the machine sleeps
-    steady_s: float  # steady, and goes on meanwhile
+    awake_s: float  # monotonic; stops while the machine sleeps
+    steady_s: float  # monotonic; goes on while the machine sleeps
 
 
 @dataclass(frozen=True)
 class Jump:
     """How far the wall clock jumped between two readings."""
 
-    set_s: float = 0.0  # by so much it was set: forward above 0, back below
-    slept_s: float = 0.0  # the machine slept for so long
+    set_s: float = 0.0  # how far it was set: forward above 0, back below
+    slept_s: float = 0.0  # how long the machine slept
 
     @property
     def reason(self) -> Reason:
@@ -57,7 +57,7 @@ class Watch:
     def __init__(self) -> None:
         self._last: Reading | None = None
         self._set: list[tuple[float, float]] = []  # when, and by how much
-        self.set_s = 0.0  # in all
+        self.set_s = 0.0  # the total
 
     def look(self, reading: Reading) -> Jump | None:
         """Return the jump since the last look, if there was one."""
@@ -75,6 +75,6 @@ class Watch:
 
     @property
     def doubt_s(self) -> float:
-        """How far the clock was set within the last minute, in which schedules ignore it."""
+        """How far the clock was set within the last minute; schedules ignore so recent a change."""
         now = self._last.awake_s if self._last is not None else 0.0
         return sum((set_s for at, set_s in self._set if now - at < DOUBT_S), 0.0)

@@ -1,10 +1,10 @@
 """Loss rates of spot machines at each location, learned from this pool's history. Pure.
 
-The rate is (PRIOR_LOSSES + losses) / (PRIOR_S + seconds lived there), what is longer ago counting
-for less. It is worked out as of the last multiple of EVERY_S, losses since included, so that it
-does not depend on who asks when.
+The rate is (PRIOR_LOSSES + losses) / (PRIOR_S + seconds lived there), where older data counts for
+less. It is computed as of the last multiple of EVERY_S, including losses since then, so that it
+does not depend on when it is asked for.
 
-Not here: the rest after refusals (`backoff`).
+Not here: the pause after refusals (`backoff`).
 """
 
 import math
@@ -17,10 +17,10 @@ PRIOR_LOSSES = 1.0
 PRIOR_S = 4 * 3600.0
 HALF_LIFE_S = 24 * 3600.0
 EVERY_S = 1800.0
-# What a loss costs, in hours of the machine lost: its successor boots while another one, mostly a
-# dearer one, serves, and while it does one more loss is an outage.
+# The cost of a loss, in hours of the lost machine: while its successor boots, another machine
+# serves, which is usually more expensive, and one more loss would be an outage.
 LOSS_COSTS_H = 1.0
-# A refusal counts as so much of a loss: where there is often no room, it does not last.
+# A refusal counts as this fraction of a loss: where capacity is often short, machines don't last.
 REFUSED = 0.1
 _DECAY = math.log(2.0) / HALF_LIFE_S
 
@@ -35,7 +35,7 @@ def hazards(history: History, now: float) -> Mapping[str, float]:
 
 
 def as_of(now: float) -> float:
-    """Return the time as of which rates are computed."""
+    """Return the time for which rates are computed."""
     return now // EVERY_S * EVERY_S
 
 

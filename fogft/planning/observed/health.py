@@ -1,7 +1,7 @@
 """Judge the health of every replica from its cloud and its links. Pure.
 
-Neither alone replaces anything: a machine that the cloud lists and that is silent may be behind a
-dead uplink, so silence counts only while another replica answers.
+A silent link alone replaces nothing: a silent machine that the cloud lists may be behind a dead
+uplink, so silence counts only while another replica answers.
 """
 
 import math
@@ -28,23 +28,23 @@ from fogft.planning.observed.history import History, Record
 # A single replica's silence looks like a dead uplink. When the cloud still answers after this
 # many times `replace_after_s`, the uplink is fine and the replica is not.
 LONE_SILENCE_FACTOR = 4.0
-# A cloud may recommend to move what has just been moved. A hint costs one launch in this time.
+# Hints to move a replica count only this long after it was ready: it may just have been moved.
 HINT_PAUSE_S = 600.0
 
 
 class Verdict(str, Enum):
     """The verdict on a replica."""
 
-    GOOD = "good"  # serves, will serve, or nothing can be said against it
+    GOOD = "good"  # serves, will serve, or has no known fault
     FAILED = "failed"  # its launch has failed, or took longer than `start_limit_s`
-    LEAVING = "leaving"  # a preemption notice was given, by its cloud or by itself
+    LEAVING = "leaving"  # its cloud or the replica itself reported a preemption notice
     UNRESPONSIVE = "unresponsive"  # silent past `replace_after_s` while another answers
-    AT_RISK = "at risk"  # serves, and its cloud recommends to move it
-    DISAGREES = "disagrees"  # its answers differ from a quorum's, or are none, repeatedly
+    AT_RISK = "at risk"  # serves, but its cloud recommends moving it
+    DISAGREES = "disagrees"  # its answers repeatedly differ from a quorum's, or are missing
     STUCK = "stuck"  # answers probes, but its service has been away past `start_limit_s`
 
 
-# Looking up a member of an Enum takes as long as all else that is asked of a healthy replica.
+# Cached: looking up an Enum member takes as long as all other checks of a healthy replica.
 _UP, _CONNECTING = LinkState.UP, LinkState.CONNECTING
 _RUNNING, _READY, _GOOD = MachinePhase.RUNNING, Phase.READY, Verdict.GOOD
 
@@ -54,17 +54,17 @@ class Assessment(NamedTuple):
 
     machine: Machine
     link: LinkReport | None
-    record: Record | None  # what is remembered of it; None for nothing
+    record: Record | None  # its history; None without one
     phase: Phase
     verdict: Verdict
     serving: bool  # its link is up and its services are ready: ending it would be felt
     may_serve: bool  # it served once and nothing proves that it does not serve now
-    fault: Reason | None = None  # why the verdict is not good; None when it is
-    unwanted: Reason | None = None  # why it is to be replaced although it works; None for no reason
+    fault: Reason | None = None  # why the verdict is not good; None if it is
+    unwanted: Reason | None = None  # why it is to be replaced although it works; None if it is not
 
     @property
     def id(self) -> ReplicaId:
-        """The replica."""
+        """The replica's identity."""
         return self.machine.id
 
     @property
@@ -93,7 +93,7 @@ class Assessment(NamedTuple):
         return self.record.first_ready_at if self.record is not None else None
 
     def was_ready_for(self, seconds: float, now: float) -> bool:
-        """Whether it first served at least so long ago."""
+        """Whether it first served at least this long ago."""
         return self.ready_at is not None and now - self.ready_at >= seconds
 
     @property
@@ -122,7 +122,7 @@ class Health(NamedTuple):
 
     replicas: tuple[Assessment, ...]
     uplink_suspected: bool  # all links that once answered are silent together
-    links_known: bool  # there is a fresh report; without one nobody is doubted
+    links_known: bool  # there is a fresh report; without one no replica is doubted
 
 
 def judge(pool_uid: str, spec: PoolSpec, observed: Observed, history: History) -> Health:
@@ -164,8 +164,8 @@ def was_heard(link: LinkReport, record: Record | None) -> bool:
 def is_ready(spec: PoolSpec, machine: Machine, link: LinkReport | None) -> bool:
     """Whether a replica answers all its services.
 
-    An outdated one was launched for other services, so answering any counts. One of a changed file
-    that lists none need answer what it offers itself, until most of its kind have told.
+    For an outdated replica, launched for other services, any ready service counts. If a changed
+    file lists none, a replica must answer those it offers, until its version's are discovered.
     """
     if link is None or link.state is not _UP or machine.phase is not _RUNNING:
         return False
@@ -193,7 +193,7 @@ def _judge_one(
     serving: bool,
 ) -> Assessment:
     accused = link is None or link.leaving or link.disagrees or link.at_risk or machine.notice
-    if serving and not accused:  # as nearly all are
+    if serving and not accused:  # as for nearly all replicas
         return Assessment(machine, link, record, _READY, _GOOD, True, True)
     verdict, why = _verdict(context, machine, link, record, serving)
     may_serve = serving
@@ -265,9 +265,9 @@ def _timeout(awaited: Cause, limit_s: float) -> Reason:
 
 
 def _accepted_at(machine: Machine, record: Record | None, now: float) -> float:
-    """Return since when a launch is under way.
+    """Return when a launch began.
 
-    The cloud's word does not move along when our clock is set, and what is remembered does.
+    The cloud's time is not shifted when our clock is set; the recorded time is.
     """
     if record is None:
         return machine.launched_at

@@ -1,9 +1,9 @@
 """The history of a pool's replicas: events in, facts out. Pure.
 
-The cloud's list says what is; history says what was. It is the only memory that must outlive a
-crash of the manager.
+The cloud's list shows what exists now; the history shows what happened. It is the only memory that
+must survive a crash of the manager.
 
-Not here: the file it is stored in (`fogft.pool.folder.history_file`), what to make of failures
+Not here: the file it is stored in (`fogft.pool.folder.history_file`), the pauses after failures
 (`backoff`).
 """
 
@@ -34,18 +34,18 @@ class EventKind(str, Enum):
     LAUNCH = "launch"  # written before the cloud is asked: the generation is used from here on
     REFUSED = "refused"  # the cloud said no: capacity, quota or an error
     READY = "ready"  # its services answer
-    UNREADY = "unready"  # they no longer do
-    DRAINING = "draining"  # marked to go
+    UNREADY = "unready"  # its services no longer answer
+    DRAINING = "draining"  # marked to end
     UNDRAINED = "undrained"  # the mark was taken back
     FAILED = "failed"  # its launch has failed
     ENDING = "ending"  # written before the cloud is asked to end it
     ENDED = "ended"  # gone, as asked
     GONE = "gone"  # gone, unasked: preempted, crashed or ended by someone else
-    CLOCK = "clock"  # of no replica: the clock on the wall was set
+    CLOCK = "clock"  # of no replica: the wall clock was set
     SLEPT = "slept"  # of no replica: the manager's machine slept
     UPDATING = "updating"  # of no replica: a changed file is being applied
-    UPDATE_STOPPED = "update_stopped"  # of no replica: and was given up
-    PROXY_REPLACED = "proxy_replaced"  # of no replica: another client proxy serves
+    UPDATE_STOPPED = "update_stopped"  # of no replica: an update was given up
+    PROXY_REPLACED = "proxy_replaced"  # of no replica: another client proxy took over
 
 
 MOVING = frozenset({EventKind.CLOCK, EventKind.SLEPT})
@@ -67,7 +67,7 @@ class Event:
     location: str = ""  # where (`cloud/region/zone`); empty in events after the launch
     reason: Reason | None = None  # why it happened, where that is known
     on_demand: bool = False  # of a launch: not bought on the spot market
-    by_s: float = 0.0  # of CLOCK and SLEPT: so much later is all that was remembered before
+    by_s: float = 0.0  # of CLOCK and SLEPT: how far earlier times are shifted
     version: str = ""  # of a launch: what it runs (`replica_hash`)
 
 
@@ -75,10 +75,10 @@ _NO_FAULT = Reason(Cause.ERROR)
 _TIMES = ("launched_at", "closed_at", "first_ready_at", "unready_since", "draining_since")
 OWN_FAULTS = frozenset({Cause.SETUP, Cause.NOT_SET_UP, Cause.NOT_READY})
 LAUNCHES_KEPT_S = 3600.0
-# A loss counts against the location where the replica was never ready for so long.
+# A loss counts as a failure of the location if the replica had been ready for less than this.
 YOUNG_S = 60.0
 KEPT_S = 86_400.0
-_PROOFS = 2 * MAX_REPLICAS  # of a version's failed launches
+_PROOFS = 2 * MAX_REPLICAS  # how many of a version's failed launches are kept
 
 
 @dataclass
@@ -123,25 +123,25 @@ def fault_of(reason: Reason | None) -> Cause:
 
 
 class History:
-    """Events folded into facts. `add` is the only change; planner and placement only read."""
+    """Facts derived from events. Only `add` changes them; planner and placement only read."""
 
     def __init__(self, events: Iterable[Event] = ()) -> None:
         self._records: dict[tuple[int, int], Record] = {}
         self._open: dict[tuple[int, int], Record] = {}
-        # Slot -> the highest generation ever used, and that was ever ready; 0 for none.
+        # Slot -> the highest generation ever used, and the highest ever ready; 0 for none.
         self.generations: Counter[int] = Counter()
         self.served: Counter[int] = Counter()
         self.failures: dict[str, list[Failure]] = {}  # by supply, oldest first
         self._proven_at: dict[str, float] = {}
         self.losses: dict[str, list[float]] = {}  # when, by location, oldest first
         self.lives: dict[str, tuple[Record, ...]] = {}  # of spot machines, by location
-        # What `hazard` makes of lives and failures, and as of when; until either changes.
+        # Cache of `hazard` by location: as of when, the rate; until lives or failures change.
         self.rates: dict[str, tuple[float, float]] = {}
-        self._set: list[tuple[float, float]] = []  # the clock: when by its old time, by how much
-        self.version = 0  # of all facts: counts events
-        self.fruitless: dict[str, list[Record]] = {}  # by version: failed for a reason of its own
+        self._set: list[tuple[float, float]] = []  # clock changes: when (old time), by how much
+        self.version = 0  # of all facts: the number of events
+        self.fruitless: dict[str, list[Record]] = {}  # by version: launches failed by its own fault
         self.ready_versions: set[str] = set()
-        # Whether on demand -> those of the last hour before the latest one.
+        # Whether on demand -> the launches within an hour before the latest one.
         self.launches: dict[bool, list[Record]] = {False: [], True: []}
         for event in events:
             self.add(event)
@@ -158,7 +158,7 @@ class History:
             self.generations[event.slot] = event.generation
         record = self._records.get(key)
         starts = event.kind is EventKind.LAUNCH
-        if record is None or (starts and record.closed is EventKind.ENDED):  # a standby's, again
+        if record is None or (starts and record.closed is EventKind.ENDED):  # a standby restarts
             record = Record(event.slot, event.generation, event.at, event.location)
             record.on_demand, record.version = event.on_demand, event.version
             self._records[key] = record
@@ -168,7 +168,7 @@ class History:
                 self.launches[record.on_demand] = [*lately, record]
             if not record.on_demand:
                 self.lives[record.location] = (*self.lives.get(record.location, ()), record)
-        if starts:  # a second one: it was thought gone, and is listed
+        if starts:  # a second launch: the machine was thought gone, but is listed
             record.closed, record.ending = None, False
         else:
             self._update(record, event)
@@ -178,7 +178,7 @@ class History:
             self._open.pop(key, None)
 
     def _move(self, event: Event) -> None:
-        """Let all that is remembered be later, so that durations stay what they were."""
+        """Shift all recorded times, so that durations stay the same."""
         if event.kind is EventKind.CLOCK:
             self._set.append((event.at - event.by_s, event.by_s))
         later = partial(moved, by_s=event.by_s, now=event.at)
@@ -195,7 +195,7 @@ class History:
         self.rates = {}
 
     def by_clock(self, instant: float) -> float:
-        """Convert a recorded time to today's clock, which may have been set since."""
+        """Convert a recorded time to the current clock, which may have been set since."""
         for old, by_s in self._set:
             instant += by_s if instant <= old else 0.0
         return instant
@@ -271,7 +271,7 @@ class History:
         return list(self._open.values())
 
     def places_alone(self) -> History:
-        """Return the facts about locations alone, as for a new pool."""
+        """Return a history with only the facts about locations, as for a new pool."""
         anew = History()
         anew.failures, anew._proven_at = self.failures, self._proven_at
         anew.lives, anew.losses = self.lives, self.losses
@@ -290,7 +290,7 @@ class History:
         return {(record.slot, record.generation) for record in (*failed, *ready.values())}
 
     def proven_at(self, supply: str) -> float:
-        """Return when a replica there last became ready; minus infinity for never."""
+        """Return when a replica of this supply last became ready; minus infinity for never."""
         return self._proven_at.get(supply, float("-inf"))
 
 
@@ -299,9 +299,9 @@ def compacted(
 ) -> list[Event]:
     """Drop events that no decision needs any more.
 
-    Kept are launches that are open, or to which something happened within `KEPT_S`, the latest of
-    each slot, and what proves that a version was given up. Of comings and goings of readiness the
-    first READY and the last two stay. That the clock was set is never forgotten.
+    Launches are kept if they are open, had an event within `KEPT_S`, are the latest of their slot,
+    or prove that a version was given up. Of a launch's READY and UNREADY events, the first READY
+    and the last two are kept. Changes of the clock are always kept.
     """
     events = list(events)
     history = history or History(events)

@@ -1,9 +1,9 @@
 """Which versions are no longer launched, and the limit of launches per hour. Pure.
 
-A version (`replica_hash`) is given up once a slot has had GIVE_UP_AFTER launches of it that failed
-for its own reasons, and none of it was ever ready anywhere; until the file changes or the user asks
-again. Spot machines and those on demand are counted apart, so that what restores readiness is not
-held up by the limit.
+A version (`replica_hash`) is given up once GIVE_UP_AFTER of its launches in one slot failed by its
+own fault and no replica of it was ever ready; until the file changes or the user asks again. Spot
+and on-demand launches are counted separately, so that the limit does not delay a stand-in that
+restores readiness.
 """
 
 from collections import Counter
@@ -20,7 +20,7 @@ HOUR_S = 3600.0
 def given_up(history: History, version: str, since: float) -> Reason | None:
     """Return why a version is no longer launched; None while it is.
 
-    What was launched before `since` does not count: the user asked for it again.
+    Launches before `since` do not count: the user asked for the version again.
     """
     if version in history.ready_versions:
         return None
@@ -41,12 +41,12 @@ def within_an_hour(history: History, now: float, *, on_demand: bool) -> Sequence
 
 
 def _was_refused(record: Record) -> bool:
-    """Whether a launch cost nothing: at once, or after the cloud had looked for a place."""
+    """Whether a launch was refused at no cost: at once, or after the cloud looked for room."""
     late = record.failed and record.fault.cause in (Cause.CAPACITY, Cause.QUOTA, Cause.CREDENTIALS)
     return late or record.closed is EventKind.REFUSED
 
 
 def next_change(history: History, now: float) -> float:
-    """Return when a launch is an hour old next; infinity for never."""
+    """Return when the next launch becomes an hour old; infinity for never."""
     ends = [record.launched_at + HOUR_S for both in history.launches.values() for record in both]
     return min([at for at in ends if at > now], default=float("inf"))

@@ -1,8 +1,8 @@
-"""Which replicas a caching cloud is asked about: those whose links fell silent. Pure.
+"""Which replicas to query at a cloud that caches its list: those whose links are silent. Pure.
 
-Such a cloud's list may still show what was preempted. A late answer to a probe is a reason to look,
-and to look only; all that are silent are asked about, for losing every replica together looks like
-a dead uplink until the cloud has told.
+A cached list may still show preempted machines. A late reply to a probe leads to a query and to
+nothing else. All silent replicas are queried, because losing every replica together looks like a
+dead uplink until the cloud has answered.
 
 Not here: asking (`fogft.cloud`), on a thread of its own (`fogft.pool.manager.operations`).
 """
@@ -20,16 +20,16 @@ FALSE_ALARM_REMEMBERED_S = 600.0
 
 
 class _Silence(float, Enum):
-    """How a replica is silent, with the first pause between questions in seconds."""
+    """How a replica is silent, with the first pause between queries in seconds."""
 
     NEVER_HEARD = 30.0
-    DOUBTED = 15.0  # still up: a probe's answer is late; once it is lost, it is asked about at once
+    DOUBTED = 15.0  # still up, but a reply to a probe is late; once LOST, it is queried at once
     LOST = 4.0
 
 
 @dataclass
 class _Asked:
-    """When a replica may be asked about, and the pause after that."""
+    """When a replica may next be queried, and the pause after that."""
 
     silence: _Silence
     next_at: float
@@ -37,18 +37,18 @@ class _Asked:
 
 
 class Silent:
-    """Remembers when each silent replica was asked about. One thread."""
+    """Remembers when each silent replica was queried. For one thread."""
 
     def __init__(self) -> None:
         self._asked: dict[ReplicaId, _Asked] = {}
 
     def due(self, observed: Observed, history: History) -> list[ReplicaId]:
-        """Return the replicas to ask about now; they count as asked."""
+        """Return the replicas to query now; they count as queried."""
         silent, now = _silent(observed, history), observed.now
         self._asked = {
             id: asked
             for id, asked in self._asked.items()
-            if id in silent  # one whose link hesitated keeps its pause
+            if id in silent  # after a false alarm, the pause is kept for a while
             or (
                 asked.silence is _Silence.DOUBTED and now - asked.next_at < FALSE_ALARM_REMEMBERED_S
             )
@@ -68,7 +68,7 @@ class Silent:
 
 
 def _silent(observed: Observed, history: History) -> dict[ReplicaId, _Silence]:
-    """Return the machines that should answer and do not, each with how it is silent."""
+    """Return the machines that should answer but do not, and how each is silent."""
     links = {link.id: link for link in observed.links or ()}
     out: dict[ReplicaId, _Silence] = {}
     for machine in observed.machines or ():

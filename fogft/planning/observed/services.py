@@ -1,7 +1,7 @@
-"""Service discovery for pool files that list none: services most replicas advertise. Pure.
+"""Discover services for pool files that list none: those that most replicas advertise. Pure.
 
-One replica's word changes nothing: it may be broken, or in wrong hands. What was agreed on is kept
-as long as the pool's replicas run the same: a replica that dies takes no name from the robot.
+One replica of several changes nothing: it may be broken or compromised. Agreed services are kept
+while the pool's version stays the same: a replica that dies removes no service from the robot.
 
 Not here: what a replica offers (`fogft.proxy.replica.offering`), the file
 (`fogft.pool.folder.discovered`).
@@ -21,9 +21,9 @@ from fogft.model.spec import ServiceSpec
 class Discovered:
     """The discovered services."""
 
-    spec_hash: Line = ""  # of the replicas that told it
+    spec_hash: Line = ""  # of the replicas that advertised them
     services: Mapping[Line, Line] = field(default_factory=dict)  # name -> type
-    # How many replicas had told when most of them confirmed all of it; 0 if not known.
+    # How many replicas advertised when most of them last confirmed all services; 0 if not known.
     voters: Count = 0
 
     def specs(self, namespace: str = "") -> tuple[ServiceSpec, ...]:
@@ -40,8 +40,8 @@ class Claims:
     """The services that replicas of one hash advertise."""
 
     count: Mapping[tuple[str, str], int]  # how many offer a service: its name and type
-    voters: int  # of how many
-    heard: int = 0  # how many have told
+    voters: int  # how many replicas the majority is counted from
+    heard: int = 0  # how many advertise services
 
     def agreed(self) -> dict[str, str]:
         """Return name -> type of the services that more than half of the replicas offer."""
@@ -52,9 +52,9 @@ class Claims:
         return sorted({name for name, _ in self.count} - self.agreed().keys())
 
     def doubtful(self, known: Discovered) -> frozenset[str]:
-        """Return known names that most do not offer, where more have told than when it was known.
+        """Return known services that most do not offer, if more replicas advertise than before.
 
-        Whoever was alone at first may have lied, and nobody else would ever be ready.
+        A replica that was alone at first may have lied, and then no other would ever be ready.
         """
         if self.heard <= known.voters:
             return frozenset()
@@ -74,8 +74,8 @@ def claims(
 ) -> Claims:
     """Return the services that replicas of a hash advertise now.
 
-    Where nothing is known yet, the machines that there are decide, for others may not be had; later
-    on as many as are wanted, so that one that is left alone for a while cannot.
+    While no service is known, most of the existing machines decide, as others may be unavailable;
+    later most of the wanted number, so that a replica that is alone for a while cannot decide.
     """
     ours = {
         machine.id

@@ -1,6 +1,6 @@
-"""``fogft bake``: build an image that has a pool file's environment already.
+"""``fogft bake``: build an image with a pool file's environment preinstalled.
 
-Not here: what the image is built of (`fogft.cloud.port.RealCloud`).
+Not here: the content of the image (`fogft.cloud.port.RealCloud`).
 """
 
 import subprocess
@@ -19,9 +19,9 @@ _DOCKER = "docker:"
 
 
 def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
-    """Build an image of a pool file, and push it. Docker's own words go to this process's stderr.
+    """Build an image for a pool file, and push it if asked. Docker's output goes to stderr.
 
-    `base` is what it is built on; None for the pool file's own image, else plain Ubuntu.
+    `base` is the base image; None for the pool file's own image or, without one, plain Ubuntu.
     """
     text = read_text(file)
     spec = parse(text, file=str(file))

@@ -1,7 +1,7 @@
-"""Change a running pool besides its file: scale, drain, exclude, retry, certificates.
+"""Change a running pool without changing its file: scale, drain, exclude, retry, certificates.
 
-All but the last write the new intent under the pool's lock and return; the manager, now or when
-there is one again, acts on it. Certificates are waited for until they are revoked or in use.
+All but the last write the new intent under the pool's lock and return; the manager acts on it, now
+or once one runs again. Changes of certificates wait until those are revoked or in use.
 """
 
 import time
@@ -26,7 +26,7 @@ from fogft.poolfile.tree import nearest
 def change(store: PoolStore, step: Callable[[Intent], Intent]) -> tuple[Intent, Intent]:
     """Change a pool's intent under its lock; return it before and after."""
     with disk.locked(store.paths.intent_lock):
-        store.identity()  # it may have been ended while we waited
+        store.identity()  # the pool may have been shut down while we waited
         before = store.intent()
         if before.stopping:
             raise PoolBusy(
@@ -39,7 +39,7 @@ def change(store: PoolStore, step: Callable[[Intent], Intent]) -> tuple[Intent, 
 
 
 def drain(store: PoolStore, slot: int, now: float) -> int:
-    """Have the replica in a slot replaced; return its generation."""
+    """Request the replacement of the replica in a slot; return its generation."""
     generation = generation_in(store.paths, slot, now)
     change(store, lambda before: intent.drain(before, slot, generation))
     return generation
@@ -81,9 +81,9 @@ PUBLISH_LIMIT_S = 10.0
 
 
 def revoke_credentials(store: PoolStore, role: Role, name: str) -> tuple[list[Holder], bool]:
-    """Revoke certificates; return their holders, and whether the pool has been told.
+    """Revoke certificates; return their holders, and whether the membership lists them.
 
-    A replica that is revoked is replaced, too.
+    Revoked replicas are also replaced.
     """
     store.identity()
     holders = Ledger(store.paths.credentials).named(role, name)
@@ -122,7 +122,7 @@ def _in_use(paths: PoolPaths, holder: Holder) -> bool:
 
 
 def rotate_replicas(store: PoolStore, slot: int | None = None) -> list[str]:
-    """Replace replicas, new before old, each with a new key; return which."""
+    """Replace replicas, new before old, each with a new key; return their names."""
     chosen = slots(store.paths) if slot is None else [slot]
     return [f"{one}.{drain(store, one, time.time())}" for one in chosen]
 

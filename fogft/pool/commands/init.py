@@ -1,6 +1,6 @@
-"""Copy a working example out of `templates/`: what `fogft init` does.
+"""``fogft init``: copy a working example from `templates/`.
 
-A file that is already there is never overwritten unless that was asked for.
+An existing file is never overwritten unless that was asked for.
 """
 
 import json
@@ -18,7 +18,7 @@ POOL_FILE = "pool.yaml"
 
 
 def examples() -> dict[str, str]:
-    """Return the examples: name and one line of description, by name."""
+    """Return the examples, sorted by name: name -> one-line description."""
     found = {}
     for pool in sorted(template_files.folder().glob(f"*/{POOL_FILE}")):
         comments = pool.read_text(encoding="utf-8").split("\n", 3)
@@ -27,8 +27,8 @@ def examples() -> dict[str, str]:
 
 
 def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Path]:
-    """Copy an example's files into a folder, which is made if need be; return them, the pool file
-    first. With `force` files of the same names are overwritten; others in the folder stay.
+    """Copy an example's files into a folder, created if needed; return them, the pool file first.
+    With `force`, files of the same names are overwritten; others in the folder stay.
     """
     known = examples()
     if name not in known:
@@ -42,7 +42,7 @@ def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Pa
             (target / relative).parent.mkdir(parents=True, exist_ok=True)
             (target / relative).write_bytes((source / relative).read_bytes())
         form = json.dumps(schema.pool_schema(), indent=2) + "\n"
-        written[-1].write_text(form, encoding="utf-8")  # which its first line names, for editors
+        written[-1].write_text(form, encoding="utf-8")  # its first line names this, for editors
     except OSError as error:
         what = f"`{error.filename or target}` cannot be written: {error.strerror}"
         raise FogftError(what, "choose another folder with `--into DIR`") from error
@@ -50,7 +50,7 @@ def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Pa
 
 
 def _files(source: Path) -> Iterator[Path]:
-    """Yield the example's files, relative to it, without what Python leaves behind."""
+    """Yield the example's files, relative to its folder, without `__pycache__`."""
     for path in source.rglob("*"):
         if path.is_file() and "__pycache__" not in path.parts:
             yield path.relative_to(source)

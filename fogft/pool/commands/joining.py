@@ -1,11 +1,11 @@
-"""Join bundles: their content, and how `fogft join` sets a machine up from one.
+"""Join bundles: their content, and how `fogft join` sets up a machine from one.
 
-It is used once: the file is destroyed when it has been opened, a copy is refused here by its id,
-and on other machines by what was said at the rendezvous. What was there for the same holder is
-replaced with the certificate last: a proxy that runs takes it into use by itself.
+A bundle is used once: its file is deleted after use, and a copy is refused on this machine by its
+id, and on others by the claim at the rendezvous. Existing files of the same holder are replaced,
+the certificate last: a running proxy starts to use it by itself.
 
 Owns: the content of bundles, and the folders of joined holders.
-Not here: sealing (`bundle`), which certificates there are (`ledger`), claims (`claiming`).
+Not here: sealing (`bundle`), which certificates exist (`ledger`), claims (`claiming`).
 """
 
 import contextlib
@@ -37,21 +37,21 @@ from fogft.poolfile import yaml_tree
 from fogft.poolfile.tree import plain
 
 _USED_LIMIT = 10_000
-# And nothing else: what else lies in its folder may be a command that a proxy starts.
+# A bundle may bring no other files: one in its folder could be a command that a proxy starts.
 _BROUGHT = re.compile(
     r"(credentials/)?(ca\.crt|(robot|gateway|replica|rendezvous)\.(key|crt))"
     r"|(proxy|gateway|replica|rendezvous)\.yaml|membership\.json|announcements\.json"
 )
 # All others: `proxy`.
 _COMMANDS = {Role.REPLICA: "serve", Role.RENDEZVOUS: "rendezvous", Role.GATEWAY: "gateway"}
-_FLAT = (Role.REPLICA, Role.RENDEZVOUS)  # their credentials lie beside their configuration
+_FLAT = (Role.REPLICA, Role.RENDEZVOUS)  # their credentials are stored beside their configuration
 
 
 @dataclass(frozen=True)
 class Joined:
     """The result of a `join`: ``fogft <command> --config <config>`` starts it.
 
-    `alone`: no rendezvous tells it of what changes, nor told whether it is the first to join.
+    `alone`: there is no rendezvous to tell it of changes, or whether it is the first to join.
     """
 
     holder: Holder
@@ -74,7 +74,7 @@ def issue(
     _check_found(spec, role, name)
     bundle.check_passphrase(passphrase)  # before a generation is used up
     with disk.locked(store.paths.intent_lock):
-        store.identity()  # it was not exported meanwhile
+        store.identity()  # raises if it was exported meanwhile
         holder, credential = Ledger(store.paths.credentials).issue_next(
             role, name, identity.uid, days=configuration.certificate_days(spec)
         )
@@ -89,7 +89,7 @@ def _is_by_hand(name: str) -> bool:
 
 
 def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
-    """See that whoever joins can find the others, or be found by them."""
+    """Check that a new member can find the others, or be found by them."""
     if spec.rendezvous:
         return
     add = "add `fogft.rendezvous` to the pool file and run `fogft up`"
@@ -127,7 +127,7 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
         membership = store.membership()
         if membership is not None:
             files["membership.json"] = disk.to_json(to_dict(membership))
-    # The certificate last: once it stands, all else does too.
+    # The certificate last: once it exists, all other files do too.
     folder = "" if holder.role in _FLAT else "credentials/"
     own = credential.files(holder.role.value)
     return {**files, **{f"{folder}{name}": text.decode() for name, text in own.items()}}
@@ -141,14 +141,14 @@ def join(
     *,
     claim: Callable[[Holder, str, list[str], CredentialPaths], None] = claiming.claim,
 ) -> Joined:
-    """Set this machine up from a bundle, and delete the bundle.
+    """Set up this machine from a bundle, and delete the bundle.
 
-    `claim` sees that no other machine has joined with it.
+    `claim` ensures that no other machine has joined with it.
 
     Raises:
-        CredentialError: It is no bundle, was used, is too old, or the passphrase is wrong; or
-            no rendezvous tells whether it was used. Then it is as good as before.
-        StateError: Something cannot be written; the bundle is still there.
+        CredentialError: The file is no bundle, was used or is too old, or the passphrase is wrong;
+            or no rendezvous can tell whether it was used: then it can still be used.
+        StateError: A file cannot be written; the bundle still exists.
     """
     label, content = bundle.open_sealed(read(file), passphrase, now)
     brought = read_content(content)
@@ -194,10 +194,10 @@ def used_once(root: Path, label: Label) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _on_disk(folder: Path, files: Mapping[str, str], holder: Holder) -> Iterator[CredentialPaths]:
-    """Have credentials in files of their own before they are put where a proxy sees them."""
+    """Keep credentials in temporary files before they are put where a proxy sees them."""
     named = {PurePosixPath(name).name: text for name, text in files.items()}
     made = folder / "claiming"
-    shutil.rmtree(made, ignore_errors=True)  # of one that was killed
+    shutil.rmtree(made, ignore_errors=True)  # left by a `join` that was killed
     disk.make_folder(made)
     try:
         place = CredentialPaths.of(made, holder.role.value)
@@ -230,7 +230,7 @@ def check_name(name: str, depth: int = 2) -> None:
 
 @dataclass(frozen=True)
 class Content:
-    """The content of a bundle: files that are known to be needed, and the rendezvous."""
+    """The content of a bundle: files with expected names, and the rendezvous endpoints."""
 
     files: Mapping[Annotated[str, only(_BROUGHT.fullmatch, "a file of a bundle")], str]
     rendezvous: tuple[Endpoint, ...] = ()
@@ -249,7 +249,7 @@ def read_content(content: Any) -> Content:
 
 
 def _check_paths(config: Any) -> None:
-    """Check that a proxy will read and write nothing outside its folder. Raises ValueError."""
+    """Check that a proxy will not read or write outside its folder. Raises ValueError."""
     keys = ("membership", "status", "lock", "records", "announcements")
     held = config if isinstance(config, dict) else {}
     credentials = held.get("credentials")

@@ -51,10 +51,10 @@ def export(
 ) -> Identity:
     """Seal a pool into a file and stop managing it here; return its identity.
 
-    The client proxy of this machine goes on, so that requests are answered meanwhile; where a
-    service is stateful it ends, since only one robot may order its requests.
+    This machine's client proxy keeps running, so that requests are answered meanwhile; if a service
+    is stateful, the proxy ends, since only one robot may order its requests.
 
-    Where the file exists or cannot be written, the pool is managed here as before.
+    If the file exists or cannot be written, this machine continues to manage the pool.
     """
     bundle.check_passphrase(passphrase)
     if file.exists():
@@ -68,7 +68,7 @@ def export(
         try:
             with contextlib.ExitStack() as ended:
                 ended.enter_context(shutdown.without_manager(paths, told))
-                store.identity()  # the manager may have stepped back just then
+                store.identity()  # the manager may have stepped back just now
                 proxy_supervisor.forbid_restart(paths)
                 ended.enter_context(shutdown.without_orders(paths, store.spec(), told))
                 name, until = manager_of(identity.uid).common_name, now + open_for_s
@@ -96,7 +96,7 @@ def export(
 
 
 def _files(paths: PoolPaths, identity: Identity, root: Path) -> Iterator[tuple[str, str]]:
-    """Yield name and content of what another machine needs; bytes as Latin-1."""
+    """Yield the name and content of each file that another machine needs; bytes as Latin-1."""
     kept = (
         *(paths.spec, paths.good_spec, paths.intent, paths.trial, paths.discovered, paths.gateway),
         *(paths.history, paths.membership, paths.records, paths.manager_records),
@@ -121,7 +121,7 @@ def import_(
 ) -> PoolStore:
     """Take over a pool from its file; return it, still without a manager.
 
-    Relative paths in `pool_file`, the pool file on this machine, start at its folder.
+    `pool_file` is the pool file on this machine; relative paths in it start at its folder.
     """
     label, content = bundle.open_sealed(joining.read(file), passphrase, now)
     if label.holder.role is not Role.MANAGER:

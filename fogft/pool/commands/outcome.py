@@ -1,7 +1,7 @@
 """The outcome of an `up`: the pool answers, is still starting, or cannot answer. Pure.
 
 Owns: the verdict on a status.
-Not here: looking and waiting (`fogft.cli.progress`).
+Not here: polling and waiting (`fogft.cli.progress`).
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import ReplicaStatus
 
 HOPELESS_RESTARTS = 4  # of `run`, some eight seconds after it was first started
-AGAIN_S = 16.0  # by then, a `run` that ended before the `up` was started again
+AGAIN_S = 16.0  # by then, a `run` that ended before the `up` has been restarted
 
 
 class Outcome(Enum):
@@ -24,7 +24,7 @@ class Outcome(Enum):
     ANSWERING = auto()
     WITHDRAWN = auto()  # the update was stopped and rolled back
     RUN_KEEPS_ENDING = auto()  # on every replica
-    NEVER_READY = auto()  # no replica ever was: nothing more is launched
+    NEVER_READY = auto()  # no replica was ever ready: nothing more is launched
     TYPES_DIFFER = auto()  # every replica has another type for a service than this machine
 
 
@@ -33,9 +33,9 @@ class Awaited:
     """The condition that an `up` waits for.
 
     Attributes:
-        services: Their names; empty for those that will be discovered.
+        services: Their names; empty if they are to be discovered.
         since: When the file was applied, in seconds since the epoch.
-        digest: Of the file whose update is waited for; empty for no update.
+        digest: The digest of the file whose update is awaited; empty for no update.
     """
 
     services: frozenset[str]
@@ -81,10 +81,10 @@ class Awaited:
 
 @dataclass(frozen=True)
 class Settled:
-    """What `scale` and `drain` wait for: all ready, none draining, and none of or before `gone`."""
+    """What `scale` and `drain` wait for: all replicas ready, none draining, and `gone` ended."""
 
     since: float
-    gone: tuple[int, int] | None = None
+    gone: tuple[int, int] | None = None  # a slot, and the last generation that must have ended
 
     def outcome(self, seen: Seen, *, is_last: bool = False) -> Outcome:
         """Return the outcome for a status."""
@@ -108,7 +108,7 @@ def is_given_up(seen: Seen) -> bool:
 
 
 def staying(seen: Seen) -> list[ReplicaStatus]:
-    """Return the replicas that are not draining: those of a file before this one are."""
+    """Return the replicas that are not draining; those of an earlier file are."""
     return [one for one in seen.status.replicas if one.phase != Phase.DRAINING.value]
 
 

@@ -25,7 +25,7 @@ from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.poolfile import named_clouds
 from fogft.poolfile.file import parse, read_text
 
-LEAST_LAUNCHES = 5  # fewer say little
+LEAST_LAUNCHES = 5  # fewer are not representative
 
 
 @dataclass(frozen=True)
@@ -33,12 +33,12 @@ class PlanShown:
     """A plan with the data that it is based on.
 
     Attributes:
-        cloud: The adapter or the table that the prices are from.
-        clouds: What each cloud lacks for such a pool; empty on the local cloud.
+        cloud: The cloud adapter or the table that the prices come from.
+        clouds: What each cloud lacks for this pool; empty on the local cloud.
         distances: ``cloud/region`` -> how far it is, and how that is known.
-        traffic: Service name -> what its client proxy counted, where the file says nothing, in the
-            last `measured_over_s`.
-        ready_p90_s: By when nine in ten of this pool's launches were ready; None for too few.
+        traffic: Service name -> what its client proxy counted in the last `measured_over_s`, if the
+            file gives no traffic.
+        ready_p90_s: How long nine in ten of this pool's launches took at most; None for too few.
     """
 
     spec: PoolSpec
@@ -64,8 +64,8 @@ def plan_file(
 ) -> PlanShown:
     """Plan a pool file from scratch. Queries clouds for prices and distances only.
 
-    Prices are of the cloud that its resources name, else `local`, unless told; `prices` is a table
-    in place of a cloud. Offline no distance is measured; `told` hears of what takes long.
+    Prices come from `cloud`, by default the one that the resources name, else `local`; or from the
+    table `prices`. If `offline`, no distance is measured. `told` is called before slow steps.
     """
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.resolve().parent)
@@ -124,7 +124,7 @@ def plan_file(
 
 
 def ready_after(events: Sequence[Event]) -> list[float]:
-    """Return how long launches took from the order until they were ready, the shortest first."""
+    """Return how long launches took from order to readiness, in seconds, the shortest first."""
     ordered: dict[tuple[int, int], float] = {}
     took_s: list[float] = []
     for event in events:
@@ -143,8 +143,8 @@ def far(
     offline: bool = False,
     told: Callable[[str], None] = lambda _: None,
 ) -> tuple[Mapping[str, Distance], list[str]]:
-    """Return how far the regions of offers are, the pool file's word first, and what could not be
-    measured; offline nothing is.
+    """Return the distances to the regions of offers, where the pool file's take precedence, and
+    notes on those that could not be measured; if `offline`, none is measured.
     """
     regions, latencies, notes = regions_of(sold), Latencies(latency_file()), []
     if not offline and (stale := latencies.stale(regions)):
@@ -157,14 +157,14 @@ def far(
 
 
 def _on_demand(seller: Seller, spec: PoolSpec) -> Sequence[Offer]:
-    """Return what one on-demand machine of the pool's largest kind costs; none if not sold."""
+    """Return the offers of one on-demand machine of the pool's last group; none if not sold."""
     try:
         return seller.offers(with_spot(groups_of(spec)[-1].resources, False))
     except (SpecError, CloudError):
         return ()
 
 
-# Shorter than this, one burst would pass for a month.
+# Over a shorter time, one burst would be taken for a month's traffic.
 LEAST_S = 60.0
 
 

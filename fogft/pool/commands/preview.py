@@ -1,7 +1,7 @@
 """Preview what `up` would do with a pool file, before anything is changed.
 
 Owns: the placements that a new pool would get, and what a changed file changes.
-Not here: doing it (`startup`) and saying it (`fogft.cli`).
+Not here: applying the file (`startup`) and showing the preview (`fogft.cli`).
 """
 
 import contextlib
@@ -39,12 +39,12 @@ class Preview:
     """The effect of applying a pool file.
 
     Attributes:
-        launches: Of a new pool; by slot. Of one that exists: what it would get if it were new.
-        costs_money: Its machines are paid for: nothing is ordered unasked.
-        accounts: Of each cloud whose credentials were tested: empty, or what is wrong.
-        changes: Of a pool that exists: what the file now says otherwise, in words.
+        launches: The launches of a new pool, by slot; of an existing pool, those if it were new.
+        costs_money: Its machines cost money: nothing is ordered without asking.
+        accounts: Each cloud whose credentials were tested -> the problem; empty for none.
+        changes: For an existing pool, the changes of the file, in words.
         new_before_old: The budget has room for a replica and its successor at once.
-        rolled_back: Why this very file was given up before; empty where it was not.
+        rolled_back: Why this same file was given up before; empty if it was not.
     """
 
     spec: PoolSpec
@@ -79,8 +79,8 @@ def order(
 ) -> Preview:
     """Read and check a pool file, and preview its effect. Changes nothing.
 
-    It runs on the cloud that its resources name, else `local`, unless told; `told` hears of what
-    takes long.
+    The pool runs on `cloud`, by default the one that its resources name, else `local`; `told` is
+    called before slow steps.
     """
     source = pool_file.read_text(file)
     spec = pool_file.parse(source, str(file), checks_here(), file.resolve().parent)
@@ -152,7 +152,7 @@ def order(
 
 
 def check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> None:
-    """Raise SpecError where a pool of this name runs from another file or on another cloud."""
+    """Raise SpecError if a pool of this name runs from another file or on another cloud."""
     if Path(identity.file) != file:
         raise SpecError(
             f"{file}: name: pool `{spec.name}` was started from `{identity.file}`",
@@ -166,7 +166,7 @@ def check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> No
 
 
 def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:
-    """Return the file in force, None for none, and why this very one was given up, if it was."""
+    """Return the file in force (None for none), and why `source` was given up, if it was."""
     try:
         store.identity()
         before, trial = store.spec(), store.trial()
@@ -179,7 +179,7 @@ def _before(store: PoolStore, source: str) -> tuple[PoolSpec | None, str]:
 def _tested(
     cloud: RealCloud, named: Sequence[str], *, may_fail: bool
 ) -> tuple[Mapping[str, str], list[str]]:
-    """Test credentials; return the outcome by cloud, and what is worth knowing besides."""
+    """Test credentials; return the outcome by cloud, and notes."""
     try:
         accounts = dict(cloud.check(named))
     except CloudError as error:
@@ -209,7 +209,7 @@ def checks_here() -> Checks:
 def mistakes(file: Path) -> list[SpecError]:
     """Return all mistakes in a pool file, by line.
 
-    What real clouds think of `resources` is left to `fogft plan` and `fogft up`, which ask them.
+    Whether real clouds accept `resources` is left to `fogft plan` and `fogft up`, which ask them.
     """
     checks = checks_here()
     found = pool_file.mistakes(file, checks)

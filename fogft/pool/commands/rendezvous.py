@@ -1,6 +1,6 @@
-"""``fogft rendezvous --config FILE``: a rendezvous as a process.
+"""``fogft rendezvous --config FILE``: run a rendezvous in the foreground.
 
-Its memory on disk spares callers a moment after a restart; without it they bring everything.
+Records on disk save callers a moment after a restart; without them, callers send all again.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ _SAVE_EVERY_S = 0.5
 
 
 def run(path: Path, *, listen: str | None = None, metrics: str | None = None) -> None:
-    """Run with a configuration file until a signal ends it."""
+    """Run a rendezvous with a configuration file until a signal ends it."""
     config = config_file.read(RendezvousConfig, path, {"listen": listen, "metrics": metrics})
     start_log()
     asyncio.run(_Rendezvous(config).live())

@@ -1,7 +1,7 @@
-"""systemd units for the parts of a pool on this machine: written, started, removed.
+"""Write, start and remove systemd units for the parts of a pool on this machine.
 
-The manager and three client proxies, two of which wait in line; or a gateway or a rendezvous with a
-configuration file. systemd restarts what dies or hangs; what ends well stays ended.
+They run the manager and three client proxies, two of which wait to take over; or a gateway or a
+rendezvous with a configuration file. systemd restarts what dies or hangs, not what exits with 0.
 
 Owns: the units' text and names, their environment, and the calls of systemctl.
 Not here: what the processes tell systemd (`fogft.process`).
@@ -28,8 +28,8 @@ SYSTEM_FOLDER = Path("/etc/systemd/system")
 STANDBY_LIMIT_S = 60.0
 HANDOVER_LIMIT_S = 180.0
 MARK = "# Written by `fogft service install`"
-# What a sourced ROS 2, its middleware, fogft itself and clouds are told by. No credentials: clouds'
-# own tools keep those in files.
+# Variables that configure ROS 2, its middleware, fogft and clouds. No credentials: the clouds' own
+# tools keep those in files.
 _TAKEN = re.compile(
     r"ROS_.*|RMW_IMPLEMENTATION|AMENT_.*|COLCON_.*|CYCLONEDDS_URI|FAST(DDS|RTPS)_.*|ZENOH_.*|"
     r"SKYPILOT_API_SERVER_ENDPOINT|SKYPILOT_(GLOBAL_|PROJECT_)?CONFIG|"
@@ -67,7 +67,7 @@ class Services:
 
 
 def services(*, system: bool) -> Services:
-    """Return where this user's units go, or the machine's."""
+    """Return where this user's units go or, with `system`, the machine's."""
     if system:
         return Services(True, SYSTEM_FOLDER)
     return Services(False, own_folder("XDG_CONFIG_HOME", "~/.config") / "systemd" / "user")
@@ -132,7 +132,7 @@ def _quoted(word: str) -> str:
 def environment(environ: Mapping[str, str] = os.environ) -> str:
     """Return an environment file with what ROS, its middleware and fogft need.
 
-    Not the home: `sudo` leaves root's, and systemd sets that of the unit's user.
+    HOME is left out: under `sudo` it is root's, and systemd sets that of the unit's user.
     """
     taken = {name: value for name, value in environ.items() if _TAKEN.fullmatch(name)}
     taken["FOGFT_HOME"] = str(home(environ).absolute())
@@ -144,9 +144,9 @@ def environment(environ: Mapping[str, str] = os.environ) -> str:
 
 
 def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = None) -> list[str]:
-    """Have units started now and at each boot; return what systemd said against it.
+    """Start units now and at each boot; return the errors of systemd.
 
-    A pool's replace the processes, if any, that run it now.
+    A pool's units replace the processes, if any, that run the pool now.
     """
     if not where.folder.is_dir():
         disk.make_folder(where.folder)
@@ -162,7 +162,7 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
     names = [unit.name for unit in units]
     said = [where.systemctl("daemon-reload"), where.systemctl("enable", *names)]
     if not any(one.returncode for one in said):
-        if paths is not None:  # whom systemd did not start: its own replace them
+        if paths is not None:  # not started by systemd: its own replace them
             for lock in (paths.manager_lock, paths.spare_lock, paths.standby_lock):
                 process_control.end_holder(lock)
         said.append(where.systemctl("restart", "--no-block", *names))
@@ -170,10 +170,10 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
 
 
 def hand_over(paths: PoolPaths) -> None:
-    """Have the client proxy not started by systemd hand over to one that was.
+    """Make a client proxy that systemd did not start hand over to one that it did.
 
-    Told to end, it hands over to whoever stands by: that one is waited for, so no request is lost.
-    systemd starts those again that have found no place until then.
+    When told to end, it hands over to the standby: that is awaited first, so no request is lost.
+    Proxies that were surplus until then are restarted by systemd.
     """
     old = disk.holder(paths.proxy_lock)
     if old is None:
@@ -196,7 +196,7 @@ def installed(where: Services, names: Sequence[str] = ()) -> list[str]:
 
 
 def states(where: Services, names: Sequence[str]) -> dict[str, str]:
-    """Return each unit's state as systemd has it; `unknown` where that does not run."""
+    """Return each unit's state according to systemd; `unknown` if systemd does not run."""
     if shutil.which("systemctl") is None:
         return dict.fromkeys(names, "unknown")
     return {name: where.systemctl("is-active", name).stdout.strip() or "unknown" for name in names}
@@ -210,7 +210,7 @@ def remove(where: Services, names: Sequence[str]) -> str:
         refused = done.stderr.strip().rpartition("\n")[2] if done.returncode else ""
     for unit in (where.folder / name for name in names):
         text = unit.read_text()
-        unit.unlink()  # first: it may not be ours to remove
+        unit.unlink()  # first, as removing it may not be permitted
         for path in re.findall("^EnvironmentFile=(.*)$", text, re.MULTILINE):
             Path(path.replace("%%", "%")).unlink(missing_ok=True)
     if runs and names:

@@ -1,7 +1,7 @@
-"""What `up` does: create or change the pool's folder, and start its manager.
+"""``fogft up``: create or change the pool's folder, and start its manager.
 
-Everything is written before the identity, which comes last: a pool exists once that
-stands. So an `up` that was cut short is an `up` that never was.
+The identity is written after everything else, and a pool exists once it is there: so an interrupted
+`up` that creates a pool has no effect.
 
 Not here: judging the file (`preview`), waiting for the services (`fogft.cli.progress`).
 """
@@ -59,7 +59,7 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
             before, old_source = spec, ""
         after = intent.file_changed(store.intent(), before, spec)
         begun_at = lifetime.begun_at(after, identity.created_at, store.history())
-        # The file first: the old one with the new intent would be one without its `scale`.
+        # The file first: the old file with the new intent would lose its `scale`.
         if old_source != source:
             disk.write_whole(paths.spec, source)
         store.write_intent(lifetime.revived(before, after, begun_at, time.time()))
@@ -67,8 +67,8 @@ def write(store: PoolStore, spec: PoolSpec, *, source: str, file: Path, cloud: s
 
 def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: str) -> None:
     paths = store.paths
-    # Of an `up` that was cut short, or a pool whose identity was lost: what its client proxy would
-    # go on to tell is not of this pool.
+    # An interrupted `up`, or a pool whose identity was lost, may have left a client proxy, whose
+    # reports are not about this pool.
     proxy_supervisor.forbid_restart(paths)
     ended: list[str] = []
     with (
@@ -92,14 +92,14 @@ def _create(store: PoolStore, spec: PoolSpec, source: str, file: Path, cloud: st
 
 
 def revive_client_proxy(paths: PoolPaths) -> None:
-    """Start the client proxy where the manager was killed: it serves without one, and sooner."""
+    """Start the client proxy if the manager was killed: it serves without one, and sooner."""
     killed = paths.manager_start.exists() and not disk.is_locked(paths.manager_lock)
     if killed and paths.proxy_config.exists():
         ProxySupervisor(paths, time.monotonic).look()
 
 
 def manager_version(paths: PoolPaths, pid: int | None = None) -> str:
-    """Return the fogft version of a pool's manager, of process `pid`; empty if unknown."""
+    """Return the fogft version of a pool's manager, if it is process `pid`; empty if unknown."""
     said = disk.read_json(paths.status)
     if not isinstance(said, dict) or (pid is not None and said.get("manager_pid", pid) != pid):
         return ""
@@ -109,8 +109,8 @@ def manager_version(paths: PoolPaths, pid: int | None = None) -> str:
 def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None = None) -> bool:
     """Ensure that the pool has a manager of this version; return whether one was started.
 
-    What has only just started is asked for its version first: it may be what another `up`, which
-    ended the same old manager, has started.
+    The version of a manager that has just started is awaited first: another `up` that ended the
+    same old manager may have started it.
     """
     paths = store.paths
     name = paths.folder.name

@@ -1,6 +1,6 @@
 """The status of a pool now, each part from its best source: docs/design/command-line.md.
 
-What nobody has looked at lately is unknown, never as it was.
+What was not observed recently is shown as unknown, never by its last value.
 
 Not here: its schema (`fogft.pool.manager.status`), showing it (`fogft.cli`).
 """
@@ -35,11 +35,11 @@ class Seen:
     """A status with its age and the processes that are alive.
 
     Attributes:
-        age_s: Since the manager observed the pool; None when it has not yet.
-        report_age_s: Since the client proxy reported its links; None for no report.
-        links_known: Whether that is recent, and the client proxy runs now.
+        age_s: Time since the manager observed the pool; None if it has not yet.
+        report_age_s: Time since the client proxy reported its links; None for no report.
+        links_known: Whether that report is recent, and the client proxy runs now.
         answers: Whether a request to each service would be answered now; None for unknown.
-        unanswered: The services to which a request would not be.
+        unanswered: The services whose requests would not be answered.
     """
 
     status: PoolStatus
@@ -83,7 +83,7 @@ def current(
     Args:
         succeeded: The proxy that wrote the report has ended, and another one runs.
         heard_since: Only a link whose replica has answered a probe since then counts as up;
-            None for what the report says.
+            None to count links as reported.
     """
     is_fresh = report is not None and report.fresh(now) and proxy_alive and not succeeded
     fresh = report if is_fresh else None
@@ -131,9 +131,9 @@ def read(paths: PoolPaths, now: float, *, heard_since: float | None = None) -> S
 
 
 def _has_successor(pid: int, lock: Path) -> bool:
-    """Whether a process has ended, be it a zombie, and another one says that it has its lock.
+    """Whether a process has ended, or is a zombie, and another one claims to hold its lock.
 
-    One that hands over lives on for a while. In a container it has another number there.
+    A process that hands over lives on for a while. In a container, the lock's file has another pid.
     """
     said = disk.said_holder(lock)
     return said not in (None, pid) and not disk.is_running(pid)
@@ -158,7 +158,7 @@ def checked(paths: PoolPaths, limit_s: float) -> Seen:
 
 
 def renewed(paths: PoolPaths, limit_s: float = 15.0) -> Seen:
-    """Have the manager observe the pool again; return its status, or without one the last."""
+    """Make the manager observe the pool again; return the status (without a manager, the last)."""
     asked_at = time.time()
     deadline = time.monotonic() + limit_s
     with contextlib.suppress(OSError):
@@ -181,7 +181,7 @@ def slots(paths: PoolPaths) -> list[int]:
 
 
 def _unobserved(paths: PoolPaths) -> PoolStatus:
-    """Return the status of a pool whose manager has not looked yet."""
+    """Return the status of a pool that its manager has not observed yet."""
     from fogft.pool.folder.store import read_identity
 
     identity = read_identity(paths)
@@ -192,12 +192,12 @@ _PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", NoneT
 
 
 def status_schema() -> dict[str, Any]:
-    """Return the schema."""
+    """Return the JSON schema of `fogft status --json`."""
     definitions: dict[str, Any] = {}
     own = _object(PoolStatus, definitions)
     of_reader = _object(Seen, definitions)
     properties = {**own["properties"], **of_reader["properties"]}
-    del properties["status"]  # what it holds stands beside the others
+    del properties["status"]  # its keys are at the top level
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "fogft status --json",
@@ -210,7 +210,7 @@ def status_schema() -> dict[str, Any]:
 
 def _object(cls: type[Any], definitions: dict[str, Any]) -> dict[str, Any]:
     hints = typing.get_type_hints(cls)
-    # A reason has the data that belongs to its cause; everything else has all of its keys.
+    # A reason has only the keys that belong to its cause; everything else has all of its keys.
     required = ["cause"] if cls is Reason else [field.name for field in fields(cls)]
     properties = {}
     for field in fields(cls):
@@ -236,7 +236,7 @@ def _form(hint: Any, definitions: dict[str, Any]) -> dict[str, Any]:
     if isinstance(hint, type) and is_dataclass(hint):
         name = hint.__name__
         if name not in definitions:
-            definitions[name] = {}  # a name for those that contain themselves
+            definitions[name] = {}  # reserved, for types that contain themselves
             definitions[name] = _object(hint, definitions)
         return {"$ref": f"#/$defs/{name}"}
     raise TypeError(f"`{hint}` has no JSON form")

@@ -1,9 +1,9 @@
 """Find and end machines of this user's pools that no manager owns.
 
-A manager owns a machine while it holds its pool's lock on this computer. Whatever else is
-listed costs money that nobody watches.
+A manager owns a machine while it holds the pool's lock on this computer. All other machines that
+are listed cost money unnoticed.
 
-Not here: what exists (`fogft.cloud`, past every memory) and asking the user (`fogft.cli`).
+Not here: listing machines (`fogft.cloud`, without any cache) and asking the user (`fogft.cli`).
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from fogft.pool.commands.composition import LOCAL, SKY, make_cloud, pools
 from fogft.pool.folder.paths import PoolPaths, home
 from fogft.pool.folder.store import Identity, read_identity
 
-_NAMED = 5  # in a sentence
+_NAMED = 5  # machines in a message
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def sweep_cloud(name: str, cloud: Cloud | None = None) -> Swept:
 def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
     """Return a warning about running machines of an earlier pool of this name; else empty.
 
-    Its keys were in that folder: no manager can take these machines over.
+    That pool's keys were in its folder, which is lost: no manager can take over its machines.
     """
     try:
         found = [one.machine for one in sweep_cloud(name, cloud).unowned if not one.known]
@@ -84,7 +84,7 @@ def left_of(pool: str, name: str, cloud: Cloud) -> list[str]:
 
 
 def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
-    """End machines one by one, but for those with a manager again; return the errors."""
+    """End machines one by one, except those that have a manager again; return the errors."""
     cloud = make_cloud(found.cloud)
     problems: list[FogftError] = []
     for one in found.unowned:
@@ -102,7 +102,7 @@ def end_found(found: Swept, told: Callable[[str], None]) -> list[FogftError]:
 
 
 def _pools() -> dict[str, tuple[str, bool]]:
-    """Return uid -> name and whether it has a manager, of the pools here and those exported."""
+    """Return uid -> name and whether it has a manager, for pools here and exported ones."""
     found = {}
     for folder in (home() / "pools").glob("*"):
         with contextlib.suppress(StateError):

@@ -1,8 +1,8 @@
 """A pool's certificate authority and the certificates that it issues.
 
-A certificate says who its holder is (common name) and what it may do: a robot's is good for
-asking only, a replica's for answering only. That is the extended key usage, which TLS itself
-checks. What cannot be used raises `CredentialError`, what cannot be written `StateError`.
+A certificate names its holder (common name) and limits what it may be used for: a robot's is valid
+for TLS clients only, a replica's for TLS servers only. TLS itself checks this (extended key usage).
+Unusable files raise `CredentialError`, files that cannot be written `StateError`.
 
 Not here: who gets one (`fogft.pool`), how they are used (`fogft.link.zenoh.settings`).
 """
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 AUTHORITY_CERTIFICATE = "ca.crt"
 AUTHORITY_KEY = "ca.key"
 AUTHORITY_DAYS = 3650.0
-# A dead manager renews nothing, and must stop no traffic: a leaf outlives any repair.
+# A dead manager renews nothing, and must not stop traffic: a leaf outlasts any repair.
 LEAF_DAYS = 365.0
 RENEW_BEFORE = datetime.timedelta(days=60)
-# Robots' clocks are wrong; a certificate that begins tomorrow, by their clock, is refused.
+# Robots' clocks may be slow, and a certificate that is not valid yet by their clock is refused.
 BACKDATE = datetime.timedelta(hours=24)
 
 
@@ -79,7 +79,7 @@ def create_authority(folder: Path, pool_uid: str) -> None:
 
 
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
-    """Certify a new key under a name of 1 to 64 characters, for some days or until the CA's end."""
+    """Certify a new key under a name of 1 to 64 characters, for `days` or until the CA expires."""
     certificate, key = _made(common_name, role=role, days=days, issuer=_load_authority(folder))
     return Credential(certificate, key, (folder / AUTHORITY_CERTIFICATE).read_bytes())
 
@@ -131,7 +131,7 @@ def _made(
     days: float,
     issuer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None,
 ) -> tuple[bytes, bytes]:
-    """Make a certificate and its key, both PEM; the CA's own where role and issuer are None."""
+    """Make a certificate and its key, both PEM; the CA's own if role and issuer are None."""
     from cryptography import x509
     from cryptography.hazmat.primitives import hashes, serialization
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -185,7 +185,7 @@ def _made(
             Role.REPLICA: [answers],
             Role.GATEWAY: [answers, asks],
             Role.RENDEZVOUS: [answers],
-            # Good for no connection at all: neither end of TLS accepts it.
+            # Valid for no connection at all: neither end of TLS accepts it.
             Role.MANAGER: [ExtendedKeyUsageOID.CODE_SIGNING],
         }
         builder = builder.add_extension(

@@ -1,9 +1,9 @@
 """A bundle: one file that sets up a robot, gateway, replica or manager on another machine.
 
-Readable JSON around sealed content: the key that seals it is made from a passphrase (scrypt), and
-the readable part is sealed along with it (AES-GCM). What is wrong raises `CredentialError`.
+It is readable JSON around encrypted content: the key is derived from a passphrase (scrypt), and the
+readable part is authenticated as well (AES-GCM). An invalid bundle raises `CredentialError`.
 
-Not here: what is in it (`joining`), and that it is used once (`claiming`).
+Not here: the content (`joining`), and ensuring that a bundle is used once (`claiming`).
 """
 
 import base64
@@ -24,11 +24,11 @@ from fogft.model.plain import Moment, from_plain, to_plain
 VERSION = 2
 SIZE_LIMIT = 32 << 20
 PASSPHRASE_LEAST = 12
-# 64 MiB and about a fifth of a second a guess. Fixed by the version: a file cannot ask for more.
+# 64 MiB and about a fifth of a second per guess. Fixed by the version: a file cannot demand more.
 SCRYPT: dict[str, int] = {"n": 1 << 16, "r": 8, "p": 1}
 _SCRYPT_MEMORY = 128 << 20
 _SALT_BYTES, _NONCE_BYTES = 16, 12
-_ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # without what looks alike
+_ALPHABET = "abcdefghjkmnpqrstuvwxyz23456789"  # without characters that look alike
 
 
 _Name = Annotated[str, only(lambda text: text.isprintable() and 0 < len(text) <= 200, "a name")]
@@ -89,7 +89,7 @@ def read_label(data: bytes) -> Label:
 
 
 def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, Any]:
-    """Return a bundle's label and content, which whoever uses it checks."""
+    """Return a bundle's label and content; the caller must check the content."""
     from cryptography.exceptions import InvalidTag
     from cryptography.hazmat.primitives.ciphers.aead import AESGCM
 

@@ -1,8 +1,8 @@
 """Claim a join bundle at the rendezvous before it is used, so that it is used only once.
 
-The claim is the holder's own record, signed with the key that the bundle brings. A second machine
-finds the record of the first and joins nothing. Of two that join in the same moment the earlier
-one stands, whichever rendezvous each has reached.
+The claim is the holder's own record, signed with the key from the bundle. A second machine finds
+the record of the first and does not join. If two machines join at the same moment, the earlier
+claim wins, whichever rendezvous each has reached.
 """
 
 import secrets
@@ -32,12 +32,12 @@ _KINDS = {
 
 
 def new_token(now: float) -> str:
-    """Return a claim's token: the earlier is the greater text, and the greater record stands."""
+    """Return a claim's token: the earlier one is the greater text, and the greater record wins."""
     return f"{_LATEST_MS - int(now * 1000):013d}.{secrets.token_hex(8)}"
 
 
 def own_token(claims: Path, id: str, now: float) -> str:
-    """Return this machine's claim to a bundle; the same one after an interruption."""
+    """Return this machine's token for a bundle; the same one after an interruption."""
     known = disk.read_as(dict[str, str], claims) or {}
     if id not in known:
         latest = dict(list(known.items())[-_KEPT:])
@@ -57,12 +57,12 @@ def claim(
 ) -> None:
     """Claim a holder's certificate for this machine. Repeatable with the same token.
 
-    A rendezvous's own is not claimed: it can neither ask, answer nor sign anything. Raises
-    `CredentialError`: another machine has joined with it, or nobody can tell.
+    A rendezvous's certificate is not claimed: it can send, answer and sign nothing. Raises
+    `CredentialError`: another machine has joined with it, or no rendezvous can tell.
     """
     if holder.role not in _KINDS:
         return
-    # Two ends: what the second hears is what the rendezvous holds, whatever the first has said.
+    # Two clients: the second receives what the rendezvous holds, whatever the first has published.
     speaker, hearer = (RendezvousClient(endpoints, credentials, holder.pool_uid) for _ in range(2))
     until = clock() + limit_s
     speaker.start()
@@ -70,7 +70,7 @@ def claim(
     try:
         about = SlotState() if holder.role is Role.REPLICA else DialIn()
         said = {**to_plain(about), _KEY: token}
-        # The second makes it stand above any other claim that comes later.
+        # The second record ranks above any other claim that comes later.
         for sequence, pause_s in ((1, settle_s), (2, 0.0)):
             kind, generation = _KINDS[holder.role], holder.generation
             speaker.publish(kind, holder.name, generation, said, sequence=sequence)
@@ -92,7 +92,7 @@ def claim(
 
 
 def _standing(client: RendezvousClient, holder: Holder, sequence: int) -> Record | None:
-    """Return what stands for a holder, once it is as late as this claim or another's."""
+    """Return a holder's record once its sequence reaches that of this claim; None before."""
     for record in client.known.of(_KINDS[holder.role]):
         if record.subject == holder.name and record.order >= (holder.generation, sequence):
             return record

@@ -1,9 +1,9 @@
 """The certificates that a pool's CA has issued and revoked.
 
-``issued.json`` beside the CA, written under its lock. Every issue is on disk before its certificate
-leaves this module, so nothing that the CA ever signed is missing from the list, and no generation
-of a name is used twice. What cannot be written down was not done, and raises `StateError`; what
-cannot be certified raises `CredentialError`.
+They are listed in ``issued.json`` beside the CA, under a lock. A certificate is listed on disk
+before it leaves this module, so no valid certificate is missing, and no generation of a name is
+used twice. If the list cannot be written, nothing is issued, and `StateError` is raised; a name
+that cannot be certified raises `CredentialError`.
 """
 
 import time
@@ -136,7 +136,7 @@ class Ledger:
             )
 
     def named(self, role: Role, name: str) -> list[Holder]:
-        """Return the holders that a role and ``name`` or ``name.generation`` mean."""
+        """Return the holders of a role with this ``name`` or ``name.generation``."""
         holders = list(dict.fromkeys(e.holder for e in self.entries() if e.revoked_at is None))
         found = [h for h in holders if h.role is role and name in (h.name, h.short)]
         if not found:
@@ -148,7 +148,7 @@ class Ledger:
         return found
 
     def _kept(self, entries: Iterable[Entry]) -> list[Entry]:
-        """Return what must be remembered: valid or revoked, and each name's last generation."""
+        """Return the entries to keep: valid or revoked ones, and each name's last generation."""
         now = self._clock()
         last = {(e.holder.role, e.holder.name): e for e in entries}
         return [

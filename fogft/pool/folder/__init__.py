@@ -1,1 +1,1 @@
-"""A pool on disk; `PoolPaths` says who writes what. Not here: why (`fogft.pool.manager`)."""
+"""A pool's files; `PoolPaths` says who writes which. Not here: why (`fogft.pool.manager`)."""

@@ -1,10 +1,10 @@
 """The cost of a pool's machines so far, by replica and day (UTC), as seen by its manager.
 
-Each look charges the time since the last one at the price of that time: the present price of a spot
-machine where it is known, else what it was ordered for. A machine that went while no manager looked
-is charged for as long as it can have run without one. What a cloud refused costs nothing.
+Each call of `look` charges the time since the last one: at the current price of a spot machine if
+known, else at the price of the order. A machine that disappeared while no manager ran is charged
+for as long as it can have run without one. A refused launch costs nothing.
 
-The file stays when the pool has ended.
+The file is kept when the pool has ended.
 """
 
 import logging
@@ -90,11 +90,11 @@ class CostBook:
         """Charge running machines up to now, and save from time to time.
 
         Args:
-            alone_s: For how long a machine runs on of which no manager has heard.
-            set_s: How far the clock was set since this book was opened: nothing runs meanwhile.
+            alone_s: How long a machine can run without a manager.
+            set_s: How far the clock was set since this book was opened: that time costs nothing.
 
         Raises:
-            StateError: It cannot be written; it is kept, and tried again.
+            StateError: The file cannot be written; the costs are kept, and written later.
         """
         if by_s := set_s - self._set_s:
             self._running = {
@@ -167,7 +167,7 @@ class CostBook:
 
 
 def read_all(folder: Path) -> list[Costs]:
-    """Return the costs of all pools of this user, those that have ended too, by name."""
+    """Return the costs of all pools of this user, including ended ones, by name."""
     found = (_read(path) for path in sorted(folder.glob("*.json")))
     return [one for one in found if one is not None]
 

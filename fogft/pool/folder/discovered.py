@@ -17,7 +17,7 @@ from fogft.model.replica import Observed
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.services import Claims, Discovered, claims, grown
 
-_NOTED = 5  # of what is not offered
+_NOTED = 5  # services that are not offered
 
 
 class Discovery:
@@ -56,7 +56,7 @@ class Discovery:
         return True
 
     def _without_doubtful(self, spec: PoolSpec, told: Claims, now: float) -> Discovered:
-        """Return what is known without names that most have not offered for long."""
+        """Return the known services without those that most have not offered for long."""
         known = self.known
         doubtful = told.doubtful(known) if known.spec_hash == spec.replica_hash else ()
         self._doubted = {name: self._doubted.get(name, now) for name in doubtful}
@@ -68,7 +68,7 @@ class Discovery:
         return replace(known, services=left, voters=told.heard)
 
     def _refusal(self, spec: PoolSpec, name: str, kind: str) -> str:
-        """Return why a service cannot be offered here; it is left out then, and noted."""
+        """Return why a service cannot be offered here, and note it; empty if it can."""
         if (name, kind) not in self._refused:
             self._refused[(name, kind)] = _check(name, kind, load=spec.rmw.robot is Speaks.RCLPY)
         why = self._refused[(name, kind)]

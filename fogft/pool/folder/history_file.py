@@ -32,7 +32,7 @@ class HistoryFile:
         self._lock = threading.Lock()
         self._known: History | None = None
         self._appended = 0
-        self._is_long = False  # the file, which its writer alone may make shorter
+        self._is_long = False  # the file needs compaction, by its writer only
         self.heard: Callable[[Event], object] = lambda _: None
 
     def history(self) -> History:
@@ -49,7 +49,7 @@ class HistoryFile:
             if self._is_long:
                 self._is_long = False
                 kept = compacted(_read_events(self._path), self._clock())
-                with contextlib.suppress(StateError):  # no room: it stays as long as it is
+                with contextlib.suppress(StateError):  # no space: it is not compacted
                     disk.write_whole(self._path, "".join(map(_line, kept)))
             try:
                 _append_durably(self._path, _line(event).encode())
@@ -81,7 +81,7 @@ def _append_durably(path: Path, line: bytes) -> None:
     try:
         size = os.fstat(descriptor).st_size
         if size and os.pread(descriptor, 1, size - 1) != b"\n":
-            line = b"\n" + line  # a crash left a torn last line: it stays alone on its own
+            line = b"\n" + line  # a crash left a torn last line: it keeps a line of its own
         if os.write(descriptor, line) != len(line):
             os.ftruncate(descriptor, size)
             raise OSError(28, "No space left on device")
@@ -91,7 +91,7 @@ def _append_durably(path: Path, line: bytes) -> None:
 
 
 def _read_events(path: Path) -> list[Event]:
-    """Return the events of a file, without a torn last line and what else is damaged."""
+    """Return the events of a file; a torn last line and other damaged lines are skipped."""
     events = []
     for line in (disk.read_bytes(path) or b"").splitlines():
         with contextlib.suppress(ValueError, RecursionError):

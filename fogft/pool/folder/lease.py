@@ -1,7 +1,7 @@
 """The manager's lease: one holder per pool, an epoch for each holder, and a heartbeat.
 
-A machine that imports a pool counts from a random later term, so of two that import copies one is
-the later one, for everybody.
+A machine that imports a pool counts epochs from a random later term, so if two machines import
+copies, everybody agrees which one is later.
 
 Owns: `manager.lock` and `lease.json`.
 """
@@ -14,7 +14,7 @@ from fogft.errors import PoolBusy
 from fogft.model.plain import Count, to_plain
 from fogft.pool.folder.paths import PoolPaths
 
-TERM = 1 << 20  # epochs of one machine; as many terms may be skipped
+TERM = 1 << 20  # epochs of one machine; an import may skip as many terms
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class _Held:
 
 
 class Lease:
-    """Held, with an epoch above all earlier ones and `at_least`, to `release` or the process's end.
+    """The lease of one pool, held until `release` or the end of the process.
 
-    PoolBusy where another manager holds it.
+    Its epoch is above all earlier ones and `at_least`. Raises PoolBusy: another manager holds it.
     """
 
     def __init__(self, paths: PoolPaths, *, at_least: int = 0) -> None:
@@ -46,7 +46,7 @@ class Lease:
         self._write()
 
     def beat(self) -> None:
-        """Write the heartbeat. Raises PoolBusy where a later manager has it: stop at once."""
+        """Write the heartbeat. Raises PoolBusy: a later manager took over, so stop at once."""
         folder = self._paths.folder
         if (self._lock.lost and folder.exists()) or read_epoch(self._paths) > self.epoch:
             raise PoolBusy(f"a later manager has taken over pool `{folder.name}`")

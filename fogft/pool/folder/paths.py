@@ -1,7 +1,7 @@
 """Paths of a pool's files on disk.
 
 ``$FOGFT_HOME``, else ``$XDG_STATE_HOME/fogft``, else ``~/.local/state/fogft``. Folders
-are 0700 and files 0600. Every file is written whole and renamed into place.
+are 0700 and files 0600. Files are written whole and renamed into place, except history and logs.
 """
 
 from __future__ import annotations
@@ -49,16 +49,16 @@ class _File:
 class PoolPaths:
     """The files of one pool. A process holds its lock as long as it lives.
 
-    Commands write `identity`, `spec` and `intent` (under `intent_lock`; who ends a pool takes its
-    `identity` away), the client proxy `proxy_status` and `records` (under `proxy_lock`), and the
-    manager all else (under `manager_lock`).
+    Commands write `identity`, `spec` and `intent` (under `intent_lock`; ending a pool removes its
+    `identity`), the client proxy writes `proxy_status` and `records` (under `proxy_lock`), and the
+    manager writes all else (under `manager_lock`).
     """
 
     folder: Path
 
     @classmethod
     def of(cls, name: str, root: Path | None = None) -> PoolPaths:
-        """Return the paths of a pool by name, under `home()` unless told."""
+        """Return the paths of a pool by name, under `root`, by default `home()`."""
         return cls((root or home()) / "pools" / name)
 
     identity = _File("pool.json")

@@ -1,6 +1,6 @@
 """A pool's state on disk, as read and written by the manager and the commands.
 
-Owns: identity, spec, intent and membership: their files.
+Owns: the files of identity, spec, intent and membership.
 Not here: what to remember (`fogft.planning`), what happened (`history_file`) and how a file is
 replaced (`fogft.disk`).
 """
@@ -54,7 +54,7 @@ class GatewayPlace:
 class PoolStore(HistoryFile):
     """A pool's folder. Safe to use from several threads; one process writes each file.
 
-    What cannot be written raises `StateError`; where there is no such pool, `PoolNotFound`.
+    Raises `StateError`: a file cannot be written. Raises `PoolNotFound`: there is no such pool.
 
     Args:
         parse: Reads a pool file's text: ``parse(text, file) -> PoolSpec``.
@@ -67,7 +67,7 @@ class PoolStore(HistoryFile):
         clock: Callable[[], float],
     ) -> None:
         self.paths = paths
-        self.name = paths.folder.name  # the pool's
+        self.name = paths.folder.name  # the pool's name
         self._parse = parse
         super().__init__(paths.history, clock)
         self._spec: tuple[bytes, PoolSpec] | None = None
@@ -89,7 +89,7 @@ class PoolStore(HistoryFile):
         return self._spec[1]
 
     def _current(self, known: tuple[bytes, PoolSpec] | None, raw: bytes) -> tuple[bytes, PoolSpec]:
-        """Return a file's spec, completed with what was discovered; the same object if known."""
+        """Return a file's spec with discovered services and gateway; the same object if known."""
         spec = known[1] if known is not None and known[0] == raw else self._read(raw)
         if not spec.services:
             found = disk.read_or(self.paths.discovered, Discovered())
@@ -157,7 +157,7 @@ class PoolStore(HistoryFile):
         disk.write_json(self.paths.intent, to_plain(intent))
 
     def place_gateway(self, host: str) -> None:
-        """Store where the launched gateway is: from now on `spec` is behind it."""
+        """Store the host of the launched gateway: from now on, `spec` connects through it."""
         disk.write_json(self.paths.gateway, to_plain(GatewayPlace(host)))
 
     def membership(self) -> Membership | None:
@@ -179,7 +179,7 @@ def digest(source: bytes) -> str:
 
 
 def read_identity(paths: PoolPaths) -> Identity:
-    """Return the identity of the pool in a folder, where it is damaged as the manager told it."""
+    """Return the identity of the pool in a folder; if damaged, the one in the manager's status."""
     try:
         found = disk.read_as(Identity, paths.identity)
     except StateError as error:
@@ -209,7 +209,7 @@ class _Told:
 
 
 def _told_identity(paths: PoolPaths) -> Identity | None:
-    """Return the identity that the manager last told in its status; None for none."""
+    """Return the identity that the manager last wrote to its status; None for none."""
     try:
         told = disk.read_as(_Told, paths.status)
         created_at = (paths.credentials / "ca.crt").stat().st_mtime

@@ -1,7 +1,7 @@
 """The manager's signed records: membership, revocations and its lease.
 
-Without a rendezvous in the pool file only revocations and the lease are signed, for the client
-proxy to pass on.
+If the pool file has no rendezvous, only revocations and the lease are signed, for the client proxy
+to pass on.
 """
 
 import datetime
@@ -47,7 +47,7 @@ class ManagerRecords:
     def look(
         self, endpoints: tuple[str, ...], membership: Membership | None, lease: ServingLease
     ) -> None:
-        """Publish changes to these rendezvous."""
+        """Publish changes at these rendezvous, and sign new announcements."""
         self._announce(self._revoked if membership is None else membership.revoked, lease)
         if endpoints != self._endpoints:
             self.close()
@@ -81,7 +81,7 @@ class ManagerRecords:
         return self._announced
 
     def _announce(self, more: frozenset[str], lease: ServingLease) -> None:
-        """Sign what is new, for the client proxy to pass on: there may be no rendezvous."""
+        """Sign new records for the client proxy to pass on: there may be no rendezvous."""
         revoked, last = self._revoked | more, self._lease
         pause_s = min(_LEASE_EVERY_S, _LEASE_SHARE * lease.lasts_s)
         if revoked == self._revoked and last is not None and abs(lease.at - last.at) < pause_s:
@@ -90,7 +90,7 @@ class ManagerRecords:
         signer = Signer(self._files.certificate, self._files.key)
         self._leases += 1
         records = [self._record(RecordKind.LEASE, self._leases, to_plain(lease))]
-        if revoked:  # they only grow, so their number counts the writings of one epoch
+        if revoked:  # they only grow in number, so that is their sequence in one epoch
             names = {"names": sorted(revoked)}
             records.append(self._record(RecordKind.REVOCATION, len(revoked), names))
         cache.write(self._paths.announcements, [sign_record(one, signer) for one in records])
@@ -123,7 +123,7 @@ class ManagerRecords:
         return Reason(Cause.NO_RENDEZVOUS, words="; ".join(details))
 
     def close(self) -> None:
-        """Leave. Repeatable."""
+        """Disconnect from the rendezvous. Repeatable."""
         client, self._client = self._client, None
         if client is not None:
             client.close()

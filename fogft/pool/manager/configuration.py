@@ -31,7 +31,7 @@ from fogft.pool.manager.reconciler import bare_order
 from fogft.poolfile import config_file
 
 _BESIDE = PoolPaths(Path())  # files in the folder of a configuration
-# What a certificate lasts beyond the end of a pool that has one.
+# How long a certificate outlasts a pool with `max_hours`.
 MARGIN_DAYS = 30.0
 _CLIENT_HEADING = (
     "A client proxy, or a gateway. It is read again whenever it changes. Paths are relative to\n"
@@ -41,7 +41,7 @@ _RENDEZVOUS_HEADING = (
     "A rendezvous, for `fogft rendezvous --config`. It needs a port that robots and replicas can\n"
     "reach, and carries no requests. Paths are relative to this file's folder."
 )
-# Either one ends: `fogft serve` starts both again.
+# If either one ends, `fogft serve` restarts both.
 _RUN_GATEWAY = """\
 python3 -m fogft rendezvous --config "$FOGFT_FILES/rendezvous.yaml" &
 python3 -m fogft gateway --config "$FOGFT_FILES/gateway.yaml" &
@@ -73,7 +73,7 @@ def write_proxy_config(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> 
 def proxy_config(
     identity: Identity, spec: PoolSpec, *, name: str = "", role: Role = Role.ROBOT
 ) -> str:
-    """Return a client proxy's configuration, or a gateway's; this robot's unless named."""
+    """Return the configuration of a client proxy or gateway; this machine's without a `name`."""
     config = ClientProxyConfig(
         pool=identity.name,
         pool_uid=identity.uid,
@@ -87,14 +87,14 @@ def proxy_config(
         rendezvous=spec.rendezvous,
         records=_BESIDE.records,
     )
-    if role is Role.ROBOT:  # a gateway's replicas hear the manager through a rendezvous
+    if role is Role.ROBOT:  # a gateway's replicas hear from the manager through a rendezvous
         config = replace(
             config,
             announcements=_BESIDE.announcements,
             rmw=spec.rmw.robot,
             topics=spec.topics,
         )
-    if not name:  # what belongs to this machine
+    if not name:  # settings of this machine
         door = "" if spec.gateway.launch else spec.dial_in
         config = replace(config, dial_in=door, uplinks=spec.uplinks, metrics=spec.metrics.proxy)
     return config_file.document(config, _CLIENT_HEADING)
@@ -122,7 +122,7 @@ def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder
 def build_order(
     paths: PoolPaths, identity: Identity, spec: PoolSpec, planned: PlannedLaunch, signed: bytes
 ) -> Launch:
-    """Return the order of a planned launch, with `signed` records and all else that it needs."""
+    """Return the complete order of a planned launch, including the manager's `signed` records."""
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
     holder = holder_of(id.certificate_name)
     issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
@@ -148,10 +148,10 @@ def gateway_order(
     *,
     signed: bytes,
 ) -> Launch:
-    """Return the order of the machine of the pool's own gateway, which also has a rendezvous.
+    """Return the order of the machine that runs the pool's own gateway and a rendezvous.
 
-    To a cloud it is a replica, which ends with its lease. It serves nothing: its `run` is the two.
-    The gateways before it are revoked.
+    To a cloud it is a replica, which ends with its lease. It offers no service: its `run` starts
+    the gateway and the rendezvous. The certificates of earlier gateways are revoked.
     """
     id = ReplicaId(identity.uid, GATEWAY_SLOT, generation)
     ledger, days = Ledger(paths.credentials), certificate_days(spec)
@@ -223,7 +223,7 @@ def gateway_order(
 def replica_config(
     identity: Identity, spec: PoolSpec, id: ReplicaId, *, announcements: bool = False
 ) -> str:
-    """Return a replica's configuration, with what the manager has signed beside it or not."""
+    """Return a replica's configuration; `announcements`: a file of signed records comes with it."""
     envs = spec.task.get("envs") or {}
     config = ServerProxyConfig(
         pool=identity.name,
@@ -239,7 +239,7 @@ def replica_config(
         records=Path("records.json"),
         announcements=_BESIDE.announcements if announcements else None,
         dial_out=(spec.dial_in,) if spec.dial_in else (),
-        # Those that the manager launches may share an address; others have one of their own.
+        # Replicas that the manager launches may share an address; others have their own.
         metrics=spec.metrics.of_replica(id.slot if id.slot < FIRST_BY_HAND else 0),
         topics=spec.topics,
         rmw=spec.rmw.replica,
@@ -274,7 +274,7 @@ def _absolute(path: str, base: Path) -> str:
 
 
 def with_build(task: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a task that builds its workspace if it has one and no `setup`."""
+    """Return a task whose `setup` builds its ROS workspace, if it has one and no `setup`."""
     workdir = None if task.get("setup") else task.get("workdir")
     if isinstance(workdir, str) and any(Path(workdir, "src").rglob("package.xml")):
         return {**task, "setup": (template_files.folder() / "workspace.sh").read_text()}

@@ -1,9 +1,9 @@
 """Round trips from the robot to regions, from the best known source.
 
-A link only refines what is known of a region otherwise: where nothing else is known, a region with
-a replica would look nearer than all others.
+The round trip of a link only refines a distance that is known otherwise: without that rule, a
+region with a replica would look closer than regions without a known distance.
 
-Not here: what they are for (`fogft.planning.listing`).
+Not here: the use of round trips (`fogft.planning.listing`).
 """
 
 import csv
@@ -73,7 +73,7 @@ def estimated_rtt_s(here: tuple[float, float], there: tuple[float, float]) -> fl
 class Distance:
     """A round trip and its source: ``pool file``, ``links``, ``measured`` or ``estimated``.
 
-    `as_of` is when it was measured, in seconds since the epoch; 0 where that means nothing.
+    `as_of` is when it was measured, in seconds since the epoch; 0 if that does not apply.
     """
 
     rtt_s: Annotated[float, within(1e-9, 60)]
@@ -113,7 +113,7 @@ class Latencies:
             return {}
 
     def stale(self, regions: Collection[str]) -> list[str]:
-        """Return the regions to measure: never measured, a day ago, or in the future."""
+        """Return the regions to measure: not measured yet, over a day ago, or in the future."""
         kept, now = self.measured(), self.clock()
         return sorted(
             region
@@ -202,7 +202,7 @@ class Distances:
     def _from_links(
         self, machines: Sequence[Machine], links: Sequence[LinkReport]
     ) -> dict[str, float]:
-        """Return the median of the last round trips by region: one slow probe moves nothing."""
+        """Return the median of the last round trips by region: one slow probe changes nothing."""
         where = {m.id: f"{m.placement.cloud}/{m.placement.region}" for m in machines}
         for link in links:
             if link.rtt_s is not None and link.state is LinkState.UP and link.id in where:

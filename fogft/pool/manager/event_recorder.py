@@ -1,6 +1,6 @@
-"""Write into the history what became of each replica, and why.
+"""Record in the history what happened to each replica, and why.
 
-Not here: what events mean (`planning.observed.history`), and those of the clock (`timekeeping`).
+Not here: what events mean (`planning.observed.history`), and clock events (`timekeeping`).
 """
 
 import logging
@@ -17,16 +17,16 @@ log = logging.getLogger(__name__)
 
 
 class EventRecorder:
-    """Adds to a pool's history. Events are on disk before a method returns, or `StateError`.
+    """Adds events to a pool's history: on disk before a method returns, or it raises `StateError`.
 
-    `clock` gives the observation's time: the plan that follows must not take a loss for something
-    of the future, and go to the same place again.
+    `clock` gives the time of the observation: otherwise the plan that follows would ignore a loss
+    as an event in the future, and choose the same location again.
     """
 
     def __init__(self, store: PoolStore, clock: Callable[[], float]) -> None:
         self._store = store
         self._clock = clock
-        self._faults: dict[ReplicaId, Reason] = {}  # when they were judged last
+        self._faults: dict[ReplicaId, Reason] = {}  # by the last `health`
 
     def add(
         self,
@@ -66,7 +66,7 @@ class EventRecorder:
         for judged in health.replicas:
             machine, record = judged.machine, judged.record
             id = machine.id
-            if record is None or record.closed is not None:  # the cloud's list is the record
+            if record is None or record.closed is not None:  # the cloud's list decides
                 place = machine.placement
                 self.add(
                     EventKind.LAUNCH,

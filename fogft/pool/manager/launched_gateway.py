@@ -1,4 +1,4 @@
-"""What the manager knows of the gateway that a pool launches for itself, and its next step.
+"""Track the gateway that a pool launches for itself, and return the next step for it.
 
 Not here: the decision (`planning.gateway`), and carrying it out (`reconciler`).
 """
@@ -23,7 +23,7 @@ ASK_EVERY_S = 10.0
 
 @dataclass
 class LaunchedGateway:
-    """The gateway of one pool; `is_up`: the robot reaches it at a time; `place` stores its host."""
+    """The gateway of one pool; `is_up`: whether the robot reaches it; `place` stores its host."""
 
     cloud: Cloud
     is_up: Callable[[float], bool]
@@ -32,7 +32,7 @@ class LaunchedGateway:
     up_at: float | None = field(default=None, init=False)  # when the robot reached it last
     _asked_at: float = field(default=-math.inf, init=False)
     _looked_at: float = field(default=-math.inf, init=False)
-    _watched_since: float = field(default=0.0, init=False)  # nobody knows what was before
+    _watched_since: float = field(default=0.0, init=False)  # not observed before
 
     def look(
         self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
@@ -55,19 +55,19 @@ class LaunchedGateway:
         return step
 
     def is_doubted(self, now: float) -> bool:
-        """Whether the cloud is to be asked about it: it was reached, and is not. Not too often."""
+        """Whether to query the cloud now: the gateway was reachable, and is not any more."""
         due = self.up_at not in (None, now) and not 0 <= now - self._asked_at < ASK_EVERY_S
         self._asked_at = now if due else self._asked_at
         return due
 
 
 def planned(cloud: Seller, spec: PoolSpec) -> tuple[PlannedLaunch, ...]:
-    """Return the launch of a pool's first gateway; none where it launches none."""
+    """Return the launch of a pool's first gateway; empty if it launches none."""
     sold = offered(cloud, spec)[:1] if spec.gateway.launch else ()
     return tuple(PlannedLaunch(GATEWAY_SLOT, 1, offer, Reason(Cause.NEW_SLOT)) for offer in sold)
 
 
 def offered(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
-    """Return what is sold for its machine, the cheapest first."""
+    """Return the offers for the gateway's machine, the cheapest first."""
     sold = cloud.offers(resources(spec))
     return tuple(sorted(sold, key=lambda o: (o.usd_per_hour, o.placement)))

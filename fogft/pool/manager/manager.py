@@ -1,6 +1,6 @@
 """The manager: one process per pool that reconciles once a second or on a change.
 
-SIGTERM ends the managing, never the pool: replicas and the client proxy run on, and the
+SIGTERM ends the manager, never the pool: replicas and the client proxy keep running, and the
 next manager takes over what it finds.
 
 Owns: the loop, what wakes it, and the pool's status file.
@@ -59,7 +59,7 @@ T = TypeVar("T")
 TICK_S = 1.0
 WATCH_S = 0.05
 CERTIFY_EVERY_S = 3600.0
-RUN_ENDED_S = 300.0  # from the end of `run` to that of its machine
+RUN_ENDED_S = 300.0  # from the end of `run` to the end of its machine
 LEAVE_LIMIT_S = 60.0  # then it is tried again in the next round
 
 
@@ -68,9 +68,9 @@ class Manager:
     """Manages one pool until told to stop. Holds the pool's lease from the start.
 
     Args:
-        proxy_command: What to start as client proxy, in place of our own.
+        proxy_command: The command to start instead of our own client proxies.
         metrics: ``host:port`` to answer Prometheus at; None for the pool file's.
-        keeps_proxy: Whether it starts client proxies; else somebody else does.
+        keeps_proxy: Whether it starts client proxies; if not, systemd or the user does.
     """
 
     store: PoolStore
@@ -151,13 +151,13 @@ class Manager:
         self._lease.release()
 
     def _let_go(self) -> bool:
-        """Leave a pool that has ended; return false where an `up` has just given it more hours.
+        """Stop managing a pool that has ended; return False if `up` has just given it more hours.
 
-        An `up` comes before, or finds nobody who manages the pool: it would rely on us.
+        An `up` comes first, or finds no manager: it must not rely on one that is about to stop.
         """
         lock = disk.Lock(self._paths.intent_lock)
         if not lock.acquire(wait=False):
-            return False  # somebody changes the pool: look again
+            return False  # a command is changing the pool: look again
         try:
             is_over = lifetime.is_over(self.store.spec(), self._begun_at(), time.time())
             if is_over:
@@ -168,7 +168,7 @@ class Manager:
             lock.release()
 
     def _work(self) -> bool:
-        """Do one round, each step again in the next if it fails; return whether the pool ended."""
+        """Do one round; failed steps are retried in the next. Return whether the pool ended."""
         self._trouble = []
         for step in (self._lease.beat, self._step_back, self._bound_logs, self._keep_proxy):
             self._attempt(step)
@@ -189,7 +189,7 @@ class Manager:
         return False
 
     def _step_back(self) -> None:
-        """Leave the pool, as an export does, where another machine took it over later."""
+        """Give up the pool, as an export does, if another machine has taken it over later."""
         report = self._fresh_report(time.time())
         heard = max(self._records.newest_epoch, report.manager_epoch if report else 0)
         if not supersedes(heard, self._lease.epoch):
@@ -198,7 +198,7 @@ class Manager:
         proxy_supervisor.forbid_restart(self._paths)
         with shutdown.without_orders(self._paths, self.store.spec(), lambda _: None):
             os.replace(self._paths.identity, self._paths.exported)
-        self.store.identity()  # which says so
+        self.store.identity()  # raises PoolBusy
 
     def _bound_logs(self) -> None:
         for path in (self._paths.manager_log, self._paths.proxy_log):
@@ -237,7 +237,7 @@ class Manager:
     def _discover(self, tick: Tick) -> None:
         if self._discovery.look(tick.spec, tick.observed, tick.plan.wanted):
             log.info("services_discovered pool=%s", self._identity.name)
-            self._wake.set()  # the client proxy is to know
+            self._wake.set()  # to tell the client proxy
 
     def _charge(self, tick: Tick) -> None:
         seen = tick.observed
@@ -249,7 +249,7 @@ class Manager:
             )
 
     def _leave(self) -> None:
-        """See to it that nothing of a pool that ends by itself is left but its folder."""
+        """Remove everything except the folder of a pool that ends by itself."""
 
         def done(what: str) -> None:
             log.info("ended pool=%s what=%r", self._identity.name, what)
@@ -269,7 +269,7 @@ class Manager:
             return step()
         except (PoolNotFound, PoolBusy):
             raise
-        except (FogftError, OSError) as error:  # no room, no descriptor, a folder that is gone
+        except (FogftError, OSError) as error:  # disk full, no descriptors, folder gone
             message = error.message if isinstance(error, FogftError) else str(error)
             log.error("manager_step_failed reason=%r", message)
             self._trouble.append(Reason(Cause.TROUBLE, words=message))
@@ -322,7 +322,7 @@ class Manager:
         )
         if seen.cloud_reachable:
             self._replicas = seen.replicas
-        else:  # show what was seen last; `cloud_reachable` says how it is meant
+        else:  # show the last known replicas; `cloud_reachable` says that they are old
             seen = replace(seen, replicas=self._replicas)
         seen = seen.joined(report, proxy_alive=fresh, links=tick.observed.links)
         if ended:

@@ -1,6 +1,6 @@
 """Get a cloud's offers for each group of a pool.
 
-Owns: telling whose offer is whose.
+Owns: assigning offers to groups.
 Not here: what a cloud sells (`fogft.cloud`) and which is chosen (`fogft.planning.placement`).
 """
 
@@ -34,7 +34,7 @@ def ask(cloud: Seller, spec: PoolSpec) -> tuple[Offer, ...]:
 
 
 def _priced(offer: Offer, spec: PoolSpec) -> Offer:
-    """Return an offer with what leaves one replica, where the file says what is asked of it."""
+    """Return an offer with one replica's egress cost added, if the file gives its traffic."""
     price = egress_price(offer.placement.cloud)
     if not price or not any(one.traffic.response_bytes for one in spec.services):
         return offer

@@ -1,10 +1,10 @@
-"""Slow cloud calls, off the manager's loop; never two at once for one replica.
+"""Run slow cloud calls outside the manager's loop; never two at once for one replica.
 
-An operation stays in the list until its outcome was collected, so whoever takes the list
+An operation stays in the list until its outcome is collected, so a caller that takes the list
 *before* asking the cloud what exists misses nothing: an order is either still in the list
 or already in the cloud's.
 
-Not here: what to order (`reconciler`) and the threads (the `Submit` that comes in).
+Not here: what to order (`reconciler`) and the threads (the `Submit` that is passed in).
 """
 
 import logging
@@ -42,7 +42,7 @@ class Operations(Generic[T]):
         self._outcomes: list[Outcome[T]] = []
 
     def busy(self) -> Mapping[ReplicaId, T]:
-        """Return the operations that run, or have ended but are not collected."""
+        """Return the operations that are running, or have ended but are not collected."""
         with self._lock:
             return dict(self._busy)
 
@@ -73,5 +73,5 @@ class Operations(Generic[T]):
             error = failed
         with self._lock:
             self._outcomes.append(Outcome(id, subject, error))
-        del error  # its traceback holds this frame: neither is to keep the other alive
+        del error  # its traceback holds this frame: break the reference cycle
         self._on_done()

@@ -28,9 +28,9 @@ def wait_for(condition: Callable[[], bool], limit_s: float) -> bool:
 def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0) -> int | None:
     """End the process that holds a lock by SIGTERM, then SIGKILL; return its pid, or None.
 
-    Returns when it is gone, not only its lock: a process lets go of what it holds, and may
-    hang only then. Another that waited for the lock may hold it by then. `only` is the one process
-    that may be ended; each signal is given `patience_s`.
+    Returns when the process is gone, not only its lock: it may release the lock and then hang.
+    By then, a process that waited for the lock may hold it. `only` is the one process that may be
+    ended; each signal gets `patience_s`.
     """
     pid = disk.holder(lock)
     if pid is None or pid == os.getpid() or only not in (None, pid):
@@ -39,13 +39,13 @@ def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0)
 
         def gone() -> bool:
             if descriptor is not None and not poll.is_ready(descriptor):
-                return False  # it has not ended; a zombie has
+                return False  # still running; a zombie is not
             return not disk.is_locked(lock) or disk.holder(lock) not in (None, pid)
 
         for number in (signal.SIGTERM, signal.SIGKILL):
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 _send(pid, descriptor, number)
-                _send(pid, descriptor, signal.SIGCONT)  # one that is stopped would never hear of it
+                _send(pid, descriptor, signal.SIGCONT)  # a stopped process would not handle it
             if wait_for(gone, patience_s):
                 break
     return pid
@@ -54,7 +54,7 @@ def end_holder(lock: Path, *, only: int | None = None, patience_s: float = 10.0)
 def call_at_end(pid: int, call: Callable[[], None]) -> None:
     """Call a function on its own thread when a process, child or not, has ended.
 
-    At once where it has gone; never where the kernel cannot tell (older than 5.3).
+    At once if it is gone already; never if the kernel cannot tell (older than 5.3).
     """
 
     def wait() -> None:
@@ -77,10 +77,10 @@ def _send(pid: int, descriptor: int | None, number: signal.Signals) -> None:
 
 @contextlib.contextmanager
 def _opened(pid: int) -> Iterator[int | None]:
-    """Yield what stays this process, even if its number is given to another; None if unknown."""
+    """Yield a pidfd, which stays with this process even if its pid is reused; None if unknown."""
     try:
         descriptor = os.pidfd_open(pid)
-    except (OSError, AttributeError):  # it has gone, or the kernel or Python cannot
+    except (OSError, AttributeError):  # it is gone, or pidfds are not supported
         yield None
         return
     try:

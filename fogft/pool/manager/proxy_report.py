@@ -66,10 +66,10 @@ class TopicCounted:
     """The counters of a topic's messages.
 
     Attributes:
-        messages: Published by the robot's nodes; or by replicas', each replica's counted.
-        passed: Published on the other side: of the robot's, by one replica at least.
-        dropped: Too many for a replica, or another replica's copy.
-        trouble: Why none pass; empty while they may.
+        messages: Published by the robot's nodes, or by replicas' nodes (each replica counts).
+        passed: Published on the other side; for the robot's messages, by at least one replica.
+        dropped: Too many for a replica, or a copy of another replica's message.
+        trouble: Why no messages pass; empty while they can.
     """
 
     messages: Count = 0
@@ -87,7 +87,7 @@ class ProxyReport:
     Attributes:
         written_at: Seconds since the epoch, by the same machine's clock.
         services: Service name -> its counters, as the proxy wrote them.
-        manager_epoch: The newest that it has heard of, on this machine or another.
+        manager_epoch: The newest manager epoch that it has heard of, of this machine or another.
     """
 
     pid: int

@@ -1,9 +1,9 @@
-"""Keep a client proxy, its standby and a spare running; they live on when the manager goes.
+"""Keep a client proxy, its standby and a spare running; they keep running when the manager ends.
 
-Who is in line takes over by itself, and the spare leaves another (`proxy.robot.standby`): here they
-are started where the line has no end, and adopted where they run already.
+The next in line takes over by itself, and a spare that moves up leaves a new one behind it
+(`proxy.robot.standby`). Here, a missing end of the line is started, and running ones are adopted.
 
-Owns: killing what hangs, too, and `manager.json` (`fogft.proxy.robot.manager_restart`).
+Owns: killing hung proxies, and `manager.json` (`fogft.proxy.robot.manager_restart`).
 Not here: its configuration (`configuration`).
 """
 
@@ -28,10 +28,10 @@ log = logging.getLogger(__name__)
 
 BACKOFF_S = 1.0
 BACKOFF_LIMIT_S = 30.0
-STEADY_S = 5.0  # one that ran so long is no failure
+STEADY_S = 5.0  # a proxy that ran this long did not fail
 HANGS_AFTER_S = 10.0
-START_LIMIT_S = 20.0  # one that has no place by then will not get one
-MOVING_UP_S = 1.0  # while others run
+START_LIMIT_S = 20.0  # a proxy without a place in line by then gets none
+MOVING_UP_S = 1.0  # how long the line may be short while others run
 
 
 @dataclass(eq=False)
@@ -39,7 +39,7 @@ class ProxySupervisor:
     """Supervises a pool's client proxies; `look` is called in each tick.
 
     Args:
-        command: What to start, alone; ``python -m fogft proxy --config ...`` unless told.
+        command: A single process to start; by default a line of ``python -m fogft proxy ...``.
         ended: Called, from any thread, when a proxy has ended: then `look` is due at once.
     """
 
@@ -59,13 +59,13 @@ class ProxySupervisor:
         locks = self.paths.proxy_lock, self.paths.standby_lock, self.paths.spare_lock
         self._hanging = {lock: Hanging(HANGS_AFTER_S, self.clock) for lock in locks}
         self._places = locks if self.command is None else locks[:1]
-        self._sessions: set[int] = set()  # of what was started, and its copies
+        self._sessions: set[int] = set()  # of started proxies and their copies
         self._complete_at = float("-inf")
         self._next_at = 0.0
         self._failures = 0
         self._last_end = ""
         self._serving = 0
-        self.replacements = 0  # how often another one was seen to serve than the one before
+        self.replacements = 0  # how often the serving proxy was seen to change
 
     def look(self, *, outdated: bool = False) -> bool:
         """Start missing proxies, and replace those of another version; return whether one works."""
@@ -101,7 +101,7 @@ class ProxySupervisor:
         return True
 
     def _end_outdated(self, line: Sequence[int | None]) -> None:
-        """End the last in line that is not ours; others only once one of ours is behind them."""
+        """End the last proxy in line that is not ours; others only once one of ours is behind."""
         for pid in reversed(line):
             if not pid:
                 return
@@ -115,7 +115,7 @@ class ProxySupervisor:
             return
 
     def _holder(self, lock: Path) -> int | None:
-        """Return who holds a lock, 0 for somebody unknown, None for nobody; hear of its end."""
+        """Return the pid that holds a lock, 0 if unknown, None for nobody; watch for its end."""
         pid = disk.holder(lock)
         if pid is None:
             return 0 if disk.is_locked(lock) else None
@@ -154,7 +154,7 @@ class ProxySupervisor:
 
 
 def allow_restart(paths: PoolPaths, environ: Mapping[str, str] = os.environ) -> None:
-    """Record how to restart this process should it die."""
+    """Record how to restart this process if it dies; under systemd, that it must not be."""
     if environ.get("NOTIFY_SOCKET"):
         forbid_restart(paths)
         return
@@ -162,7 +162,7 @@ def allow_restart(paths: PoolPaths, environ: Mapping[str, str] = os.environ) -> 
         "command": [sys.executable, *sys.orig_argv[1:]],
         "folder": os.getcwd(),
         "lock": paths.manager_lock.name,
-        "changing": paths.intent_lock.name,  # while it is held, somebody may be ending the pool
+        "changing": paths.intent_lock.name,  # while it is held, a command may be ending the pool
         "log": paths.manager_log.name,
     }
     disk.write_json(paths.manager_start, value)

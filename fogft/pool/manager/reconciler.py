@@ -1,7 +1,7 @@
 """The reconciler: observe, plan and apply, each tick from the current state.
 
-Owns: the order of reading and writing within a tick, so that one killed at any point leaves nothing
-that its successor does not repair.
+Owns: the order of reading and writing within a tick, so that a tick killed at any point leaves
+nothing that the next one does not repair.
 Not here: the decisions (`fogft.planning.planner`), the loop and the processes (`manager`).
 """
 
@@ -66,8 +66,8 @@ class Tick(NamedTuple):
     """The observations and decisions of one tick.
 
     Attributes:
-        over: Its hours are used up: the pool ends by itself.
-        update: The update under way, or the one that was given up; None where there is none.
+        over: The pool's `max_hours` have passed: it ends by itself.
+        update: The update under way, or the one that was given up; None without one.
     """
 
     identity: Identity
@@ -100,8 +100,8 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
 class Reconciler:
     """Reconciles one pool with its spec.
 
-    `by_hand` are the replicas that are still let in; `gateways` has the generations of each one's
-    good certificates, by name; `gateway` is the one that the pool may launch.
+    `by_hand` returns the manually started replicas with valid certificates; `gateways` returns the
+    generations of each gateway's valid certificates, by name; `gateway` is the one to launch.
     """
 
     cloud: Cloud
@@ -132,23 +132,23 @@ class Reconciler:
         self.timekeeping = Timekeeping(self.store, self._updating, self.clock)
         self._recorder = EventRecorder(self.store, lambda: self.timekeeping.now)
         self._membership: Membership | None = self.store.membership()
-        self._published_for: tuple[Any, ...] | None = None  # what it follows from
+        self._published_for: tuple[Any, ...] | None = None  # its inputs
         self._log_tail = ""  # of the last replica that was ended because it was never ready
 
     def tick(self) -> Tick:
         """Observe, plan and apply once.
 
         Raises:
-            StateError: Something cannot be read or written; nothing was launched for it.
+            StateError: A file cannot be read or written; the launch concerned was not ordered.
         """
-        if self.timekeeping.look():  # first: who waits for a change trusts what is dated after it
+        if self.timekeeping.look():  # first: `renewed` relies on all else being observed later
             self._silent = Silent()
         identity, spec, intent = self.store.identity(), self.store.spec(), self.store.intent()
         history = self.store.history()
         self._settle_outcomes()
         observed, trouble = self._observe(identity, spec)
         asked, (spec, trial) = spec, self._updating.look(identity.uid, observed, history)
-        if spec is not asked:  # rolled back: what is sold to it may differ
+        if spec is not asked:  # rolled back: its offers may differ
             observed, trouble = self._observe(identity, spec)
         health, judged_at = None, 0
         if observed.machines is not None:
@@ -156,7 +156,7 @@ class Reconciler:
             self._ask_about_silent(observed, history)
             health, judged_at = judge(identity.uid, spec, observed, history), history.version
             self._recorder.health(health, history)
-        if history.version != judged_at:  # it remembers more now: judge by all of it
+        if history.version != judged_at:  # events were added: judge again
             health = None
         begun_at = lifetime.begun_at(intent, identity.created_at, history)
         trouble += lifetime.notes(spec, begun_at, observed.now)
@@ -233,7 +233,7 @@ class Reconciler:
         return seen, trouble
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:
-        """Have the cloud asked about replicas that fell silent, where its list is from memory."""
+        """Query the cloud about replicas that fell silent, if it caches its list."""
         cloud = self._refreshing
         if cloud is None:
             return
@@ -254,7 +254,7 @@ class Reconciler:
         if known is None or known[0] != key or not 0 <= now - known[1] < OFFERS_EVERY_S:
             try:
                 sold = offers.ask(self.cloud, spec)
-                if sold != self._offers:  # the planner keeps what it worked out of a tuple
+                if sold != self._offers:  # else keep the tuple: the planner caches by it
                     self._offers = sold
                 self._offers_for = (key, now)
             except FogftError as error:
@@ -266,7 +266,7 @@ class Reconciler:
     def _tend_gateway(
         self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
     ) -> Reason | None:
-        """See to the gateway that the pool launches; return why no replica is launched before."""
+        """Manage the gateway that the pool launches; return why replicas must wait, if so."""
         if self.gateway is None or not (spec.gateway.launch or observed.gateway):
             return None
         step = self.gateway.look(spec, intent, observed, history)
@@ -278,7 +278,7 @@ class Reconciler:
             was_up = record is not None and record.first_ready_at is not None
             if is_seen and not was_up:
                 self._recorder.add(EventKind.READY, machine.id)
-            elif is_doubted and was_up and cloud is not None:  # one that boots is left alone
+            elif is_doubted and was_up and cloud is not None:  # not while it boots
                 ask = functools.partial(cloud.refresh, machine.id)
                 self._refreshes.start(machine.id, None, ask)
         for id, reason in step.ends:
@@ -335,7 +335,7 @@ class Reconciler:
         gateways = self.gateways() if spec.topology else {}
         ending = {end.id for end in plan.terminations} | observed.ending
         machines = observed.machines or ()
-        if found is Found.BY_CLOUD:  # others can be found by nobody
+        if found is Found.BY_CLOUD:  # others cannot be found
             machines = tuple([m for m in machines if m.endpoint is not None])
         cause = spec, machines, plan.draining, ending, revoked, by_hand, gateways
         if cause == self._published_for:
@@ -401,7 +401,7 @@ class Reconciler:
             self.operations.start(id, None, lambda: self._stop(stopped))
 
     def _stop(self, order: Launch) -> None:
-        """Stop a machine, off the loop; end it where its cloud cannot stop it."""
+        """Stop a machine, outside the loop; end it if its cloud cannot stop it."""
         try:
             if self._stopping is not None:
                 self._stopping.stop(order)
@@ -412,7 +412,7 @@ class Reconciler:
             self.cloud.terminate(order.id)
 
     def _end(self, id: ReplicaId, *, keep_log: bool) -> None:
-        """End a machine, off the loop; keep the end of its log where it says why it goes."""
+        """End a machine, outside the loop; with `keep_log`, keep the tail of its log."""
         if keep_log:
             with contextlib.suppress(CloudError):
                 path = self.cloud.log(id)
@@ -420,7 +420,7 @@ class Reconciler:
         self.cloud.terminate(id)
 
     def _with_log(self, note: Reason) -> Reason:
-        """Return a note with the log of what was never ready."""
+        """Return a note; if it is about a replica that was never ready, with its log."""
         hopeless = note.cause is Cause.NEVER_READY and self._log_tail
         if not hopeless or fault_of(note.because[0]) is not Cause.NOT_READY:
             return note
@@ -428,7 +428,7 @@ class Reconciler:
 
 
 def _slack(spec: PoolSpec, observed: Observed, plan: Plan) -> float | None:
-    """Return by how much each launch may cost more than planned; None where there is no cap."""
+    """Return how much more than planned each launch may cost; None without a cap."""
     cap = cap_usd(spec, observed)
     if cap is None or not plan.launches:
         return None
@@ -439,11 +439,11 @@ def _slack(spec: PoolSpec, observed: Observed, plan: Plan) -> float | None:
 
 
 def _refusal(error: Exception) -> Cause | None:
-    """Return the cause of a refused launch; None when it may have been launched all the same."""
+    """Return the cause of a refused launch; None if the machine may exist nevertheless."""
     if isinstance(error, NoCapacity):
         return Cause.CAPACITY
     if isinstance(error, QuotaExceeded):
         return Cause.QUOTA
     if isinstance(error, CloudError) and type(error) is not CloudError:
-        return None  # unreachable: the cloud's list will tell
+        return None  # unreachable: the cloud's list will show it
     return Cause.ERROR

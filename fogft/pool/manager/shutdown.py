@@ -1,10 +1,10 @@
-"""What `down` does: end everything of a pool, with or without its manager.
+"""``fogft down``: end everything of a pool, with or without its manager.
 
-Manager first (it would repair what we end), then the client proxy, the machines and the folder.
-Stopped half-way, it can be run again. It takes each lock from the process that it ends, and keeps
-it: what is only starting finds its place taken and ends.
+The manager ends first (it would repair what we end), then the client proxy, the machines and the
+folder. If interrupted, `down` can be run again. It takes each lock from the process that it ends,
+and keeps it: a process that is just starting finds the lock taken and exits.
 
-Not here: the machines, and the proof that none is left (`teardown`).
+Not here: ending the machines, and verifying that none is left (`teardown`).
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import process_control, teardown
 
 LIMIT_S = 600.0
-_TRIES = 4  # as many may wait for a lock: a standby, and what each of its starters began
+_TRIES = 4  # processes that may wait for a lock: a standby, and one by each of its starters
 
 
 def end(
@@ -34,14 +34,14 @@ def end(
     warned: Callable[[str], None] = lambda _: None,
     limit_s: float = LIMIT_S,
 ) -> None:
-    """Shut a pool down; of one that another machine manages, only what is left here.
+    """Shut a pool down; of a pool that another machine manages, only what is left here.
 
-    `told` hears of each thing as it has ended, `warned` of what could not be made certain.
+    `told` is called with each thing that has ended, `warned` with what could not be verified.
 
     Raises:
         PoolNotFound: There is no such pool (any more).
-        CloudUnreachable: It is not known what is left; run it again.
-        FogftError: Something did not end (the message says what); run it again.
+        CloudUnreachable: It is not known what is left; call this again.
+        FogftError: Something did not end (the message says what); call this again.
     """
     paths = store.paths
     if paths.exported.exists():
@@ -54,8 +54,8 @@ def end(
         except PoolNotFound:
             return  # another `down` was faster
         kept.enter_context(without_manager(paths, told))
-        store.identity()  # it may have stepped back just then
-        # Should this be cut short, whoever manages the pool next goes on ending it.
+        store.identity()  # the manager may have stepped back just now
+        # If this is interrupted, the next manager of the pool continues to end it.
         with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
             before = disk.read_or(paths.intent, Intent())
             store.write_intent(replace(before, stopping=True))
@@ -70,7 +70,7 @@ def end(
         )
         shutil.rmtree(paths.credentials, ignore_errors=True)
         # The identity before the rest: from here on there is no such pool.
-        with contextlib.suppress(OSError):  # what stands in its place is no file
+        with contextlib.suppress(OSError):  # it is not a file
             paths.identity.unlink()
         _remove(paths.folder)
 
@@ -103,7 +103,7 @@ def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Itera
     """End a pool's client proxies; none can start inside this context."""
     with contextlib.ExitStack() as kept:
         kept.enter_context(_taken(lambda _: None, "spare client proxy", paths.spare_lock))
-        # Its place in line stays free until the proxy has gone: it would wait for us to take over.
+        # Leave the standby's lock free until the proxy is gone: it would wait for us to take over.
         process_control.end_holder(paths.standby_lock)
         kept.enter_context(_taken(done, "client proxy", paths.proxy_lock))
         kept.enter_context(_taken(lambda _: None, "standby client proxy", paths.standby_lock))
@@ -121,7 +121,7 @@ def without_orders(paths: PoolPaths, spec: PoolSpec, done: Callable[[str], None]
 
 @contextlib.contextmanager
 def _taken(done: Callable[[str], None], what: str, path: Path) -> Iterator[None]:
-    """Hold a lock; end who holds it, and whoever takes it before us."""
+    """Hold a lock; end the process that holds it, and any that takes it before us."""
     lock = disk.Lock(path)
     for _ in range(_TRIES):
         pid = process_control.end_holder(path)

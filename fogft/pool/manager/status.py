@@ -53,13 +53,13 @@ class ReplicaStatus:
     Attributes:
         verdict: ``good``, ``failed``, ``leaving``, ``unresponsive``, ``stuck``, ``disagrees`` or
             ``at risk``.
-        age_s: Since its launch; None where that was somebody else's.
+        age_s: Time since its launch; None if the manager did not launch it.
         reason: Why the verdict is not ``good``, as ``{cause, ...}``; None when it is.
-        known: Whether `phase` and `link` are known now; else `phase` is what was last seen.
-        has_served: Whether it was ready before: one that is ``starting`` then has lost its
+        known: Whether `phase` and `link` are known now; if not, `phase` is the last one seen.
+        has_served: Whether it was ready before: if it is ``starting`` now, it has lost its
             service, or cannot be reached.
         provisioning_s: From its order until the machine ran; then `setup_s` until `setup` was done
-            and `starting_s` until it was ready. None where it is not known, or not over.
+            and `starting_s` until it was ready. None if it is unknown, or not over.
     """
 
     slot: int
@@ -98,8 +98,8 @@ class ReplicaStatus:
         """Return a copy with the current link report; without one, with unknown link fields.
 
         Args:
-            services: Names of all services: with these it is ready.
-            stale: What the manager last saw says nothing of now.
+            services: Names of all services: a replica with all of these is ready.
+            stale: The manager's last observation is too old.
         """
         if link is None:
             return replace(
@@ -116,7 +116,7 @@ class ReplicaStatus:
         phase = self.phase
         if is_up and (link.ready if stale else services and services <= link.ready):
             is_known = True
-            if stale or phase in _COMING:  # sooner than the manager saw it
+            if stale or phase in _COMING:  # before the manager sees it
                 phase = (Phase.DRAINING if link.draining else Phase.READY).value
         is_judged = self.reason is not None or link.state is LinkState.CONNECTING
         return replace(
@@ -136,7 +136,7 @@ _OF_LINK -= {"detail"}
 
 @dataclass(frozen=True)
 class ServiceStatus:
-    """One service: how many replicas answer it, and the proxy's counters (0 when unknown)."""
+    """One service: how many replicas answer it, and the proxy's counters (0 if unknown)."""
 
     name: str
     type: str
@@ -159,7 +159,7 @@ class TopicStatus:
 class UpdateStatus:
     """An update in progress, or the last one if it was given up: for `fault`, in words.
 
-    `done` are the replicas of the version that is wanted now which serve.
+    `done` counts the serving replicas of the version that is wanted now.
     """
 
     state: str
@@ -212,19 +212,19 @@ class PoolStatus:
     """The status of a pool.
 
     Attributes:
-        cloud_reachable: Whether the cloud could say what exists; if not, `replicas` is
-            what was seen last and `ready` is 0.
-        by_hand: Replicas that people started themselves, beside those of `replicas`.
-        ready: Replicas whose services answer and that are to stay.
-        credentials_end_at: When the cloud's credentials end, in seconds since the epoch; None where
-            no end is known.
+        cloud_reachable: Whether the cloud could say what exists; if not, `replicas` are the
+            last known ones and `ready` is 0.
+        by_hand: Manually started replicas, which are not in `replicas`.
+        ready: The number of replicas whose services answer and that are to stay.
+        credentials_end_at: When the cloud's credentials end, in seconds since the epoch; None if no
+            end is known.
         usd_to_date: What the pool has cost since its first `up`, as the manager saw it.
         notes: Why the pool is not yet as wanted, in sentences.
         reasons: The same, one for each note, as ``{cause, ...}``.
-        version: Of this schema; see `fogft.pool.commands.status`.
-        topology: ``{robot, gateways, robots, through, links}``: who talks through whom, and
-            how this machine's robot finds its gateways; empty where there are none.
-        manager_version: Of fogft, by which the manager runs; empty before 0.2.0.
+        version: The version of this schema; see `fogft.pool.commands.status`.
+        topology: ``{robot, gateways, robots, through, links}``: who connects through whom, and
+            how this machine's robot reaches its gateways; empty without gateways.
+        manager_version: The manager's version of fogft; empty before 0.2.0.
     """
 
     pool: str
@@ -271,9 +271,9 @@ class PoolStatus:
         """Return a copy completed with the client proxy's report.
 
         Args:
-            report: Its last report, however old.
-            links: What is known of links now; None for nothing.
-            stale: What the manager last saw says nothing of now.
+            report: The last report, however old.
+            links: The current links; None if unknown.
+            stale: The manager's last observation is too old.
         """
         up = [link for link in links or () if link.state is LinkState.UP]
         by_id = {(link.id.slot, link.id.generation): link for link in links or ()}

@@ -1,8 +1,8 @@
 """Prometheus metrics of the manager and the rendezvous, and the manager's counters.
 
 Owns: what counts as a launch, a preemption, a loss, a failure, and how long launches take.
-Not here: the history that outlives the manager (`fogft.pool.folder.history_file`), and what
-proxies tell (`fogft.metrics.proxies`).
+Not here: the history that outlives the manager (`fogft.pool.folder.history_file`), and the
+proxies' metrics (`fogft.metrics.proxies`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _PHASES = ("provisioning", "starting", "total")
 
 
 class Tally:
-    """Counts events as they are recorded, and times each launch. One thread."""
+    """Counts events as they are recorded, and times each launch. For one thread."""
 
     def __init__(self) -> None:
         self._launches: Counter[str] = Counter({"spot": 0, "on_demand": 0})
@@ -70,7 +70,7 @@ class Tally:
                 self._running.setdefault(replica, now)
 
     def _preempt(self, replica: str) -> None:
-        """Count a spot machine that was taken, once; any other one that went counts as gone."""
+        """Count a spot machine as preempted, any other one as gone; each once."""
         if replica in self._preempted:
             return
         is_spot = self._ordered.get(replica, (0.0, True))[1]
@@ -100,7 +100,7 @@ class Tally:
             ("failed_launches", "Launches that failed, by cause.", "cause", self._failed),
             ("lost_replicas", "Machines lost without being ended by fogft.", "kind", self._lost),
         ):
-            told = [(n, {label: key}) for key, n in list(counts.items())]  # while more are counted
+            told = [(n, {label: key}) for key, n in list(counts.items())]  # others may be added
             yield counter(f"fogft_pool_{name}_total", help, told)
         yield histogram(
             "fogft_pool_launch_duration_seconds",

@@ -1,7 +1,7 @@
 """End every machine of a pool, verified with the clouds themselves.
 
-Owns: ending them side by side until none is listed, the last look past every memory, and what
-to say when it is not known what still runs.
+Owns: ending machines in parallel until none is listed, the final check without any cache, and the
+message if it is not known what still runs.
 Not here: ending one machine (`fogft.cloud`).
 """
 
@@ -22,7 +22,7 @@ ASK_AGAIN_S = 1.0
 class Known:
     """The machines recorded in a pool's folder, in case its cloud does not answer.
 
-    `running` have not ended as far as was seen, in words; any were ever launched in `clouds`.
+    `running` describes those not known to have ended; `clouds` are all clouds with a launch.
     """
 
     pool: str
@@ -58,8 +58,8 @@ def end_machines(
     """End all machines that carry a pool's uid; return when none is left.
 
     Raises:
-        CloudUnreachable: It is not known what is left; the message lists what may be.
-        FogftError: Some did not end within `limit_s`; the message says which, and why.
+        CloudUnreachable: It is not known what is left; the message lists what may be left.
+        FogftError: Some machines did not end within `limit_s`; the message says which, and why.
     """
     deadline = time.monotonic() + limit_s
     told: set[str] = set()
@@ -85,7 +85,7 @@ def end_machines(
 
 
 def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -> Sequence[Machine]:
-    """Return what exists; once nothing is listed, what the clouds' own lists have beside."""
+    """Return the machines listed; if there are none, those in the clouds' own lists."""
     left = [m for m in cloud.machines(uid) if m.id.pool_uid == uid]
     if left or not isinstance(cloud, Auditing):
         return left
@@ -101,7 +101,7 @@ def _left(cloud: Cloud, uid: str, known: Known, warned: Callable[[str], None]) -
 
 
 def _end(cloud: Cloud, machines: Sequence[Machine]) -> dict[ReplicaId, FogftError]:
-    """End machines side by side; return those that did not end, with why."""
+    """End machines in parallel; return those that did not end, with their errors."""
 
     def terminate(machine: Machine) -> FogftError | None:
         try:

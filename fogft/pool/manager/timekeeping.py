@@ -1,6 +1,6 @@
-"""Take one time for a whole tick, and write into the history where the clock jumped.
+"""Take one time for a whole tick, and record clock jumps in the history.
 
-Not here: what a jump is (`planning.observed.clock_jumps`), what moves then (`history`, `updating`).
+Not here: detecting jumps (`planning.observed.clock_jumps`), shifting times (`history`, `updating`).
 """
 
 import logging
@@ -30,7 +30,7 @@ class Timekeeping:
     def look(self) -> bool:
         """Read the clocks for a tick; return whether the time jumped.
 
-        Raises StateError where a jump cannot be written down; the next look tries again.
+        Raises StateError: a jump cannot be written; the next call tries again.
         """
         reading = self._clock()
         self.now = reading.wall_s
@@ -53,7 +53,7 @@ _TRIES = 10
 
 
 def read() -> Reading:
-    """Read all three clocks at one moment, again where the process was held up between two."""
+    """Read all three clocks at one moment; again if the process was delayed between two."""
     for _ in range(_TRIES):
         awake_s = time.monotonic()
         steady_s = time.clock_gettime(time.CLOCK_BOOTTIME)

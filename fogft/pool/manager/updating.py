@@ -1,9 +1,9 @@
 """Carry out updates of the pool file, and roll back to the last good one.
 
-`up` writes neither the good file nor the trial: another file's digest makes the trial void, so the
-next `up` with a changed file tries again. Killed anywhere, the next tick goes on.
+`up` writes neither the good file nor the trial: a trial is void for a file with another digest, so
+the next `up` with a changed file tries again. After a kill at any point, the next tick continues.
 
-Not here: the judgement (`fogft.planning.rollout`), the files' place (`store`).
+Not here: the judgement (`fogft.planning.rollout`), the files themselves (`store`).
 """
 
 import logging
