@@ -67,7 +67,7 @@ class Placement:
 
     @cached_property
     def location(self) -> str:
-        """``cloud/region/zone``: the unit that can be excluded, full or quarantined."""
+        """``cloud/region/zone``: the unit that can be excluded, full or in backoff."""
         return f"{self.cloud}/{self.region}/{self.zone}"
 
     @cached_property
