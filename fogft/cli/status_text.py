@@ -160,7 +160,7 @@ def troubles(status: PoolStatus) -> list[str]:
         if row.counters.trouble:
             found.append(row.counters.trouble)
         elif not row.heard_by and status.ready:
-            found.append(f"`{row.name}` has no subscriber: no node on a replica subscribes to it")
+            found.append(f"`{row.name}` has no subscriber with compatible QoS on a replica")
     return found
 
 

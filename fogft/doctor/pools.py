@@ -12,7 +12,7 @@ from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.errors import CredentialError, FogftError, StateError
 from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
-from fogft.model.replica import LinkState
+from fogft.model.replica import LinkState, Phase
 from fogft.pool.commands import status
 from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
@@ -187,8 +187,8 @@ def judge_traffic(pool: str, seen: Seen) -> Iterator[Finding]:
         elif not topic.heard_by and seen.answers:
             yield warn(
                 "topics",
-                f"pool `{pool}`: no node on a replica subscribes to `{topic.name}`",
-                "compare its `name` in the pool file with what the nodes of `run` subscribe to",
+                f"pool `{pool}`: `{topic.name}` has no subscriber with compatible QoS on a replica",
+                "compare its `name`, `reliable` and `latched` with what the nodes there ask for",
             )
 
 
@@ -229,6 +229,8 @@ def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
                 if by_hand
                 else f"it is replaced if it stays silent; see `fogft status` and {log}",
             )
+        elif one.detail and one.phase == Phase.READY.value:
+            yield warn("replicas", f"{replica}: {one.detail}", "it is used all the same")
         elif one.detail:
             yield warn(
                 "replicas",

@@ -80,24 +80,23 @@ def domain(_: Situation, environ: Mapping[str, str] = os.environ) -> Iterator[Fi
     else:
         yield ok("ROS domain", f"{text}; your nodes must use the same")
     reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
-    if reach and reach not in _RANGES:
+    if environ.get("ROS_LOCALHOST_ONLY") == "1":
+        yield warn(
+            "discovery range",
+            "ROS_LOCALHOST_ONLY is set, so ROS ignores the range and ROS_STATIC_PEERS",
+            "unset it; ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST does the same",
+        )
+    elif reach and reach not in _RANGES:
         yield fail(
             "discovery range",
             f"ROS_AUTOMATIC_DISCOVERY_RANGE is `{reach}`",
             f"set it to one of {', '.join(_RANGES[:3])}",
         )
-    elif reach == "OFF" and not environ.get("ROS_STATIC_PEERS"):
+    elif reach == "OFF":
         yield fail(
             "discovery range",
-            "ROS_AUTOMATIC_DISCOVERY_RANGE is `OFF` and there are no ROS_STATIC_PEERS: "
-            "nodes cannot discover each other",
+            "ROS_AUTOMATIC_DISCOVERY_RANGE is `OFF`: nodes cannot discover each other",
             "set it to LOCALHOST",
-        )
-    elif environ.get("ROS_LOCALHOST_ONLY"):
-        yield warn(
-            "discovery range",
-            "ROS_LOCALHOST_ONLY is set; newer ROS versions ignore it",
-            "set ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST instead",
         )
     else:
         yield ok("discovery range", reach or "SUBNET (the default)")

@@ -30,6 +30,8 @@ from fogft.model.spec import ServiceSpec
 from fogft.requests.load import Handling
 
 _KEPT = 2048
+_REST_S, _LONGEST_REST_S = 2.0, 300.0
+_SOON_S = 60.0
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 
 
@@ -76,6 +78,8 @@ class UplinksLink:
         # How many uplinks may still report the end of a forgotten or answered request.
         self._may_tell: OrderedDict[bytes, int] = OrderedDict()
         self._current: int | None = None
+        self._up: set[str] = set()  # interfaces
+        self._lost: dict[str, tuple[float, float]] = {}  # when, and for how long others go first
         self._closed = False
         self._links: list[Link] = []
         for interface in dialer.interfaces:
@@ -135,6 +139,7 @@ class UplinksLink:
         policy = self._dialer.policies.get(attempt.service, UplinkPolicy.PREFER)
         taken = False
         usable = [i for i, link in enumerate(self._links) if link.usable and (not by or i in by)]
+        usable.sort(key=self._rests)
         while usable and not taken:
             chosen, current = choose(policy, usable, self._current)
             if policy is UplinkPolicy.FAILOVER:
@@ -147,6 +152,10 @@ class UplinksLink:
             if taken and not attempt.on and self._attempts.get(request_id) is attempt:
                 self._again.append(request_id)
         return taken
+
+    def _rests(self, index: int) -> bool:
+        at, rest_s = self._lost.get(self._links[index].peer.interface, (0.0, 0.0))
+        return time.monotonic() < at + rest_s
 
     def _send_on(self, index: int, request_id: bytes, attempt: _Attempt) -> bool:
         with self._lock:
@@ -267,7 +276,18 @@ class UplinksLink:
             self._events.late(self, answer)
 
     def changed(self, link: Link) -> None:
-        """Report that an uplink has changed."""
+        """Report that an uplink has changed; one that is lost again and again is used last.
+
+        On a path that drops large packets a link opens, and then loses what is sent.
+        """
+        name, now = link.peer.interface, time.monotonic()
+        if link.usable:
+            self._up.add(name)
+        elif name in self._up:
+            self._up.remove(name)
+            at, rest_s = self._lost.get(name, (now, 0.0))
+            rest_s = 0.0 if now > at + 4 * rest_s + _SOON_S else rest_s
+            self._lost[name] = now, min(max(_REST_S, 2 * rest_s), _LONGEST_REST_S)
         self._events.changed(self)
 
 

@@ -168,7 +168,9 @@ class SerialisedNode:
         def create() -> Publisher:
             profile = topic_ends.profile(topic)
             made: Any = self._node.create_publisher(message_type, topic.name, profile)
-            return Publisher(made, shape(message_type), self._withdraw)
+            found = partial(self._node.get_subscriptions_info_by_topic, made.topic_name)
+            mismatch = partial(topic_ends.mismatch, "subscriber", topic, found)
+            return Publisher(made, shape(message_type), self._withdraw, mismatch)
 
         return self._add(topic.name, create)
 
@@ -180,8 +182,9 @@ class SerialisedNode:
             made: Any = self._node.create_subscription(
                 message_type, topic.name, lambda _: None, topic_ends.profile(topic), raw=True
             )
-            publishers = self._node.get_publishers_info_by_topic
-            return Subscription(made, topic, on_message, self._withdraw, publishers)
+            found = partial(self._node.get_publishers_info_by_topic, made.topic_name)
+            mismatch = partial(topic_ends.mismatch, "publisher", topic, found)
+            return Subscription(made, on_message, self._withdraw, mismatch)
 
         return self._add(topic.name, create)
 

@@ -32,18 +32,44 @@ def profile(topic: TopicSpec) -> Any:
     )
 
 
+def mismatch(other: str, topic: TopicSpec, find: Callable[[], Any]) -> str:
+    """Return which `other`, "publisher" or "subscriber", has incompatible QoS, and the remedy."""
+    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+    ours = other == "subscriber"  # we publish
+    reliability = ReliabilityPolicy.RELIABLE if ours else ReliabilityPolicy.BEST_EFFORT
+    durability = DurabilityPolicy.TRANSIENT_LOCAL if ours else DurabilityPolicy.VOLATILE
+    try:
+        found = find()
+    except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
+        return ""
+    for one in found:
+        if one.topic_type != topic.type:
+            return f"a {other} of `{topic.name}` has type `{one.topic_type}`"
+        if topic.reliable is not ours and one.qos_profile.reliability == reliability:
+            why = "asks for reliable messages" if ours else "offers best effort"
+            return f"a {other} of `{topic.name}` {why}: write `reliable: {str(ours).lower()}`"
+        if topic.latched is not ours and one.qos_profile.durability == durability:
+            why = "asks for latched messages" if ours else "is not latched"
+            return f"a {other} of `{topic.name}` {why}: write `latched: {str(ours).lower()}`"
+    return ""
+
+
+@dataclass(eq=False)
 class Publisher:
     """A publisher of a node. Any thread."""
 
-    def __init__(self, publisher: Any, shape: Shape, withdraw: Callable[[Publisher], None]) -> None:
-        self._publisher = publisher
-        self._shape = shape
-        self._withdraw = withdraw
+    publisher: Any
+    shape: Shape
+    withdraw: Callable[[Publisher], None]
+    mismatch: Callable[[], str]  # returns why a subscriber receives nothing; empty if all do
+
+    def __post_init__(self) -> None:
         self._open = True
 
     def check(self, payload: bytes) -> None:
         """Raise Unreadable if bytes are not a message of this type: ROS must not get them."""
-        fault = self._shape.fault(payload)
+        fault = self.shape.fault(payload)
         if fault:
             raise Unreadable(f"{len(payload)} bytes are no message of its type: {fault}")
 
@@ -51,7 +77,7 @@ class Publisher:
         """Publish a checked message; does nothing once withdrawn. Raises RosError."""
         try:
             if self._open:
-                self._publisher.publish(payload)
+                self.publisher.publish(payload)
         except Exception as error:
             if self._open:
                 raise RosError(f"a message cannot be published: {error}") from error
@@ -59,19 +85,19 @@ class Publisher:
     def subscribers(self) -> int:
         """Count the subscriptions that discovery lists."""
         try:
-            return int(self._publisher.get_subscription_count())
+            return int(self.publisher.get_subscription_count())
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
             return 0
 
     def close(self) -> None:
         """Withdraw the publisher; idempotent."""
         self._open = False
-        self._withdraw(self)
+        self.withdraw(self)
 
     def destroy(self, node: Any) -> None:
         """Free all resources. Take loop only, once."""
         self._open = False
-        node.destroy_publisher(self._publisher)
+        node.destroy_publisher(self.publisher)
 
 
 @dataclass(eq=False)
@@ -79,34 +105,14 @@ class Subscription:
     """A subscription of a node. Any thread."""
 
     subscription: Any
-    topic: TopicSpec
     on_message: Callable[[bytes], None]
     withdraw: Callable[[Subscription], None]
-    publishers: Callable[[str], Any]
+    mismatch: Callable[[], str]  # returns why a publisher's messages are not received
 
     def __post_init__(self) -> None:
         self.handle = self.subscription.handle
         self._name: str = self.subscription.topic_name
         self._open = True
-
-    def mismatch(self) -> str:
-        """Return why a publisher's messages are not received; empty if all are."""
-        from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-
-        name = self._name
-        try:
-            found = self.publishers(name) if self._open else []
-        except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
-            return ""
-        for one in found:
-            offered = one.qos_profile
-            if one.topic_type != self.topic.type:
-                return f"a publisher of `{name}` has type `{one.topic_type}`"
-            if self.topic.reliable and offered.reliability == ReliabilityPolicy.BEST_EFFORT:
-                return f"a publisher of `{name}` offers best effort: write `reliable: false`"
-            if self.topic.latched and offered.durability == DurabilityPolicy.VOLATILE:
-                return f"a publisher of `{name}` is not latched: write `latched: false`"
-        return ""
 
     def close(self) -> None:
         """Withdraw it; idempotent. On return it is gone, unless the take loop called."""

@@ -42,7 +42,7 @@ def test_a_topic_is_shown_with_who_hears_it_and_what_became_of_its_messages():
 @pytest.mark.parametrize(
     ("ready", "trouble", "said"),
     [
-        ({"/plan"}, "", "`/scan` has no subscriber: no node on a replica subscribes to it"),
+        ({"/plan"}, "", "`/scan` has no subscriber with compatible QoS on a replica"),
         ({"/plan", "topic /scan"}, "it offers best effort", "it offers best effort"),
     ],
 )

@@ -159,10 +159,16 @@ def test_a_state_folder_that_others_read_is_found(tmp_path):
         (
             {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "10.0.0.1"},
             Verdict.OK,
-            Verdict.OK,
+            Verdict.FAIL,
         ),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "NEAR"}, Verdict.OK, Verdict.FAIL),
         ({"ROS_LOCALHOST_ONLY": "1"}, Verdict.OK, Verdict.WARN),
+        ({"ROS_LOCALHOST_ONLY": "0"}, Verdict.OK, Verdict.OK),
+        (
+            {"ROS_LOCALHOST_ONLY": "1", "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF"},
+            Verdict.OK,
+            Verdict.WARN,
+        ),
     ],
 )
 def test_the_domain_and_the_range_are_judged(tmp_path, environ, domain, reach):
@@ -353,8 +359,8 @@ def test_a_full_disk_is_found_and_no_process_is_blamed_for_it(tmp_path, monkeypa
         assert "links" not in {one.check for one in every}
 
 
-def judged_links(*links: LinkReport) -> list[Finding]:
-    rows = [ReplicaStatus(one.id.slot, one.id.generation, "ready") for one in links]
+def judged_links(*links: LinkReport, phase: str = "ready") -> list[Finding]:
+    rows = [ReplicaStatus(one.id.slot, one.id.generation, phase) for one in links]
     status = replace(STATUS, replicas=rows).joined(None, proxy_alive=True, links=links)
     return list(pools.judge_links("p", Seen(status, 0.0, manager_alive=True)))
 
@@ -371,10 +377,17 @@ def test_silent_links_are_found():
 
 def test_a_replica_whose_program_ends_is_found():
     ends = LinkReport(ReplicaId(UID, 1, 2), LinkState.UP, detail="`run` exited with status 3")
-    found = judged_links(ends)
+    found = judged_links(ends, phase="starting")
     assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
     assert "`1.2` is not ready: `run` exited with status 3" in found[0].text
     assert "`fogft logs 1`" in found[0].advice
+
+
+def test_an_uplink_that_is_down_is_told_of_and_its_replica_is_not_called_unready():
+    down = LinkReport(ReplicaId(UID, 1, 2), LinkState.UP, detail="uplink `wlan0`: unreachable")
+    found = judged_links(down)
+    assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
+    assert found[0].text.endswith("`1.2`: uplink `wlan0`: unreachable")
 
 
 def test_chaos_that_lasts_is_found(tmp_path):

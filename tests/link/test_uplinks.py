@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.link import uplinks
 from fogft.link.port import Answer, Peer
 from fogft.link.uplinks import UplinkDialer, choose
 from fogft.model import topic
@@ -138,6 +139,29 @@ def test_prefer_goes_back_and_failover_does_not():
         scene.uplinks[0].ready = READY
         assert scene.offer(b"3" * 16)
         assert scene.counts() == expected, policy
+
+
+def test_an_uplink_that_is_lost_again_and_again_comes_last_for_ever_longer(monkeypatch):
+    """Where large packets vanish it opens each time, and each time what it was given is lost."""
+    scene, now = Scene("prefer"), [1000.0]
+    monkeypatch.setattr(uplinks.time, "monotonic", lambda: now[0])
+    one = scene.uplinks[0]
+
+    def rested_s() -> float:
+        for ready in (READY, frozenset(), READY):
+            one.ready = ready
+            one.events.changed(one)
+        lost_at = now[0]
+        while scene.offer() and not one.offered:
+            scene.link.forget(ID)
+            now[0] += 0.5
+        scene.link.forget(ID)
+        one.offered.clear()
+        return now[0] - lost_at
+
+    assert [rested_s() for _ in range(4)] == [2.0, 4.0, 8.0, 16.0]
+    now[0] += 3600.0
+    assert rested_s() == 2.0
 
 
 def test_what_is_too_slow_on_one_uplink_goes_out_on_the_other():

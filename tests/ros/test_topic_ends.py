@@ -50,6 +50,17 @@ def test_a_publisher_that_offers_less_is_told_of_with_the_remedy(make_node, ros_
     assert fine.mismatch() == ""
 
 
+def test_a_subscriber_that_asks_for_more_is_told_of_with_the_remedy(make_node, ros_domain):
+    """As a node that wants a map, where the pool file does not say that it is latched."""
+    node, other = make_node(ros_domain), make_node(ros_domain)
+    plain, easy, fine = map(node.publisher, (SAID, EASY, replace(SAID, latched=True)))
+    other.subscribe(replace(SAID, latched=True), print)
+    wait_for(plain.mismatch, "the subscriber")
+    assert "`latched: true`" in plain.mismatch()
+    assert "`reliable: true`" in easy.mismatch()
+    assert fine.mismatch() == ""
+
+
 def test_a_publisher_of_another_type_is_told_of(make_node, ros_domain):
     make_node(ros_domain).publisher(replace(SAID, type="std_msgs/msg/Int32"))
     heard = make_node(ros_domain).subscribe(SAID, lambda _: None)

@@ -10,6 +10,7 @@ import contextlib
 import datetime
 import socket
 import ssl
+from collections.abc import Iterator
 from typing import Any
 
 from fogft.errors import CredentialError
@@ -30,6 +31,8 @@ _ALERTS = {
     "unsupported certificate": "our certificate is not a robot's",
     "bad certificate": "the replica does not accept our certificate",
     "certificate unknown": "the replica does not accept our certificate",
+    "wrong version number": "no TLS is spoken there: a login page of this network, or a proxy?",
+    "violation of protocol": "the connection was closed before TLS: by a proxy of this network?",
 }
 
 
@@ -40,9 +43,8 @@ def explain(peer: Peer, credentials: CredentialPaths) -> str:
     except CredentialError as error:
         return error.message
     try:
-        with socket.create_connection(host_and_port(peer.endpoint), _TIMEOUT_S) as raw:
-            with context.wrap_socket(raw) as link:
-                return _after_handshake(link, peer)
+        with _tls(peer, context) as link:
+            return _after_handshake(link, peer)
     except ssl.SSLError as error:
         return _clock_words(error, peer, credentials) or _tls_words(error)
     except TimeoutError:
@@ -50,6 +52,20 @@ def explain(peer: Peer, credentials: CredentialPaths) -> str:
     except (OSError, ValueError) as error:
         words = getattr(error, "strerror", None) or str(error)
         return f"`{peer.endpoint}`: {words.lower()}"
+
+
+@contextlib.contextmanager
+def _tls(peer: Peer, context: ssl.SSLContext) -> Iterator[ssl.SSLSocket]:
+    """Connect through the peer's interface, as its link does. Raises OSError."""
+    host, port = host_and_port(peer.endpoint)
+    family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+    with socket.socket(family, kind) as raw:
+        raw.settimeout(_TIMEOUT_S)
+        if peer.interface:
+            raw.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, peer.interface.encode())
+        raw.connect(address)
+        with context.wrap_socket(raw) as link:
+            yield link
 
 
 def _context(credentials: CredentialPaths) -> ssl.SSLContext:
@@ -104,10 +120,9 @@ def _certificate_of(peer: Peer, credentials: CredentialPaths) -> bytes:
     context = _context(credentials)
     context.verify_mode = ssl.CERT_NONE
     with contextlib.suppress(OSError, ValueError):
-        with socket.create_connection(host_and_port(peer.endpoint), _TIMEOUT_S) as raw:
-            with context.wrap_socket(raw) as link:
-                der = link.getpeercert(binary_form=True) or b""
-                return ssl.DER_cert_to_PEM_cert(der).encode()
+        with _tls(peer, context) as link:
+            der = link.getpeercert(binary_form=True) or b""
+            return ssl.DER_cert_to_PEM_cert(der).encode()
     return b""
 
 

@@ -270,8 +270,9 @@ class TopicsOnReplica:
             outgoing.tick(now)
         if now - self._looked_at > LOOK_EVERY_S:
             self._looked_at = now
-            for name, subscription in self._subscriptions.items():
-                self._note(name, subscription.mismatch())
+            ends: dict[str, Publisher | Subscription] = {**self._publishers, **self._subscriptions}
+            for name, end in ends.items():
+                self._note(name, end.mismatch())
 
     def _publish(self, incoming: Incoming) -> None:
         """Publish a message, and confirm it to its robot."""

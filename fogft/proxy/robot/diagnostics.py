@@ -145,10 +145,10 @@ class Diagnosis:
             level, message = Level.WARN, detail or "not all services can answer"
         elif link.get("draining"):
             level, message = Level.WARN, "machine about to be preempted"
-        elif link.get("hanging"):
-            level, message = Level.WARN, detail
         elif link.get("disagrees"):
             level, message = Level.WARN, "answers differ from the other replicas'"
+        elif detail:  # it hangs, or an uplink is down
+            level, message = Level.WARN, detail
         else:
             level, message = Level.OK, "responding"
         values = {

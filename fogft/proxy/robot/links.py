@@ -40,6 +40,7 @@ def link_report(
     key = key_of(link)
     misread = misread or any(one.misreads(key) for one in dispatchers)
     ended = [one.outcomes.of.get(key, OfReplica()) for one in dispatchers]
+    down = [f"uplink `{u['interface']}`: {u['detail']}" for u in status.uplinks if u["detail"]]
     return {
         "slot": id.slot,
         "generation": id.generation,
@@ -70,7 +71,7 @@ def link_report(
         "lease_age_s": answer.lease_age_s if answer else None,
         "lease_left_s": answer.lease_left_s if answer else None,
         **({"uplinks": list(status.uplinks)} if status.uplinks else {}),
-        "detail": status.detail or ours or (answer.detail if answer else ""),
+        "detail": status.detail or ours or (answer and answer.detail) or "; ".join(down),
     }
 
 

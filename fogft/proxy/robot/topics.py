@@ -145,8 +145,8 @@ class RobotTopic:
         self._looked_at, (then, before_count) = now, self._counted
         self._counted = (now, self.count["messages"])
         self._rate_hz = (self.count["messages"] - before_count) / (now - then)
-        if self._subscription is not None:
-            before, self.trouble = self.trouble, self._subscription.mismatch()
+        if end := self._subscription or self._publisher:
+            before, self.trouble = self.trouble, end.mismatch()
             if self.trouble not in ("", before):
                 log.error("topic_not_heard topic=%s reason=%r", self.topic.name, self.trouble)
 

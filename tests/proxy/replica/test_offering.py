@@ -99,6 +99,14 @@ def test_a_replica_that_offers_other_names_lists_them():
     )
 
 
+def test_a_service_that_is_there_and_cannot_be_called_is_not_said_to_be_missing():
+    """As one with the quality of service of sensor data."""
+    scene = Scene(ServiceSpec("/s", SET_BOOL), graph={"/s": SET_BOOL})
+    scene.node.clients["/s"].there = False
+    scene.look()
+    assert "`run` offers /s, which cannot be called yet" in scene.probe().detail
+
+
 def test_a_replica_whose_type_is_another_names_both():
     scene = Scene(ServiceSpec("/s", SET_BOOL), graph={"/arm/s": SET_BOOL, "/s": "a_b/srv/C"})
     scene.node.clients["/s"].there = False

@@ -69,6 +69,7 @@ def test_what_is_down_is_an_error_and_the_pool_is_as_bad_as_its_services(told, w
     [
         *({"draining": True}, {"disagrees": True}, {"ready": []}, {"state": "connecting"}),
         {"hanging": ["/plan"], "detail": "`/plan` has requests and has answered none for 2 s"},
+        {"detail": "uplink `wlan0`: there is no network interface `wlan0` here"},
     ],
 )
 def test_a_replica_that_is_not_all_right_is_a_warning(state):

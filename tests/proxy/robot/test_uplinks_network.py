@@ -63,6 +63,7 @@ def test_an_uplink_that_goes_costs_no_request(tmp_path, two, policy, fault):
             robot.ask(5, 1000)
         robot.all_right()
         wait_for(lambda: ups(robot)[0] != "up")
+        assert f"uplink `{two.cables[0][0]}`: " in robot.tell()["report"]["links"][0]["detail"]
         robot.ask(20)
         robot.all_right()
         told = robot.tell()["report"]["services"]["/echo"]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import socket
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +14,8 @@ from fogft.link.zenoh import diagnosis
 from fogft.link.zenoh.diagnosis import Opening
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
-from tests.link.wire_pool import peer
+from tests.link.namespaces import Namespaces, inside
+from tests.link.wire_pool import Authority, peer
 
 SETTINGS = LinkSettings(open_timeout_s=1.0, long_open_timeout_s=4.0)
 CREDENTIALS = CredentialPaths(Path("ca"), Path("crt"), Path("key"))
@@ -57,3 +61,47 @@ def test_a_replica_that_was_never_reached_is_not_called_frozen() -> None:
 def test_an_interface_that_is_not_there_is_named() -> None:
     opening = Opening(replace(peer("10.0.0.1:1"), interface="no-such"), SETTINGS)
     assert "`no-such`" in opening.failed(0.01, 0.0, CREDENTIALS)
+
+
+def answering(said: bytes) -> socket.socket:
+    """Listen, say this to whoever has spoken, and hang up."""
+    port = socket.create_server(("0.0.0.0", 0))
+
+    def serve() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                link, _ = port.accept()
+                with link:
+                    link.recv(4096)
+                    link.sendall(said)
+
+    threading.Thread(target=serve, daemon=True).start()
+    return port
+
+
+@pytest.mark.parametrize(
+    ("said", "words"), [(b"HTTP/1.1 302 Found\r\n\r\n", "login page"), (b"", "closed before TLS")]
+)
+def test_what_speaks_no_tls_is_not_called_by_an_error_of_openssl(
+    tmp_path: Path, said: bytes, words: str
+) -> None:
+    """The login page of a hotel's network, or a proxy, answers for every address."""
+    with answering(said) as port:
+        at = peer(f"127.0.0.1:{port.getsockname()[1]}")
+        assert words in diagnosis.explain(at, Authority(tmp_path).robot())
+
+
+def test_the_reason_is_looked_for_through_the_links_own_interface(
+    tmp_path: Path, net: Namespaces
+) -> None:
+    """Another uplink reaches the replica; that says nothing of this one."""
+    robot, replica = net.add("r"), net.add("p")
+    near, _ = net.join(robot, "10.79.1.1", replica, "10.79.1.2")
+    other, _ = net.join(robot, "10.79.2.1", replica, "10.79.2.2")
+    with inside(replica):
+        port = answering(b"no TLS")
+    net.blackhole(replica, "10.79.1.1")
+    with port, inside(robot):
+        at, files = peer(f"10.79.2.2:{port.getsockname()[1]}"), Authority(tmp_path).robot()
+        assert "TLS" in diagnosis.explain(replace(at, interface=other), files)
+        assert "does not answer" in diagnosis.explain(replace(at, interface=near), files)
