@@ -104,7 +104,7 @@ def test_a_service_that_is_there_and_cannot_be_called_is_not_said_to_be_missing(
     scene = Scene(ServiceSpec("/s", SET_BOOL), graph={"/s": SET_BOOL})
     scene.node.clients["/s"].there = False
     scene.look()
-    assert "`run` offers /s, which cannot be called yet" in scene.probe().detail
+    assert "`run` offers /s, but it cannot be called" in scene.probe().detail
 
 
 def test_a_replica_whose_type_is_another_names_both():
