@@ -10,7 +10,6 @@ from typing import Any
 
 from fogft.errors import FrameError
 from fogft.link import frame
-from fogft.link.frame import NO_STAMP, STAMP_BYTES, RequestHeader
 from fogft.link.port import Answer
 from fogft.model import refusal
 from fogft.model.names import REQUEST_ID_BYTES
@@ -20,7 +19,7 @@ ENTRY_BYTES_LIMIT = 4 << 10  # a larger payload is sent alone: it neither waits 
 BYTES_LIMIT = 16 << 10  # of all payloads together
 
 BATCH = bytes((frame.VERSION | 0x10,))  # the first byte of a batch's header
-_STAMPED = len(BATCH) + STAMP_BYTES
+_STAMPED = len(BATCH) + frame.STAMP_BYTES
 _REQUEST = struct.Struct(f">{REQUEST_ID_BYTES}sdBI")  # id, remaining seconds, handling, length
 _ANSWER = struct.Struct(f">{REQUEST_ID_BYTES}s{frame.LOAD_BYTES}s?I")  # ..., refusal, length
 
@@ -29,7 +28,7 @@ Answers = Sequence[tuple[bytes, bytes, bytes, str]]  # id, load, payload, refusa
 
 
 def encode_requests(
-    requests: Requests, origin: bytes, *, seen: bytes = NO_STAMP
+    requests: Requests, origin: bytes, *, seen: bytes = frame.NO_STAMP
 ) -> tuple[bytes, bytes]:
     """Return header and payload for at most `LIMIT` requests; `seen` is the last answer's stamp."""
     parts = []
@@ -39,7 +38,7 @@ def encode_requests(
     return BATCH + seen + origin, b"".join(parts)
 
 
-def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, bytes]]:
+def decode_requests(header: bytes, payload: bytes) -> list[tuple[frame.RequestHeader, bytes]]:
     """Return the requests of a batch, each with its own header. Raises FrameError."""
     if header[:1] != BATCH:
         raise FrameError("no batch of requests")
@@ -48,7 +47,8 @@ def decode_requests(header: bytes, payload: bytes) -> list[tuple[RequestHeader, 
     found = []
     for (id, remaining_s, flags, _), part in _entries(_REQUEST, payload):
         handling = frame.read_handling(flags, remaining_s)
-        found.append((RequestHeader(id, remaining_s, token, robot, seen, handling=handling), part))
+        one = frame.RequestHeader(id, remaining_s, token, robot, seen, handling=handling)
+        found.append((one, part))
     return found
 
 

@@ -7,7 +7,6 @@ another version. Each frame begins with its version. Other frames: `probe_frames
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
@@ -57,8 +56,7 @@ class RequestHeader(NamedTuple):  # one per request: a frozen dataclass costs th
     handling: Handling = Handling.NORMAL
 
 
-@dataclass(frozen=True)
-class Greeting:
+class Greeting(NamedTuple):
     """Sent with a probe to authenticate the connection."""
 
     token: bytes  # identifies the connection; requests that carry it are the greeter's

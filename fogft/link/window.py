@@ -243,10 +243,6 @@ class SendQueue:
         self._order = count()
         self._waiting = {service: list[tuple[float, int, OpenAttempt]]() for service in latest}
 
-    def overtakes(self, service: str) -> bool:
-        """Whether a service's newest request is sent first."""
-        return service in self._waiting
-
     def put(self, attempt: OpenAttempt | None) -> None:
         """Queue an attempt; None ends the sender after everything queued before it."""
         waiting = self._waiting.get(attempt.service) if attempt is not None else None

@@ -8,6 +8,7 @@ refusal. Protocol: docs/design/state.md.
 import struct
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 
 _ID = struct.Struct(">QQ")
 _JOIN = struct.Struct(">QQQ")
@@ -130,19 +131,15 @@ def _unpack(layout: struct.Struct, payload: bytes) -> tuple[int, ...]:
         raise OrderError(f"an answer of {len(payload)} bytes") from error
 
 
-def read_index(detail: str) -> int | None:
-    """Return the next expected number from a `Refusal.GAP`."""
-    return _number(detail, 10, INDEX_LIMIT)
-
-
-def read_epoch(detail: str) -> int | None:
-    """Return the current term from a `Refusal.FENCED`."""
-    return _number(detail, 16, _CLAIMED_EPOCH_LIMIT)
-
-
 def _number(detail: str, base: int, limit: int) -> int | None:
     try:
         number = int(detail, base)
     except ValueError:
         return None
     return number if 0 <= number < limit else None
+
+
+# Reads the next expected number from a `Refusal.GAP`.
+read_index = partial(_number, base=10, limit=INDEX_LIMIT)
+# Reads the current term from a `Refusal.FENCED`.
+read_epoch = partial(_number, base=16, limit=_CLAIMED_EPOCH_LIMIT)

@@ -7,7 +7,7 @@ each, once, by `replied`, `refused` or `declined`. Protocol and rationale: docs/
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fogft.model.refusal import Refusal
 from fogft.ordering import orders
@@ -20,8 +20,7 @@ CHECK_EVERY_S = 1.0
 _GOES_BACK = 8  # times without an acknowledged number: orders may overtake each other
 
 
-@dataclass(frozen=True)
-class Handover:
+class Handover(NamedTuple):
     """The start of a term with another active version, once all earlier requests are applied."""
 
     version: str  # the version that becomes active

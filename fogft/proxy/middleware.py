@@ -20,7 +20,6 @@ from fogft.ros.joining import EarlyJoin
 from fogft.ros.port import RosNode
 from fogft.ros.visible import VisibleNode
 
-Told = Callable[[], Mapping[str, Sequence[Definition]]]
 Judge = Callable[[Mapping[str, Any]], str]
 
 
@@ -73,7 +72,7 @@ def join(
     domain_id: int | None,
     *,
     early: EarlyJoin | None = None,
-    told: Told = dict,
+    told: Callable[[], Mapping[str, Sequence[Definition]]] = dict,
     noticed: Callable[[], None] = lambda: None,
     environ: Mapping[str, str] = os.environ,
 ) -> Joined:

@@ -1,8 +1,5 @@
 """Decide what an answer means for its request: by default, the first success wins. Pure.
 
-An answer is first parsed by `read`, which may be slow and holds no lock. Then `judge` returns its
-meaning.
-
 Not here: votes (`requests.votes`), actions and stateful services (`proxy.robot`), which requests
 await an answer (`pending`).
 """
@@ -84,7 +81,8 @@ class Reachable(NamedTuple):
 class Decide:
     """Judges answers: the first response counts; with `accepts`, the first ok one.
 
-    All methods but `read` are called under the dispatcher's lock. Subclasses override the rest.
+    All methods but `read`, which may be slow, are called under the dispatcher's lock. Subclasses
+    override the rest.
     """
 
     flagged: Collection[int] = ()  # replicas whose answers do not count any more

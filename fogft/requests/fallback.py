@@ -18,11 +18,8 @@ class FallbackTimer:
         self.submitted = self._arrived.__setitem__  # note a new request, and when it arrived
         self._handed: set[bytes] = set()
         self.failed = self._handed.discard  # the call failed: call again at the deadline
+        self.not_asked = self._handed.clear  # it was replaced: call the new one at each deadline
         self._awaited: dict[bytes, tuple[float, Pending]] = {}  # past their deadline: until when
-
-    def not_asked(self) -> None:
-        """Note that the fallback was replaced: call the new one at each request's deadline."""
-        self._handed.clear()
 
     def __len__(self) -> int:
         """Count the requests past their deadline whose fallback is awaited."""

@@ -31,8 +31,6 @@ class Verdict(Enum):
     POISON = "poison"  # it crashed services: never send it again
 
 
-Judged = tuple[Judgement, Pending | None, Iterable[int], Verdict]
-
 ATTEMPTS = 3  # a replica that failed a request this often is barred from it
 RETRY_FIRST_S = 0.02
 RETRY_LIMIT_S = 0.32
@@ -230,7 +228,7 @@ class PendingRequests:
         reading: Any,
         load: Load | None,
         now: float,
-    ) -> Judged:
+    ) -> tuple[Judgement, Pending | None, Iterable[int], Verdict]:
         """Take an answer to `request`, or to no request if None.
 
         Returns its meaning; the item it completes, or None if it is late or no success; the other

@@ -17,8 +17,6 @@ _BATCH = struct.Struct(f">{SESSION_BYTES}sQI")
 _ENTRY = struct.Struct(">QI")
 NO_SESSION = bytes(SESSION_BYTES)
 
-Batch = tuple[bytes, int, list[tuple[int, bytes]]]
-
 
 def encode_message(session: bytes, number: int, message: bytes) -> bytes:
     """Encode a robot's message: publisher session (random at its start), number, CDR."""
@@ -56,7 +54,7 @@ def encode_batch(session: bytes, after: int, messages: Sequence[tuple[int, bytes
     return b"".join(parts)
 
 
-def decode_batch(frame: bytes) -> Batch:
+def decode_batch(frame: bytes) -> tuple[bytes, int, list[tuple[int, bytes]]]:
     """Decode the answer to a pull. Raises FrameError."""
     if len(frame) < _BATCH.size:
         raise FrameError(f"a batch of {len(frame)} bytes")

@@ -16,7 +16,6 @@ from fogft import poll
 from fogft.errors import FogftError
 from fogft.link.dial_out import tunnel
 from fogft.link.dial_out.robot import GO, PURPOSE, SIGN, SIGN_EVERY_S, SILENCE_S
-from fogft.link.dial_out.tunnel import GREETING_TIMEOUT_S, Tunnels, hang_up, keep_alive
 from fogft.model.names import host_and_port
 from fogft.process import on_thread
 from fogft.records import frames
@@ -41,7 +40,7 @@ class DialOut:
         self._lock = threading.Lock()
         self._targets: dict[str, threading.Event] = {}  # set once the door is no longer followed
         self._details: dict[str, str] = {}  # each door's problem, empty while connected
-        self._tunnels = Tunnels()
+        self._tunnels = tunnel.Tunnels()
 
     def follow(self, doors: Iterable[str]) -> None:
         """Connect to these dial-in ports (``host:port``) and no others; connections in use stay."""
@@ -82,14 +81,14 @@ class DialOut:
                 self._say(door, str(error) or type(error).__name__)
             finally:
                 if link is not None:
-                    hang_up(link)
+                    tunnel.hang_up(link)
             stop.wait(_BACKOFF_S)
 
     def _greet(self, link: socket.socket) -> None:
         """Authenticate to the door."""
-        keep_alive(link)
+        tunnel.keep_alive(link)
         nonce, _ = frames.read_challenge(tunnel.receive(link, 4 << 10))
-        link.settimeout(GREETING_TIMEOUT_S)
+        link.settimeout(tunnel.GREETING_TIMEOUT_S)
         proof = frames.proof_bytes(PURPOSE, nonce, self._pool_uid.encode())
         link.sendall(frames.greeting(*self._sign(proof)))
 

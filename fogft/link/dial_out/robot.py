@@ -12,19 +12,12 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass
 
 from fogft import poll
 from fogft.counters import Counters
 from fogft.link.dial_out import tunnel
-from fogft.link.dial_out.tunnel import (
-    GREETING_TIMEOUT_S,
-    Tunnels,
-    hang_up,
-    keep_alive,
-    shut_down,
-)
 from fogft.model.credentials import Role, holder_of
 from fogft.model.replica import ReplicaId
 from fogft.process import on_thread
@@ -72,7 +65,7 @@ class DialIn:
         self._lock = threading.Condition()
         self._waiting: list[_Waiting] = []  # oldest first
         self._local: dict[ReplicaId, socket.socket] = {}
-        self._tunnels = Tunnels()
+        self._tunnels = tunnel.Tunnels()
         self._greeting: dict[socket.socket, str] = {}  # oldest first, with their hosts
         self._closed = False
         self._door = listening(self.listen)
@@ -83,22 +76,27 @@ class DialIn:
     # -- connections from replicas ------------------------------------------------------------
 
     def _accept(self) -> None:
-        while not self._closed:
-            try:
-                link, address = self._door.accept()
-            except OSError as error:
-                if not self._closed:
-                    self._count("accept_failed", str(error))
-                    time.sleep(0.1)
-                continue
-            host = str(address[0])
+        for link, host in self._accepted(self._door):
             with self._lock:
                 if len(self._greeting) >= GREETINGS_LIMIT:
                     crowd = oldest_of_most(self._greeting)
                     self._count("greeting_crowded", self._greeting.pop(crowd))
-                    shut_down(crowd)  # its thread closes it
+                    tunnel.shut_down(crowd)  # its thread closes it
                 self._greeting[link] = host
             on_thread(self._attend, link, host, name="fogft-greet")
+
+    def _accepted(self, port: socket.socket) -> Iterator[tuple[socket.socket, str]]:
+        """Yield the connections to a port, with their hosts, until it is closed."""
+        while True:
+            try:
+                link, address = port.accept()
+            except OSError as error:
+                if self._closed or port.fileno() < 0:
+                    return
+                self._count("accept_failed", str(error))  # e.g. out of file descriptors
+                time.sleep(0.1)
+            else:
+                yield link, str(address[0])
 
     def _attend(self, link: socket.socket, host: str) -> None:
         try:
@@ -110,13 +108,13 @@ class DialIn:
         except (RecordError, OSError, EOFError) as error:
             reason = error.reason if isinstance(error, RecordError) else "failed"
             self._count(f"greeting_{reason}", f"{host}: {error}")
-            hang_up(link)
+            tunnel.hang_up(link)
         else:
             self._wait(_Waiting(id, link))
 
     def _greet(self, link: socket.socket, host: str) -> ReplicaId:
-        keep_alive(link)
-        link.settimeout(GREETING_TIMEOUT_S)
+        tunnel.keep_alive(link)
+        link.settimeout(tunnel.GREETING_TIMEOUT_S)
         nonce = secrets.token_bytes(frames.NONCE_BYTES)
         link.sendall(frames.challenge(nonce, host))
         message = tunnel.receive(link, 16 << 10)
@@ -140,7 +138,7 @@ class DialIn:
             of_each = Counter(other.id for other in (*self._waiting, one))
             too_many = of_each[one.id] > WAITING_LIMIT or len(of_each) > REPLICAS_LIMIT
             if too_many or self._closed:
-                hang_up(one.link)
+                tunnel.hang_up(one.link)
                 self._counters.add("refused_full")
                 return
             self._waiting.append(one)
@@ -152,7 +150,7 @@ class DialIn:
             log.info("replica_left_door replica=%s reason=%s", one.id.short, why)
             with self._lock, contextlib.suppress(ValueError):  # `_take` just took it
                 self._waiting.remove(one)
-            hang_up(one.link)
+            tunnel.hang_up(one.link)
 
     def _tend(self, one: _Waiting) -> str:
         """Exchange keepalives; return why the connection ended, or "" once a link uses it."""
@@ -199,18 +197,10 @@ class DialIn:
         with self._lock:
             gone = [self._local.pop(id) for id in list(self._local) if id not in ids]
         for port in gone:
-            hang_up(port)
+            tunnel.hang_up(port)
 
     def _accept_local(self, id: ReplicaId, port: socket.socket) -> None:
-        while True:
-            try:
-                link, _ = port.accept()
-            except OSError as error:
-                if port.fileno() < 0:
-                    return  # closed by `keep`
-                self._count("accept_failed", str(error))  # e.g. out of file descriptors
-                time.sleep(0.1)
-                continue
+        for link, _ in self._accepted(port):
             one = self._take(id)
             if one is None:
                 link.close()  # the link retries soon
@@ -234,7 +224,7 @@ class DialIn:
                 one.link.sendall(GO)
                 if _drained(one.link):
                     return one
-            hang_up(one.link)
+            tunnel.hang_up(one.link)
 
     # -- the owner ----------------------------------------------------------------------------
 
@@ -249,10 +239,10 @@ class DialIn:
     def close(self) -> None:
         """Close the port and all its connections. Repeatable."""
         self._closed = True
-        hang_up(self._door)
+        tunnel.hang_up(self._door)
         self.keep(())
         with self._lock:
-            shut_down(*(one.link for one in self._waiting))
+            tunnel.shut_down(*(one.link for one in self._waiting))
             self._lock.notify_all()
         self._tunnels.close()
 

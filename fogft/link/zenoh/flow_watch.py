@@ -10,7 +10,6 @@ from collections.abc import Callable
 from fogft import poll
 from fogft.link.socket_progress import BULK_BYTES, SocketProgress
 from fogft.link.zenoh import sockets
-from fogft.link.zenoh.sockets import Address, OwnSocket
 
 THIN_BYTES_PER_S = 2_000_000.0  # below this, the kernel's queue of unsent bytes is kept short
 _END_WITHIN_S = 1.0  # how long a connection that is being closed may still move data
@@ -21,8 +20,8 @@ _QUIET_S = 0.05  # if nothing was received for this long, no large answer is in 
 class FlowWatch:
     """Watches one connection's socket. For one thread, except `end_when_safe`."""
 
-    def __init__(self, own: Address, peer: Address) -> None:
-        self._socket = OwnSocket(own, peer)
+    def __init__(self, own: sockets.Address, peer: sockets.Address) -> None:
+        self._socket = sockets.OwnSocket(own, peer)
         self.progress = SocketProgress()
         self._kept_short = False
 
@@ -47,7 +46,7 @@ class FlowWatch:
                 self._kept_short = True
         return moved_s
 
-    def end_when_safe(self, sending: Callable[[], bool], asked: Callable[[], bool]) -> None:
+    def end_when_safe(self, sending: Callable[[], bool], asked: Callable[[], object]) -> None:
         """End the connection if a large message may be in transit, in either direction; may block.
 
         If a connection ends while data flows, Zenoh's thread and a sender may deadlock: see

@@ -48,10 +48,6 @@ class Forwarder:
         self.joined = 0  # copies of requests already known
         self.refused = Counters()
 
-    def start(self) -> None:
-        """Start forwarding on its own thread, since the link's threads must not send."""
-        threading.Thread(target=self.pass_on, name="fogft-forward", daemon=True).start()
-
     @property
     def in_flight(self) -> int:
         """Return the number of requests in flight."""

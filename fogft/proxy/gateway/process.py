@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fogft import disk
-from fogft.disk import Watched
 from fogft.errors import CredentialError, FogftError, PoolBusy
 from fogft.link.port import Probe, ProbeAnswer
 from fogft.metrics import proxies
@@ -23,7 +22,7 @@ from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.type_definition import RESPONSE
-from fogft.process import Watchdog, notify, start_log, stop_on_signal
+from fogft.process import Watchdog, notify, on_thread, start_log, stop_on_signal
 from fogft.proxy.config import read_gateway
 from fogft.proxy.gateway.gateway import Forwarder
 from fogft.proxy.middleware import fault_of
@@ -82,7 +81,7 @@ class _Gateway:
         self._revoked: frozenset[str] = frozenset()
         self._listener: ZenohListener | None = None
         self._holder = self._own_holder()
-        self._certificate = Watched(config.credentials.certificate, from_now=True)
+        self._certificate = disk.Watched(config.credentials.certificate, from_now=True)
         self._scrape = Scrape(lambda: proxies.of_gateway(self._told()), {"pool": config.pool})
 
     def _own_holder(self) -> Holder:
@@ -140,7 +139,8 @@ class _Gateway:
         )
 
     def run(self, stop: threading.Event) -> None:
-        self._forwarder.start()
+        # A thread of its own, since the link's threads must not send.
+        on_thread(self._forwarder.pass_on, name="fogft-forward")
         self._listen()
         self._scrape.at(self._config.metrics)
         reported, watchdog = time.monotonic(), Watchdog()

@@ -104,7 +104,7 @@ class Responder:
             return {
                 name: queue.quiet_s(now)
                 for name, queue in self._queues.items()
-                if (queue.stuck(now) if stuck else queue.hangs(now))
+                if queue.hangs(now, stuck=stuck)
             }
 
     @property
@@ -202,7 +202,7 @@ class Responder:
                 if job is None or job.waiting is None or job.unwanted:
                     continue
                 job.unwanted = True
-                if self._queue(job.service).remove(job):
+                if self._queue(job.service).remove(id):
                     self.work["saved"] += 1
                     dropped.append(id)
                 elif job.passed_on:
@@ -211,13 +211,12 @@ class Responder:
             self._end(id, Refusal.CANCELLED)
         for job in at_work:
             client, queue = self._cancel_clients.get(job.service), self._queues[job.service]
-            if client is not None:
-                with self._lock:
-                    held = queue.hold(self._clock()) if job.passed_on else None
-                if held is not None:
-                    self.work["interrupted"] += self._await(
-                        job.service, client, EMPTY_REQUEST, held
-                    )
+            if client is None:
+                continue
+            with self._lock:
+                held = queue.hold(self._clock()) if job.passed_on else None
+            if held is not None:
+                self.work["interrupted"] += self._await(job.service, client, EMPTY_REQUEST, held)
 
     def _await(self, service: str, client: RosClient, request: bytes, held: float) -> bool:
         """Call a service, and end a hold once it answers; return whether the call was sent."""
@@ -312,7 +311,7 @@ class Responder:
                 self.known.forget(job)
             waiting, job.waiting = job.waiting, None
             queue = self._queues[job.service]
-            queue.remove(job)
+            queue.remove(id)
             load = queue.load(
                 self._clock() - job.arrived, ended=job.passed_on and reason is not Refusal.EXPIRED
             )

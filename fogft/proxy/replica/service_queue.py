@@ -87,6 +87,7 @@ class ServiceQueue:
     ) -> None:
         self._waiting: FairQueue[Job] = FairQueue(latest=latest)
         self.waiting = self._waiting.size  # how many
+        self.remove = self._waiting.remove  # return a waiting job, by its id; None if it is not one
         self.evict = self._waiting.evict  # remove a job to make room for a new one
         self.limit = ConcurrencyLimit(most, given)
         self.at_work = 0
@@ -184,10 +185,6 @@ class ServiceQueue:
         if self.at_work > self.limit.limit:
             self._next = job
 
-    def remove(self, job: Job) -> bool:
-        """Remove a waiting job; return whether it was waiting."""
-        return self._waiting.remove(job.id) is not None
-
     def finished(self, job: Job, now: float) -> None:
         """Note that the service has answered."""
         if job.passed_on:
@@ -233,15 +230,11 @@ class ServiceQueue:
             self.at_work -= 1
             self._batch = 0
 
-    def hangs(self, now: float) -> bool:
-        """Whether the service has work, and has finished none for far longer than usual."""
-        return self.quiet_s(now) > most_quiet_s(self._longest_s)
-
-    def stuck(self, now: float) -> bool:
-        """Whether it hangs for long, and no caller waits for its work any more."""
-        if self._unanswered < _STUCK_ON or now < self._last_deadline:
+    def hangs(self, now: float, *, stuck: bool) -> bool:
+        """Whether it is quiet for unusually long; `stuck`: even longer, with no caller waiting."""
+        if stuck and (self._unanswered < _STUCK_ON or now < self._last_deadline):
             return False
-        return self.quiet_s(now) > most_quiet_s(self._longest_s, stuck=True)
+        return self.quiet_s(now) > most_quiet_s(self._longest_s, stuck=stuck)
 
     def quiet_s(self, now: float) -> float:
         """Return how long it has had work and finished none; 0 if it has never answered."""

@@ -33,8 +33,7 @@ class Supervisor:
     """
 
     # Backoff between a death and the next start: second and longest wait; the first restart is
-    # immediate. A run longer than the longest wait resets it, and so does a death while requests
-    # were running.
+    # immediate. A run longer than the longest wait resets it.
     backoff_s = 0.5, 15.0
 
     command: str

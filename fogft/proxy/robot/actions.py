@@ -11,9 +11,8 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 from fogft.model.names import REQUEST_ID_BYTES
 from fogft.model.refusal import Effect, Refusal
@@ -22,7 +21,6 @@ from fogft.model.spec import Part, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher, Wake
 from fogft.requests.decide import Decide, Judgement, Means, Pending, Reachable, Send
 from fogft.topics import goals
-from fogft.topics.goals import Goals
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +31,7 @@ _CANCEL_AGAIN_S = 0.25
 _SEVERAL = b""  # instead of a goal: the request cancels several
 
 
-@dataclass(frozen=True)
-class _ToCancel:
+class _ToCancel(NamedTuple):
     """A cancellation of a goal to send to a replica: not before `at`, retried until `until`."""
 
     goal: bytes
@@ -50,7 +47,7 @@ class _Action:
         self.lock = threading.Lock()
         self.clock = clock
         self.wake = wake
-        self.goals = Goals()
+        self.goals = goals.Goals()
         self.to_cancel: deque[_ToCancel] = deque(maxlen=_CANCELS_KEPT)
         self.replicas: Collection[int] = ()
         # Called, without the lock, with a goal and a replica that has accepted it.

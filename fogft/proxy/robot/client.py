@@ -37,9 +37,6 @@ log = logging.getLogger(__name__)
 _TICK_S = 0.02  # if there are topics
 _IDLE_TICK_S = 0.1
 
-# Creates the dispatcher of a service, given how to respond and how to have `tick` called soon.
-MakeDispatcher = Callable[[ServiceSpec, Callable[[Any, bytes], None], Wake], Dispatcher]
-
 
 @dataclass(eq=False)
 class ClientProxy:
@@ -54,7 +51,8 @@ class ClientProxy:
     pool_uid: str
     node: RosNode | None
     dialer: Dialer
-    make_dispatcher: MakeDispatcher
+    # Creates the dispatcher of a service, given how to respond and how to have `tick` called soon.
+    make_dispatcher: Callable[[ServiceSpec, Callable[[Any, bytes], None], Wake], Dispatcher]
     _: KW_ONLY
     clock: Callable[[], float] = time.monotonic
     define: Define = lambda name: Definition()
@@ -128,8 +126,8 @@ class ClientProxy:
             if service.server is not None:
                 service.server.respond(handle, payload)
 
-        make = self.make_dispatcher
-        service = ProxiedService(spec, make(self._here(spec), respond, self._wake))
+        dispatcher = self.make_dispatcher(self._here(spec), respond, self._wake)
+        service = ProxiedService(spec, dispatcher)
         if spec.fallback is not None:
             self._adopt(service)
         return service

@@ -11,7 +11,6 @@ from dataclasses import replace
 from typing import Any
 
 from fogft import disk
-from fogft.disk import Watched
 from fogft.errors import FogftError
 from fogft.link.dial_out.robot import DialIn
 from fogft.model.credentials import Holder, Role, holder_of
@@ -38,7 +37,7 @@ class Following:
         self._clock = clock
         self._looks, self._looked_at = _LOOKS, clock()
         self._config = config
-        self._file = Watched(config.membership)
+        self._file = disk.Watched(config.membership)
         self._from_file: Membership | None = None
         self._changed = threading.Event()
         self._client: RendezvousClient | None = None
@@ -88,19 +87,16 @@ class Following:
                 changed=self._changed.set,
             )
             self._client.start()
-            self._announce(self._client)
+            self.renew()
         self._changed.set()
-
-    def _announce(self, client: RendezvousClient) -> None:
-        holder = self.holder()
-        kind = RecordKind.GATEWAY if holder.role is Role.GATEWAY else RecordKind.ROBOT
-        content = {"dial_in": self._config.dial_in}
-        client.publish(kind, holder.name, holder.generation, content)
 
     def renew(self) -> None:
         """Switch to the certificate that is now in its file."""
         if self._client is not None:
-            self._announce(self._client)
+            holder = self.holder()
+            kind = RecordKind.GATEWAY if holder.role is Role.GATEWAY else RecordKind.ROBOT
+            content = {"dial_in": self._config.dial_in}
+            self._client.publish(kind, holder.name, holder.generation, content)
 
     def look(self) -> Membership | None:
         """Return the membership if it may have changed.

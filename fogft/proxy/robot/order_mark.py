@@ -10,8 +10,7 @@ from pathlib import Path
 
 from fogft import disk
 from fogft.errors import StateError
-from fogft.ordering import orders
-from fogft.ordering.orders import Position
+from fogft.ordering.orders import Position, next_epoch
 
 _MAGIC = int.from_bytes(b"fogmark1", "little")
 # magic, the pool's uid, the term, the mark's epoch, the mark's index, the active version
@@ -59,7 +58,7 @@ class OrderMark:
     def new_term(self, nonce: int, *, above: int = 0) -> int:
         """Store and return a new epoch, greater than `above` and all earlier ones."""
         self._version = self.holder or ""  # another process may have written meanwhile
-        epoch = orders.next_epoch(max(self._words[_TERM], above), nonce)
+        epoch = next_epoch(max(self._words[_TERM], above), nonce)
         self._words[_TERM] = epoch
         self._map.flush()
         return epoch

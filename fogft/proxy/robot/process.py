@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from fogft import __version__, disk
-from fogft.disk import Watched
 from fogft.errors import FogftError, PoolBusy, RosError, StateError
 from fogft.link.uplinks import UplinkDialer
 from fogft.metrics import proxies
@@ -261,10 +260,10 @@ class _Running:
         """
         proxy, config, folder = self.proxy, self.config, self.config_path.parent
         memory, watchdog = memory_tuning.Trimmer(), Watchdog()
-        watched_config = Watched(self.config_path, from_now=True)
+        watched_config = disk.Watched(self.config_path, from_now=True)
         # The certificate is written after its key.
-        watched_certificate = Watched(config.credentials.certificate, from_now=True)
-        announcements = Watched(config.announcements) if config.announcements else None
+        watched_certificate = disk.Watched(config.credentials.certificate, from_now=True)
+        announcements = disk.Watched(config.announcements) if config.announcements else None
         started = reported = time.monotonic()
         looked = 0.0
         changed = False  # since the last report
@@ -360,10 +359,7 @@ _troubles: dict[Path, str] = {}
 
 
 def try_step(step: Callable[[], None], path: Path) -> bool:
-    """Run one step; errors such as a bad file or a full disk are logged once and skipped.
-
-    Returns whether it succeeded.
-    """
+    """Run a step, log an error such as a full disk once; return whether the step succeeded."""
     try:
         step()
     except (FogftError, OSError) as error:  # OSError: no file descriptor, no folder

@@ -55,9 +55,8 @@ def surplus(links: Mapping[Address, str]) -> list[Address]:
 class ConnectionReaper:
     """Watches one port until closed; keeps in `thin` the holders with a slow link.
 
-    `links` returns the peers' addresses of authenticated links, with their holders. Links of
-    `revoked` holders are closed, as are those with queued bytes that delivered none for
-    `stuck_after_s`. `also` is called at each look.
+    `links` returns the peers' addresses of authenticated links, with their holders; a link is stuck
+    if it delivered none of its queued bytes for `stuck_after_s`. `also` is called at each look.
     """
 
     port: int
@@ -103,11 +102,11 @@ class ConnectionReaper:
     def _fill_reserve(self) -> bool:
         """Fill the reserve; return False if no other descriptor is left."""
         try:
-            while len(self._reserve) < _RESERVE:
-                self._reserve.append(_open())
-            os.close(_open())
+            while len(self._reserve) <= _RESERVE:
+                self._reserve.append(os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC))
         except OSError:
             return False
+        os.close(self._reserve.pop())
         return True
 
     def _release_reserve(self) -> None:
@@ -196,7 +195,3 @@ class ConnectionReaper:
         self.counters.warn(
             log, event, "connection_ended reason=%s peer=%s:%d name=%r", event, *peer, name
         )
-
-
-def _open() -> int:
-    return os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)

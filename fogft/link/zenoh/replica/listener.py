@@ -1,9 +1,7 @@
 """A replica's end of links over Zenoh: receives requests and probes, queues replies per connection.
 
-A connection's answers are the replies to one query, which it makes once it has been admitted and
-which stays open. Zenoh's threads only decode and hand over. Each connection has its own thread for
-replies, because replying to a frozen robot can block; another thread answers probes, ahead of all
-replies.
+Zenoh's threads only decode and hand over: each connection's replies have their own thread
+(`reply_queue`), and another one answers probes (`control_queries`), ahead of all replies.
 """
 
 import logging

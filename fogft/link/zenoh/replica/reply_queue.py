@@ -138,11 +138,7 @@ class ReplyQueues:
         return len(self._queues)
 
     def put(self, token: bytes, robot: str, reply: Reply, *, more: bool) -> None:
-        """Send or queue a reply. Never blocks; if the queue is full, the reply is dropped.
-
-        Replies for one connection (`token`) never wait for another's. With `more`, other replies
-        follow soon, so that they can share one message.
-        """
+        """Send or queue a reply. Never blocks; if the queue is full, the reply is dropped."""
         size, counted = len(reply.payload), "refused" if reply.refusal else "replies"
         small = size <= SMALL_BYTES and not reply.may_pack
         if small and not more and not self._closed and get_ident() not in threads.idents:
@@ -193,14 +189,13 @@ class ReplyQueues:
     def _run(self, token: bytes, queue: ReplyQueue) -> None:
         unended: list[QueryEnd] = []
         while True:
+            if unended:
+                unended = [one for one in unended if not self._guarded(one.ended)]
             try:
                 taken = queue.next(_END_LOOK_S if unended else self.idle_s)
             except Empty:
-                if unended:
-                    unended = [one for one in unended if not self._guarded(one.ended)]
-                    continue
                 with self._lock:
-                    if queue.waiting:
+                    if unended or queue.waiting:
                         continue  # one came between the time-out and the lock
                     self._queues.pop(token, None)
                     return
@@ -213,8 +208,6 @@ class ReplyQueues:
                 self._guarded(partial(taken[0].stream.send, partial(send_together, taken)))
             else:
                 return
-            if unended:
-                unended = [one for one in unended if not self._guarded(one.ended)]
             with self._lock:
                 queue.waiting -= len(sizes)
                 for size in sizes:

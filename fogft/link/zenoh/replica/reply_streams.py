@@ -12,8 +12,6 @@ If a token is used for a second query, or its connection is the oldest of too ma
 query is ended, and the robot opens another connection.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import threading
@@ -21,13 +19,12 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 from weakref import WeakValueDictionary
 
-from fogft.link.frame import STAMP_BYTES
+import zenoh
 
-if TYPE_CHECKING:
-    import zenoh
+from fogft.link.frame import STAMP_BYTES
 
 CREDIT_LIMIT = 4  # replies of 16 KiB: 64 KiB, which those buffers hold
 _OTHERS_COUNT_FOR_S = 60.0

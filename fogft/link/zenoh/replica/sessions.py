@@ -13,7 +13,6 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from fogft.link import frame
-from fogft.link.frame import Greeting
 from fogft.model.credentials import Holder, Role, holder_of
 from fogft.model.refusal import Refusal
 from fogft.records.record import RecordError, Verify
@@ -49,7 +48,7 @@ class AuthenticatedSessions:
         self._holders: OrderedDict[str, OrderedDict[bytes, float]] = OrderedDict()
         self.revoked: frozenset[str] = frozenset()  # common names that are no longer admitted
 
-    def greet(self, greeting: Greeting) -> None:
+    def greet(self, greeting: frame.Greeting) -> None:
         """Admit a connection. Raises NotAdmittedError: its holder may not send requests here."""
         if not greeting.certificate:
             if greeting.token not in self._tokens:

@@ -106,6 +106,7 @@ class Attempts:
         self._seen = frame.NO_STAMP  # the stamp of the last answer
         self._telling = False
         self._unanswered = Unanswered()
+        self.awaited = self._unanswered.__len__  # how many answers may come, late ones included
         self._unpacker = Unpacker()
         self._batch = BatchBuffer()
         self._credit = Credit()
@@ -195,7 +196,7 @@ class Attempts:
             self._lose(error, *attempts)
 
     def _before(self, service: str) -> list[OpenAttempt]:
-        if self._queue.overtakes(service):
+        if service in self.options.latest:
             return []
         return [one for one in self.window.attempts() if one.payload is not None]
 
@@ -388,11 +389,6 @@ class Attempts:
     def sending(self) -> bool:
         """Whether a large message is being sent."""
         return self._sending_since is not None
-
-    @property
-    def awaits_answers(self) -> bool:
-        """Whether answers may still come, late ones included."""
-        return len(self._unanswered) > 0
 
     def look(self, now: float) -> float:
         """Track large sends; return how long the current one has taken so far."""

@@ -260,7 +260,7 @@ class Connection:
     def _end_flow(self) -> None:
         attempts = self.attempts
         try:
-            self.flow.end_when_safe(lambda: attempts.sending, lambda: attempts.awaits_answers)
+            self.flow.end_when_safe(lambda: attempts.sending, attempts.awaited)
         finally:
             attempts.end()
 

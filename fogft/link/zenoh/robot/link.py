@@ -70,7 +70,6 @@ class ZenohLink:
         self._live: Connection | None = None
         self.offer: Callable[..., bool] = _decline  # that of the live connection, if any
         self._state = LinkState.CONNECTING
-        # Services that the last probe answer reported ready; empty unless UP
         self.ready: frozenset[str] = frozenset()
         self._detail = "not reached yet"
         self._opening = Opening(peer, shared.settings)
