@@ -216,7 +216,7 @@ def key(
 
 
 ORDINARY = Key(Free(""), "")
-"""Of a field that is no key of the pool file: any value of its type is right."""
+"""For a field that is not a key of the pool file: any value of its type is valid."""
 
 
 def entries_of(cls: Any) -> list[Entry]:

@@ -101,6 +101,6 @@ SETUP_LIMIT_S = 3600
 by who follows its launch, and by the planner. Seconds."""
 
 NAMES_BYTES_LIMIT = 64 << 10
-"""Of the names of a pool's services and topics: each probe's answer names all that work."""
+"""Limit on a pool's service and topic names: each probe's answer lists those that work."""
 LINK_PORT = 7448
 """Where a server proxy listens unless told otherwise; 7447 is the port of `rmw_zenoh`'s router."""

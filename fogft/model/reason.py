@@ -152,7 +152,7 @@ NOTICES = (Cause.NOTICE, Cause.NOTICE_BY_REPLICA)
 MOVES = frozenset(
     {Cause.BETTER_SPREAD, Cause.BETTER_SCORE, Cause.SPOT_AGAIN, Cause.ON_DEMAND_AGAIN}
 )
-"""Of a healthy replica, to a better location."""
+"""Causes for moving a healthy replica to a better location."""
 
 
 def because(reason: Reason | None) -> tuple[Reason, ...]:

@@ -160,7 +160,7 @@ class LinkState(str, Enum):
 
 
 DOUBTED_AFTER_S = 0.6
-"""A probe unanswered for so long is a reason to look, and to look only."""
+"""A probe unanswered for this long is a reason to ask the cloud, and nothing more."""
 _DOUBTED_AFTER_ROUND_TRIPS = 3
 
 

@@ -21,7 +21,7 @@ from fogft.planning.observed.launches import given_up
 from fogft.planning.sizing import cap_usd
 
 LOST_S = 60.0
-"""Replaced when the robot's link to it was down for so long. Seconds."""
+"""A gateway is replaced when the robot's link to it was down for this many seconds."""
 PAUSE_S, LONGEST_PAUSE_S = 10.0, 600.0
 _WHEREABOUTS = ("infra", "cloud", "region", "zone")
 

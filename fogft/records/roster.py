@@ -93,7 +93,7 @@ READERS: dict[RecordKind, Callable[[Record], object]] = {
     RecordKind.ROBOT: dial_in,
     RecordKind.GATEWAY: dial_in,
 }
-"""What reads, and so checks, the content of each kind of record."""
+"""Functions that parse and validate the content of each kind of record."""
 
 
 def located(membership: Membership, slots: Iterable[Record]) -> Membership:

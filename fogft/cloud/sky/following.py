@@ -30,9 +30,9 @@ _JOB_PAUSE_LIMIT_S = 300.0
 
 _TRIES_LINES = 400  # of a launch's log: enough for its last attempts
 ASK_LIMIT_S = 180.0
-"""Until SkyPilot has accepted the order; then it is known that it never will."""
+"""How long SkyPilot may take to accept a launch; after that, it never will."""
 LAUNCH_LIMIT_S = 900.0
-"""From when SkyPilot began to the running machine; `SETUP_LIMIT_S`: from the order to the job."""
+"""From SkyPilot's start to the running VM; `SETUP_LIMIT_S`: from the launch to the job."""
 
 
 @dataclass

@@ -21,7 +21,7 @@ PRICE = "fogft-microusd"
 PORT = "fogft-port"
 NAME = "fogft-name"
 MAPPING_CLOUDS = frozenset({"runpod", "vast", "yotta"})
-"""Clouds whose machines are reached at another address and port than their own."""
+"""Clouds whose machines are reached at a mapped address and port."""
 
 _NAME = re.compile(r"fogft-([0-9a-f]{16})-(\d{1,9})-(\d{1,9})")
 _NUMBER = re.compile(r"\d{1,9}")

@@ -19,12 +19,12 @@ from fogft.model.replica import ReplicaId
 
 NO_UPLOAD, UPLOAD = "NO_UPLOAD", "LOCAL_CREDENTIALS"
 ENDED_BY_FILES = frozenset({"nebius", "oci", "vast"})
-"""Clouds whose VMs have no identity of their own: to end itself one needs its cloud's files."""
+"""Clouds whose VMs have no identity: a VM needs the cloud's credential files to end itself."""
 GROUP = ("aws", "security_group_name")  # by patterns of cluster names
 GUARD = ("aws", "post_provision_runcmd")  # part of the launch request itself
 EACH_BOOT = "/var/lib/cloud/scripts/per-boot"
 ALONE_MINUTES = 15 + SETUP_LIMIT_S // 60
-"""A launch takes 15 minutes at most (`following.LAUNCH_LIMIT_S`), a set-up its own limit."""
+"""A launch may take 15 minutes (`following.LAUNCH_LIMIT_S`), plus the limit for set-up."""
 NO_REPORTS = "SKYPILOT_DISABLE_USAGE_COLLECTION"
 
 

@@ -16,7 +16,7 @@ from fogft.planning.observed.history import History
 
 LONGEST_PAUSE_S = 60.0
 FALSE_ALARM_REMEMBERED_S = 600.0
-"""A link that often hesitates and then answers costs a question now and then, no more."""
+"""So a link that often pauses and recovers costs only an occasional query."""
 
 
 class _Silence(float, Enum):

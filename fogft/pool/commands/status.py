@@ -27,7 +27,7 @@ from fogft.pool.manager.status import PoolStatus
 
 _LOOK_EVERY_S = 0.05
 STALE_AFTER_S = 15.0
-"""A manager that has not looked for so long knows nothing of now."""
+"""An older observation of the manager says nothing about the present."""
 
 
 @dataclass(frozen=True)

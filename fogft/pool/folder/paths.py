@@ -68,7 +68,7 @@ class PoolPaths:
     spec = _File("spec.yaml")
     """The pool file as last applied, byte for byte."""
     good_spec = _File("good.yaml")
-    """The last pool file with which the pool was wholly ready, byte for byte."""
+    """The last pool file with which the whole pool was ready, byte for byte."""
     trial = _File("trial.json")
     """``{file, began_at, fault}``: what became of the file applied last."""
     intent = _File("intent.json")
@@ -83,15 +83,15 @@ class PoolPaths:
     membership = _File("membership.json")
     """The membership that the client proxy follows, and its cache."""
     discovered = _File("discovered.json")
-    """Services that replicas told of, where the pool file lists none."""
+    """Services that replicas reported, if the pool file lists none."""
     gateway = _File("gateway.json")
-    """Where the gateway is that the pool has launched."""
+    """The location of the gateway that the pool launched."""
     records = _File("records.json")
     """Records that the client proxy learned from a rendezvous."""
     manager_records = _File("manager-records.json")
     """Records that the manager published or learned."""
     announcements = _File("announcements.json")
-    """What the manager has signed for all replicas; the client proxy passes it on to them."""
+    """Records that the manager signed for all replicas; the client proxy forwards them."""
     history = _File("history.jsonl")
     """One JSON object a line: launches, ends, refusals; the generations used."""
     credentials = _File("credentials")

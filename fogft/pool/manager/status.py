@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # `fogft status` reads the schema and must be quick
     from fogft.pool.manager.reconciler import Tick
 
 VERSION = 1
-"""Of the JSON form: goes up when a key goes or changes what it means, not when one comes."""
+"""Of the JSON: grows when a key is removed or changes its meaning, not when one is added."""
 WORDS = {
     EventKind.LAUNCH: "launched",
     EventKind.REFUSED: "refused",
