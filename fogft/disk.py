@@ -289,8 +289,7 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
         fields = line.split()
         # A READ lock belongs to a process that only checks whether the file is locked.
         if len(fields) >= 6 and fields[1:4:2] == ["FLOCK", "WRITE"] and fields[5] == wanted:
-            pid = int(fields[4])
-            return pid if pid > 0 else None
+            return max(0, int(fields[4])) or None
     return said_holder(lock) if said and is_locked(lock) else None
 
 

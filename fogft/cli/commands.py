@@ -79,7 +79,7 @@ def _load(name: str, module: str, example: str) -> Any:
     found = getattr(import_module(f"fogft.cli.{module}"), name + "_" * keyword.iskeyword(name))
     if isinstance(found, typer.Typer):
         return typer.main.get_command(found)
-    alone = typer.Typer(add_completion=False)
+    alone = typer.Typer(rich_markup_mode=None, add_completion=False)
     alone.command(name, cls=Command, epilog=f"fogft {name} {example}")(found)
     return typer.main.get_command(alone)
 
@@ -132,13 +132,7 @@ class Commands(Group):
 
 
 class Command(TyperCommand):
-    """A command whose help shows arguments as ``SLOT`` or ``[FILE]``, without types and ranges.
-
-    Its epilog is an example of its use.
-    """
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **{**options, "rich_markup_mode": None})
+    """A command whose help shows arguments as ``SLOT`` or ``[FILE]``, without types and ranges."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse as usual, but refuse "nan", which passes every range check."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,7 +35,7 @@ def doctor(
         if not as_json:
             _show(finding)
     if as_json:
-        output.json_data([asdict(finding) for finding in found])
+        output.json_data([finding._asdict() for finding in found])
     failed = sum(f.verdict is Verdict.FAIL for f in found)
     warned = sum(f.verdict is Verdict.WARN for f in found)
     output.say(
@@ -51,8 +49,8 @@ def _show(finding: Finding) -> None:
     from rich.text import Text
 
     verdict = finding.verdict.value
-    text = output.indented(output.printable(finding.text), 26, sys.stdout)
+    text = output.indented(output.printable(finding.text), 26)
     parts = (f"{verdict:<4}", _STYLES[verdict]), f"  {finding.check:<18}  {text}"
     output.show(Text.assemble(*parts), folds=False)  # wrapped already, between whole paths
     if finding.advice:
-        output.data(f"{'':<26}-> {output.indented(finding.advice, 29, sys.stdout)}")
+        output.data(f"{'':<26}-> {output.indented(finding.advice, 29)}")

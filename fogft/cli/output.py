@@ -119,11 +119,11 @@ def width(stream: IO[str]) -> int | None:
     return _console(stream).width
 
 
-def indented(text: str, by: int, stream: IO[str]) -> str:
-    """Return text wrapped between words, with the same left margin on each line."""
+def indented(text: str, by: int) -> str:
+    """Return text for stdout, wrapped between words, with the same left margin on each line."""
     import textwrap
 
-    room = (width(stream) or _UNLIMITED) - by
+    room = (width(sys.stdout) or _UNLIMITED) - by
     folded = textwrap.wrap(text, max(room, 20), break_long_words=False, break_on_hyphens=False)
     return ("\n" + " " * by).join(folded)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -43,7 +42,7 @@ def show(shown: PlanShown, *, everything: bool = False) -> None:
         output.data("")
     for line in _summary(shown):
         by = 4 if line.startswith(" ") else _MARGIN
-        output.data(line[:by] + output.indented(line[by:], by, sys.stdout))
+        output.data(line[:by] + output.indented(line[by:], by))
 
 
 def to_json(shown: PlanShown) -> dict[str, Any]:

@@ -211,9 +211,7 @@ class Tail:
     def new_lines(self) -> Iterable[str]:
         """Return the complete lines added since the last call."""
         last, self._last = self._last, None  # a log that appears later is shown whole
-        if last is None:
-            return self._added()
-        return deque(self._added(), maxlen=min(last, sys.maxsize))
+        return deque(self._added(), maxlen=None if last is None else min(last, sys.maxsize))
 
     def _added(self) -> Iterator[str]:
         try:

@@ -1,9 +1,9 @@
 """The result of a check, with a remedy."""
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import NamedTuple
 
 from fogft.model.spec import PoolSpec
 
@@ -16,8 +16,7 @@ class Verdict(str, Enum):
     FAIL = "fail"  # does not work
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """The result of one check."""
 
     check: str
@@ -26,8 +25,7 @@ class Finding:
     advice: str = ""
 
 
-@dataclass(frozen=True)
-class Situation:
+class Situation(NamedTuple):
     """The input of all checks."""
 
     home: Path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,6 @@ _LINK_COUNTS = {
     ),
     "restarts": ("fogft_replica_restarts_total", "Restarts of a replica's command."),
 }
-_WORK_GAUGES = {"held": ("fogft_requests_held", "Requests held and not yet answered.")}
 _WORK_COUNTS = {
     "ran": ("fogft_requests_run_total", "Requests passed on to a service."),
     "ran_s": ("fogft_request_run_seconds_total", "Time that services spent on requests."),
@@ -139,11 +139,10 @@ def _refusals(values: Iterator[tuple[float, dict[str, str]]]) -> Metric:
     return counter("fogft_refusals_total", "Copies of requests that were refused.", values)
 
 
-def _by_slot(by_replica: Mapping[str, int]) -> dict[str, int]:
-    found: dict[str, int] = {}
+def _by_slot(by_replica: Mapping[str, int]) -> Counter[str]:
+    found: Counter[str] = Counter()
     for replica, count in by_replica.items():
-        slot = replica.partition(".")[0]
-        found[slot] = found.get(slot, 0) + count
+        found[replica.partition(".")[0]] += count
     return found
 
 
@@ -160,9 +159,9 @@ def _slot(link: Mapping[str, Any]) -> dict[str, str]:
 def of_server(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a server proxy from its report."""
     work: Mapping[str, float] = report["work"]
-    for kind, table in ((gauge, _WORK_GAUGES), (counter, _WORK_COUNTS)):
-        for key, (name, help) in table.items():
-            yield kind(name, help, [(work[key], {})])
+    yield gauge("fogft_requests_held", "Requests held and not yet answered.", [(work["held"], {})])
+    for key, (name, help) in _WORK_COUNTS.items():
+        yield counter(name, help, [(work[key], {})])
     yield _refusals((count, {"reason": reason}) for reason, count in report["refused"].items())
     yield gauge(
         "fogft_concurrency_limit",

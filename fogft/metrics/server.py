@@ -23,7 +23,6 @@ def bound(endpoint: str, app: Callable[..., Any]) -> WSGIServer:
 
 class _Server(ThreadingMixIn, WSGIServer):
     daemon_threads = True
-    block_on_close = False
 
     def server_activate(self) -> None:
         self._open: dict[socket.socket, None] = {}  # oldest first

@@ -8,8 +8,8 @@ its own size, counted from the end of the four-byte header.
 import re
 import struct
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from fogft.model.type_definition import Fields
 
@@ -62,8 +62,7 @@ class _Bytes:
 _Walk = Callable[[_Bytes, int], int]  # from the offset of a value to the offset after it
 
 
-@dataclass(frozen=True)
-class _Kind:
+class _Kind(NamedTuple):
     """How to skip a value of one type."""
 
     walk: _Walk

@@ -1,7 +1,4 @@
-"""Pool file values: placement, numbers, schedule and price. Data only.
-
-Each field made by `key` is a key of the pool file.
-"""
+"""Pool file values: placement, numbers, schedule and price. Data only."""
 
 import re
 from collections.abc import Mapping

@@ -97,10 +97,8 @@ def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:
     """Return a `resources` section restricted to spot machines, or to on-demand ones."""
     out = {**resources, "use_spot": spot}
     for key in ("any_of", "ordered"):
-        if isinstance(out.get(key), list):
-            out[key] = [
-                {**one, "use_spot": spot} if isinstance(one, Mapping) else one for one in out[key]
-            ]
+        if out.get(key):
+            out[key] = [{**one, "use_spot": spot} for one in out[key]]
     return out
 
 

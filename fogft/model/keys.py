@@ -6,17 +6,17 @@ are all derived from these fields.
 """
 
 import dataclasses
-from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, field
 from enum import Enum
+from functools import cache
 from typing import Any, NamedTuple
 
 DAY_S = 86_400.0
 LONGEST_S = 1e7  # the longest duration that a request's header can carry
 
 
-@dataclass(frozen=True)
-class Number:
+class Number(NamedTuple):
     """A number above 0, or 0 and above, up to a limit."""
 
     most: float
@@ -24,8 +24,7 @@ class Number:
     from_zero: bool = False
 
 
-@dataclass(frozen=True)
-class Whole:
+class Whole(NamedTuple):
     """A whole number between two limits."""
 
     least: int
@@ -33,21 +32,19 @@ class Whole:
     unit: str = ""
 
 
-@dataclass(frozen=True)
-class Flag:
+class Flag(NamedTuple):
     """True or false."""
 
 
-@dataclass(frozen=True)
-class OneOf:
+class OneOf(NamedTuple):
     """An enumeration's value; `hidden` ones occur only in the proxies' configurations."""
 
     of: type[Enum]
     hidden: tuple[Enum, ...] = ()
+    hints: Mapping[str, str] = {}  # for values of other versions
 
 
-@dataclass(frozen=True)
-class Text:
+class Text(NamedTuple):
     """A string of a given form.
 
     With `has_parts`, proxies' configurations may hold further values that no pool file may hold,
@@ -72,8 +69,7 @@ def only(is_right: Callable[[str], object], what: str = "") -> Callable[[str], s
     return check
 
 
-@dataclass(frozen=True)
-class Listed:
+class Listed(NamedTuple):
     """A list of distinct strings."""
 
     of: Text
@@ -81,16 +77,14 @@ class Listed:
     least: int = 1
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """A map from strings to numbers."""
 
     of: Number
     name: Text
 
 
-@dataclass(frozen=True)
-class Map:
+class Map(NamedTuple):
     """A map with the keys of a dataclass."""
 
     of: type
@@ -99,8 +93,7 @@ class Map:
     off: bool = False  # whether `false` in its place means None
 
 
-@dataclass(frozen=True)
-class Maps:
+class Maps(NamedTuple):
     """A list of maps with the keys of a dataclass, each with a unique name."""
 
     of: type
@@ -108,15 +101,13 @@ class Maps:
     most: int = 1000
 
 
-@dataclass(frozen=True)
-class Free:
+class Free(NamedTuple):
     """A map that is passed on unchanged."""
 
     hint: str
 
 
-@dataclass(frozen=True)
-class Special:
+class Special(NamedTuple):
     """Any other form: its description, its reader and its JSON Schema."""
 
     what: str
@@ -175,8 +166,7 @@ def checked(form: Form, value: Any) -> Any:
     return value
 
 
-@dataclass(frozen=True)
-class Key:
+class Key(NamedTuple):
     """The description of one key."""
 
     form: Form
@@ -229,12 +219,8 @@ def entries_of(cls: Any) -> list[Entry]:
     return found
 
 
-_KNOWN: dict[type, tuple[Entry, ...]] = {}
-
-
+@cache
 def keys_of(cls: type) -> tuple[Entry, ...]:
     """Return the keys of a dataclass, in order; required ones first."""
-    if cls not in _KNOWN:
-        found = [entry for entry in entries_of(cls) if entry.key is not ORDINARY]
-        _KNOWN[cls] = tuple(sorted(found, key=lambda entry: not entry.required))
-    return _KNOWN[cls]
+    found = [entry for entry in entries_of(cls) if entry.key is not ORDINARY]
+    return tuple(sorted(found, key=lambda entry: not entry.required))

@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Collection, Iterable
-from enum import Enum
 from typing import Any
 
 from fogft.errors import StateError
@@ -19,29 +18,14 @@ from fogft.model.spec import PoolSpec
 from fogft.model.topology import Topology, trouble
 
 
-class Found(Enum):
-    """How a proxy finds a replica."""
-
-    BY_CLOUD = "cloud"  # at the endpoint that the cloud reports
-    BY_RECORD = "record"  # at that endpoint, or at the one in the replica's own record
-    BY_DOOR = "door"  # it dials in
-
-    @classmethod
-    def of(cls, spec: PoolSpec) -> Found:
-        """Return how proxies find the replicas of a pool."""
-        if spec.dial_in:
-            return cls.BY_DOOR
-        return cls.BY_RECORD if spec.rendezvous else cls.BY_CLOUD
-
-
 def members_of(
     machines: Iterable[Machine],
+    spec: PoolSpec,
     *,
     pool_uid: str,
     draining: Collection[ReplicaId] = (),
     ending: Collection[ReplicaId] = (),
     revoked: Collection[str] = (),
-    found: Found = Found.BY_CLOUD,
     by_hand: Iterable[ReplicaId] = (),
 ) -> tuple[Member, ...]:
     """Return the members to hold links to: this pool's, not ending, not revoked, and findable.
@@ -52,13 +36,13 @@ def members_of(
     members = tuple(
         Member(
             machine.id,
-            "" if found is Found.BY_DOOR else machine.endpoint or "",
+            "" if spec.dial_in else machine.endpoint or "",  # it dials in, or has a record
             machine.id in draining or machine.notice,
             version=machine.spec_hash,
         )
         for machine in sorted(machines, key=lambda m: m.id)
         if machine.id.pool_uid == pool_uid
-        and (machine.endpoint is not None or found is not Found.BY_CLOUD)
+        and (machine.endpoint is not None or spec.rendezvous or spec.dial_in)
         and machine.phase is not MachinePhase.FAILED
         and machine.id not in ending
         and machine.id.certificate_name not in revoked

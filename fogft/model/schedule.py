@@ -1,7 +1,4 @@
-"""Replicas and cap by time of the week. Pure: `now` is an argument.
-
-Windows are in local time, so they follow daylight-saving time.
-"""
+"""Replicas and cap by time of the week. Pure: `now` is an argument."""
 
 import datetime
 import zoneinfo

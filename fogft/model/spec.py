@@ -127,7 +127,7 @@ class ServiceSpec:
         parameter=True,
     )
     hedging: HedgingMode = key(
-        OneOf(HedgingMode),
+        OneOf(HedgingMode, hints={"adaptive": "is now called `auto`, which is the default"}),
         "How many replicas get a request: all of them while they are idle and fewer as load "
         "rises (`auto`), always all (`all`), or one, and another if it fails (`failover`).",
         default=HedgingMode.AUTO,

@@ -120,18 +120,13 @@ class Topology:
         """Whether there is any gateway."""
         return bool(self.gateways)
 
-    def of(self, name: str) -> Gateway | None:
-        """Return a gateway by its name."""
-        return next((g for g in self.gateways if g.name == name), None)
-
     def neighbours(self, holder: Holder) -> tuple[Gateway, ...]:
         """Return the gateways that a robot or gateway connects to; if empty, the replicas.
 
         Gateways without a valid certificate are left out.
         """
         if holder.role is Role.GATEWAY:
-            own = self.of(holder.name)
-            listed = own.through if own is not None else ()
+            listed = next((g.through for g in self.gateways if g.name == holder.name), ())
         else:
             listed = self.robots.get(holder.name, self.through)
         return tuple(g for g in self.gateways if g.name in listed and g.generations)

@@ -1,6 +1,5 @@
 """Read a pool file from disk."""
 
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +25,7 @@ def mistakes(path: Path, checks: Checks = UNCHECKED) -> list[SpecError]:
     found = Mistakes(keep=True)
     with found.step():
         source = read_text(path)
-        checks = replace(checks, workdir=partial(_no_folder, path.resolve().parent))
+        checks = checks._replace(workdir=partial(_no_folder, path.resolve().parent))
         pool_spec(yaml_tree.tree(source, str(path)), str(path), checks, found)
     return sorted(found.found, key=lambda error: error.line)
 
@@ -38,10 +37,8 @@ def parse(
 
     The stem of `file` names the pool if the text does not.
     """
-    if len(source) > MAX_BYTES:
-        raise _too_large(file)
     if folder is not None:
-        checks = replace(checks, workdir=partial(_no_folder, folder))
+        checks = checks._replace(workdir=partial(_no_folder, folder))
     return pool_spec(yaml_tree.tree(source, file), file, checks)
 
 
@@ -61,7 +58,8 @@ def read_text(path: Path | str) -> str:
         hint = "check the path and its permissions"
         raise SpecError(f"{path}: cannot be read: {reason}", hint) from None
     if len(raw) > MAX_BYTES:
-        raise _too_large(str(path))
+        hint = "a pool file is short; is this the right file?"
+        raise SpecError(f"{path}: is larger than {MAX_BYTES >> 20} MiB", hint)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -81,8 +79,3 @@ def _no_folder(base: Path, workdir: str) -> SpecError | None:
         return SpecError(f"`{workdir}` cannot be read: {error}")
     hint = "a relative path begins at the pool file's own folder"
     return SpecError(f"there is no folder `{folder}`", hint)
-
-
-def _too_large(file: str) -> SpecError:
-    what = f"{file}: is larger than {MAX_BYTES >> 20} MiB"
-    return SpecError(what, "a pool file is short; is this the right file?")

@@ -61,8 +61,7 @@ def changed(spec: ServiceSpec, values: Mapping[str, Value]) -> ServiceSpec:
         read: ServiceSpec = Reader(RULES).map(ServiceSpec, section)
     except SpecError as error:
         key = error.key.removeprefix(f"{spec.name}.").removeprefix(f"{ADVANCED}.")
-        reason = f"{key}: {error.what}"
-        raise ValueError(f"{reason}; {error.hint}" if error.hint else reason) from None
+        raise ValueError(told(SpecError(f"{key}: {error.what}", error.hint))) from None
     return replace(read, traffic=spec.traffic)
 
 

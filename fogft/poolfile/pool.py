@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 from fogft.errors import FogftError
 from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
@@ -23,8 +23,7 @@ def _nothing(*_: object) -> None:
     return None
 
 
-@dataclass(frozen=True)
-class Checks:
+class Checks(NamedTuple):
     """Checks that depend on this machine, run when everything else is valid.
 
     Each returns the problem with a hint, or None if there is none.

@@ -23,7 +23,8 @@ class Reader:
 
     def map(self, cls: type[T], section: Section) -> T:
         """Return the dataclass that a map describes."""
-        entries = keys_of(cls)
+        kind: Any = cls  # mypy doubts that `type[T]` is hashable
+        entries = keys_of(kind)
         below = [e.name for e in entries if e.key.advanced]
         known = [e.name for e in entries if not e.key.advanced]
         allowed = [*known, ADVANCED] if below else known
@@ -75,7 +76,8 @@ class Reader:
             case keys.Flag():
                 return section.flag(name, bool(default))
             case keys.OneOf() as form:
-                return section.choice(name, [m for m in form.of if m not in form.hidden])
+                allowed = [m for m in form.of if m not in form.hidden]
+                return section.choice(name, allowed, form.hints)
             case keys.Text() as form:
                 return _text(form, section, name, section.text(name, form.hint))
             case keys.Listed() as form:

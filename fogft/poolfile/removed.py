@@ -8,7 +8,7 @@ from fogft.model.choices import (
     ScheduleSpec,
 )
 from fogft.model.keys import keys_of
-from fogft.model.spec import HealthSpec, HedgingMode, PoolSpec, ServiceSpec
+from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
 from fogft.model.topology import Gateway, RobotRoute, Topology
 
@@ -62,9 +62,6 @@ HINTS: dict[type, dict[str, Hint]] = {
     Topology: {"through": _renamed("default_gateways")},
     Gateway: {"through": _renamed("upstream")},
     RobotRoute: {"through": _renamed("gateways")},
-}
-VALUE_HINTS: dict[tuple[type, str], str] = {
-    (HedgingMode, "adaptive"): "is now called `auto`, which is the default"
 }
 
 

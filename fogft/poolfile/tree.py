@@ -10,18 +10,15 @@ import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from enum import Enum
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 from fogft.errors import SpecError
 
 SMALLEST = 1e-12  # of a number above 0: a smaller one is a typing mistake
-Choice = TypeVar("Choice", bound=Enum)
 
 
-@dataclass(frozen=True)
-class Node:
+class Node(NamedTuple):
     """A value with its line, and the line of the key that it belongs to."""
 
     value: str | int | float | bool | tuple[Node, ...] | Mapping[str, Node] | None
@@ -184,15 +181,13 @@ class Section:
             raise self.error(key, f"must be {limits}, not {shown(node.value)}", hint)
         return float(node.value)
 
-    def choice(self, key: str, members: Sequence[Choice]) -> Choice:
-        """Return one of the given members of an enumeration."""
+    def choice(self, key: str, members: Sequence[Enum], hints: Mapping[str, str]) -> Enum:
+        """Return one of the given members of an enumeration; `hints` are by value."""
         by_value = {str(member.value): member for member in members}
         allowed = " or ".join(f"`{value}`" for value in by_value)
         text = self.text(key, f"write {allowed}")
         if text not in by_value:
-            from fogft.poolfile.removed import VALUE_HINTS  # late: it loads all of a pool's model
-
-            hint = VALUE_HINTS.get((type(members[0]), text)) or nearest(text, by_value)
+            hint = hints.get(text) or nearest(text, by_value)
             raise self.error(key, f"must be {allowed}, not {shown(text)}", hint)
         return by_value[text]
 

@@ -12,13 +12,13 @@ Source: the design document and `attachment_helpers.cpp` of ros2/rmw_zenoh.
 import hashlib
 import struct
 import threading
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from fogft.model import ros_names
 
 ROOT = "@ros2_lv"
 NODE, SERVER, CLIENT = "NN", "SS", "SC"
-KEEP_ALL = "::2,:,:,:,,"  # reliable and volatile are its defaults, and left out
+_KEEP_ALL = "::2,:,:,:,,"  # a QoS; reliable and volatile are its defaults, and left out
 NO_HASH = "TypeHashNotSupported"  # what a distribution without type hashes (Humble) writes
 
 _NODE_PARTS, _SERVICE_PARTS = 9, 13
@@ -27,8 +27,7 @@ _STAMP = slice(8, 16)  # of the attachment: between sequence number and GID
 _ATTACHMENT_BYTES = (32, 33)  # without and with a byte for the GID's length
 
 
-@dataclass(frozen=True)
-class Token:
+class Token(NamedTuple):
     """A liveliness token of a node, or of a service's server or client."""
 
     domain: int
@@ -41,13 +40,12 @@ class Token:
     service: str = ""  # this and the following fields: empty for a node
     type: str = ""  # ``package/srv/Name``
     hash: str = ""
-    quality: str = KEEP_ALL  # as `rmw_zenoh` writes it
 
     def __str__(self) -> str:
         parts = [ROOT, str(self.domain), self.session, self.node_id, self.id, self.kind]
         parts += ["%", self.namespace.replace("/", "%"), self.node]
         if self.kind != NODE:
-            parts += [self.service.replace("/", "%"), dds_type(self.type), self.hash, self.quality]
+            parts += [self.service.replace("/", "%"), dds_type(self.type), self.hash, _KEEP_ALL]
         return "/".join(parts)
 
     @property
@@ -71,9 +69,7 @@ def read_token(key: str) -> Token | None:
     if not type_name:
         return None
     service = parts[9].replace("%", "/")
-    return Token(
-        domain, session, node_id, id, kind, node, namespace, service, type_name, *parts[11:]
-    )
+    return Token(domain, session, node_id, id, kind, node, namespace, service, type_name, parts[11])
 
 
 def service_key(domain: int, name: str, type_name: str, hash: str) -> str:

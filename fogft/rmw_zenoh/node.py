@@ -65,21 +65,18 @@ class RmwZenohNode:
         config = settings_from(environ)
         try:
             self._session: Any = zenoh.open(config)
-            self._start()
+            self._id = str(self._session.zid())
+            self.graph = Graph(self._id)
+            self.offered = self.graph.offered
+            self._probes = NodeProbes(self.client, self.graph.same_node_serves)
+            live = self._session.liveliness()
+            node = Token(self._domain, self._id, "0", "0", NODE, self._name)
+            self._declared = live.declare_token(str(node))
+            seen = handlers.Callback(self._seen, indirect=False)
+            tokens = f"{naming.ROOT}/{self._domain}/**"
+            self._subscriber = live.declare_subscriber(tokens, seen, history=True)
         except zenoh.ZError as error:
             raise RosError(f"no Zenoh session among `rmw_zenoh`'s nodes: {error}") from error
-
-    def _start(self) -> None:
-        self._id = str(self._session.zid())
-        graph = self.graph = Graph(self._id)
-        self.offered = graph.offered
-        self._probes = NodeProbes(self.client, graph.same_node_serves)
-        live = self._session.liveliness()
-        node = Token(self._domain, self._id, "0", "0", NODE, self._name)
-        self._declared = live.declare_token(str(node))
-        seen = handlers.Callback(self._seen, indirect=False)
-        tokens = f"{naming.ROOT}/{self._domain}/**"
-        self._subscriber = live.declare_subscriber(tokens, seen, history=True)
 
     def _seen(self, sample: Any) -> None:
         key = str(sample.key_expr)

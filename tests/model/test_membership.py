@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from fogft.errors import StateError
 from fogft.model import membership as memberships
 from fogft.model.replica import Member, Membership, ReplicaId
+from fogft.model.spec import PoolSpec
 from tests.planning.pool_worlds import STRANGER, UID, replica
 
 members = st.lists(
@@ -129,7 +130,7 @@ def test_members_are_those_to_talk_to() -> None:
         replica(4, state="failed").machine,
     ]
     found = memberships.members_of(
-        machines, pool_uid=UID, draining=[machines[2].id], ending=[machines[3].id]
+        machines, PoolSpec(), pool_uid=UID, draining=[machines[2].id], ending=[machines[3].id]
     )
     assert [(m.id.short, m.draining) for m in found] == [
         ("0.1", False),
@@ -165,6 +166,6 @@ def test_replicas_started_by_hand_are_members_that_say_where_they_are() -> None:
     """The highest generation of each slot, and never in the place of a machine."""
     machine = replica(100).machine
     by_hand = [ReplicaId(UID, 101, 1), ReplicaId(UID, 101, 3), ReplicaId(UID, 100, 9)]
-    found = memberships.members_of([machine], pool_uid=UID, by_hand=by_hand)
+    found = memberships.members_of([machine], PoolSpec(), pool_uid=UID, by_hand=by_hand)
     assert [member.id for member in found] == [machine.id, ReplicaId(UID, 101, 3)]
     assert found[1] == Member(ReplicaId(UID, 101, 3), "")

@@ -6,7 +6,6 @@ What it promises as a node of ROS is tested with the others' (`tests/contract/te
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import struct
 import threading
 import time
@@ -165,7 +164,7 @@ class PlainClient:
         if answers_probes:
             name = "/robot/get_parameter_types"
             token = Token(7, str(session.zid()), "0", "2", SERVER, "robot", "/", name, self.TYPES)
-            said = str(dataclasses.replace(token, hash=HASH))
+            said = str(token._replace(hash=HASH))
             key = service_key(7, name, self.TYPES, HASH)
             held = handlers.Callback(self._probes.append, indirect=False)
             self._declared += [

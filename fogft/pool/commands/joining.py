@@ -22,7 +22,7 @@ from fogft.errors import CredentialError, FogftError, SpecError
 from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
 from fogft.model.keys import only
-from fogft.model.membership import Found, to_dict
+from fogft.model.membership import to_dict
 from fogft.model.names import Endpoint
 from fogft.model.plain import from_plain
 from fogft.model.replica import ReplicaId
@@ -93,12 +93,12 @@ def _check_found(spec: PoolSpec, role: Role, name: str) -> None:
     if spec.rendezvous:
         return
     add = "add `fogft.rendezvous` to the pool file and run `fogft up`"
-    if role is Role.REPLICA and Found.of(spec) is Found.BY_CLOUD:
+    if role is Role.REPLICA and not spec.dial_in:
         raise CredentialError(
             f"replica `{name}` could not be found: the pool has no rendezvous",
             f"{add}, or set `fogft.dial_in` so that it dials the robot",
         )
-    if role in (Role.ROBOT, Role.GATEWAY) and Found.of(spec) is Found.BY_DOOR:
+    if role in (Role.ROBOT, Role.GATEWAY) and spec.dial_in:
         raise CredentialError(
             f"{role.value} `{name}` would find no replica: replicas dial this machine's robot, "
             "and only a rendezvous can tell them about others",

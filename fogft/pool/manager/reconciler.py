@@ -19,7 +19,7 @@ from fogft.cloud.port import Cloud, Launch, RealCloud, Refreshing
 from fogft.errors import CloudError, CloudUnreachable, FogftError, NoCapacity, QuotaExceeded, told
 from fogft.model.groups import GATEWAY_SLOT, replica_hash, sales, task_at
 from fogft.model.intent import Intent
-from fogft.model.membership import Found, members_of, successor
+from fogft.model.membership import members_of, successor
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import (
     LinkReport,
@@ -330,23 +330,21 @@ class Reconciler:
 
     def _publish(self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan) -> None:
         revoked = self.revoked()
-        found = Found.of(spec)
-        by_hand = self.by_hand() if found is not Found.BY_CLOUD else frozenset()
+        # Otherwise they cannot be found.
+        by_hand = self.by_hand() if spec.rendezvous or spec.dial_in else frozenset()
         gateways = self.gateways() if spec.topology else {}
         ending = {end.id for end in plan.terminations} | observed.ending
         machines = observed.machines or ()
-        if found is Found.BY_CLOUD:  # others cannot be found
-            machines = tuple([m for m in machines if m.endpoint is not None])
         cause = spec, machines, plan.draining, ending, revoked, by_hand, gateways
         if cause == self._published_for:
             return
         members = members_of(
             machines,
+            spec,
             pool_uid=identity.uid,
             draining=plan.draining,
             ending=ending,
             revoked=revoked,
-            found=found,
             by_hand=by_hand,
         )
         membership = successor(

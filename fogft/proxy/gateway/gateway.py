@@ -91,7 +91,7 @@ class Forwarder:
             return Refusal.NOT_READY
         of_robot = self._by_robot[incoming.robot]
         full = self._known.held >= self.held_limit or of_robot >= self.of_one_limit
-        too_large = not self._known.large.has_room_for(incoming.robot, len(incoming.payload))
+        too_large = not self._known.large.has_room(len(incoming.payload), incoming.robot)
         return Refusal.OVERLOADED if full or too_large else None
 
     def _refuse(self, incoming: Incoming, reason: Refusal) -> None:

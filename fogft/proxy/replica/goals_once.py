@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from fogft.byte_limit import SharedByteLimit
+from fogft.byte_limit import ByteLimit
 from fogft.errors import RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
@@ -135,11 +135,11 @@ class GoalsOnce:
             return Refusal.EXPIRED
         if not self.is_ready(incoming.service) or incoming.service not in self._clients:
             return Refusal.NOT_READY
-        large = SharedByteLimit(_BYTES_LIMIT)
+        large = ByteLimit(_BYTES_LIMIT)
         for other in self._servers.values():
             for open in other.open.values():
-                large.hold(open.robot, open.size * max(len(open.waiting), 1))
-        if not large.has_room_for(incoming.robot, len(incoming.payload)):
+                large.add(open.size * max(len(open.waiting), 1), open.robot)
+        if not large.has_room(len(incoming.payload), incoming.robot):
             return Refusal.OVERLOADED
         known = server.open.get(goal)
         if known is None:

@@ -8,7 +8,7 @@ owner's lock.
 import heapq
 from collections import OrderedDict
 
-from fogft.byte_limit import SMALL_BYTES, SharedByteLimit
+from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.proxy.replica.service_queue import Job
 
 COPIES_LIMIT = 8  # copies of one request waiting for its answer, one per reopened link
@@ -33,7 +33,7 @@ class KnownRequests:
         self._kept: OrderedDict[bytes, Job] = OrderedDict()
         self._kept_bytes = 0
         self.held = 0  # how many jobs are open
-        self.large = SharedByteLimit(held_bytes)
+        self.large = ByteLimit(held_bytes)
 
     def __len__(self) -> int:
         """Return the number of entries: requests, including answered ones, and deadlines."""
@@ -62,13 +62,13 @@ class KnownRequests:
             heapq.heapify(self._deadlines)
         self.held += 1
         if job.size > SMALL_BYTES:
-            self.large.hold(job.robot, job.size)
+            self.large.add(job.size, job.robot)
 
     def end(self, job: Job, answer: bytes | None = None) -> None:
         """Note that a job is done; its answer is kept for copies, within the bounds."""
         self.held -= 1
         if job.size > SMALL_BYTES:
-            self.large.let_go(job.robot, job.size)
+            self.large.remove(job.size, job.robot)
         if answer is None:
             return
         job.answer = answer

@@ -186,7 +186,7 @@ class Responder:
         full = queue.waiting() and queue.hopeless(incoming.robot, deadline, remaining_s)
         size = len(incoming.payload)
         large = self.known.large
-        if full or (size > SMALL_BYTES and not large.has_room_for(incoming.robot, size)):
+        if full or (size > SMALL_BYTES and not large.has_room(size, incoming.robot)):
             return Refusal.OVERLOADED, None
         if queue.waiting() + queue.at_work < self.held_limit:
             return None, None

@@ -16,7 +16,7 @@ from itertools import count
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, NamedTuple
 
-from fogft.byte_limit import SharedByteLimit
+from fogft.byte_limit import ByteLimit
 from fogft.errors import FrameError, RosError, Unreadable
 from fogft.link.port import Incoming
 from fogft.model.refusal import Refusal
@@ -124,7 +124,7 @@ class _Inbox:
         self._take, self._refuse = take, refuse
         self._lock = threading.Lock()
         self._waiting: FairQueue[Incoming] = FairQueue()
-        self._large = SharedByteLimit(_WAITING_BYTES)
+        self._large = ByteLimit(_WAITING_BYTES)
         self._count = count()
         self._due: SimpleQueue[bool] = SimpleQueue()  # one True per item put in; False to end
 
@@ -133,16 +133,16 @@ class _Inbox:
         robot, size = incoming.robot, len(incoming.payload)
         excess: Incoming | None = None
         with self._lock:
-            if not self._large.has_room_for(robot, size):
+            if not self._large.has_room(size, robot):
                 excess = incoming
             elif self._waiting.size() >= _WAITING_LIMIT:
                 excess = self._waiting.evict(robot, 0.0) or incoming
             if excess is not incoming:
-                self._large.hold(robot, size)
+                self._large.add(size, robot)
                 self._waiting.put(b"%d" % next(self._count), robot, 0.0, incoming)
                 self._due.put(True)
             if excess is not None and excess is not incoming:
-                self._large.let_go(excess.robot, len(excess.payload))
+                self._large.remove(len(excess.payload), excess.robot)
         if excess is not None:
             self._refuse(excess)
 
@@ -152,7 +152,7 @@ class _Inbox:
             with self._lock:
                 incoming = self._waiting.take()
                 if incoming is not None:
-                    self._large.let_go(incoming.robot, len(incoming.payload))
+                    self._large.remove(len(incoming.payload), incoming.robot)
             try:
                 if incoming is not None:
                     self._take(incoming)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from fogft.model.credentials import CredentialPaths, Holder, Role
-from fogft.model.membership import Found, members_of
+from fogft.model.membership import members_of
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, Placement, ReplicaId
 from fogft.model.spec import PoolSpec, ServiceSpec
 from fogft.pool.credentials import authority
@@ -137,8 +137,8 @@ def test_a_replica_whose_address_the_cloud_does_not_know_is_admitted_where_it_ca
     services = (ServiceSpec("/a", "std_srvs/srv/SetBool"),)
 
     def endpoints(**keys: object) -> dict[int, str]:
-        found = Found.of(PoolSpec("p", services, **keys))
-        members = members_of((machine, known), pool_uid=UID, found=found)
+        spec = PoolSpec("p", services, **keys)
+        members = members_of((machine, known), spec, pool_uid=UID)
         return {m.id.slot: m.endpoint for m in members}
 
     assert endpoints() == {1: "10.0.0.1:1"}
