@@ -5,7 +5,7 @@ import socket
 
 
 def is_ready(
-    file: int | socket.socket, timeout_s: float | None = 0.0, *, event: int = select.POLLIN
+    file: int | socket.socket, timeout_s: float | None = 0.0, *, event: int | None = None
 ) -> bool:
     """Wait until a file, socket or pidfd is readable, or until `event`; return whether it is.
 
@@ -13,7 +13,7 @@ def is_ready(
     """
     waiting = select.poll()
     try:
-        waiting.register(file, event)
+        waiting.register(file, select.POLLIN if event is None else event)
     except ValueError:
         return True
     return bool(waiting.poll(None if timeout_s is None else timeout_s * 1e3))

@@ -121,10 +121,11 @@ class Section:
             yield self.error(key, what, hint, at_key=True)
 
     def has(self, key: str) -> bool:
-        """Whether the key has a value, here or under `advanced`."""
+        """Whether the key has a value, here or under `advanced`, which no SkyPilot task has."""
         if key in self.children:
             return self.children[key].value is not None
-        below = self.children["advanced"].value if "advanced" in self.children else None
+        is_ours = self.path and "advanced" in self.children
+        below = self.children["advanced"].value if is_ours else None
         return isinstance(below, Mapping) and key in below and below[key].value is not None
 
     def text(self, key: str, hint: str) -> str:

@@ -26,6 +26,10 @@ class Missing:
 sys.meta_path.insert(0, Missing())
 for name in {missing!r}:
     sys.modules.pop(name, None)
+if sys.platform == "win32":
+    import select
+    for name in [name for name in vars(select) if name.lower().startswith(("poll", "epoll"))]:
+        delattr(select, name)
 from fogft.cli import main
 for words in {commands!r}:
     out, err = io.StringIO(), io.StringIO()

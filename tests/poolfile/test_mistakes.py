@@ -59,6 +59,13 @@ def test_every_mistake_is_found_with_its_line():
     assert [line for line, _ in shown] == sorted(line for line, _ in shown)
 
 
+def test_advanced_is_of_fogft_and_not_of_a_task():
+    """No key of the task is looked for there."""
+    below = "{num_nodes: 2, workdir: 1, envs: {A: b}, secrets: {}, resources: {}, setup: x}"
+    told = found(f"run: x\nadvanced: {below}\nfogft: {{services: [{{name: /a, type: p/srv/A}}]}}\n")
+    assert ["advanced: unknown key" in one.message for one in told] == [True]
+
+
 def test_what_only_this_machine_tells_is_asked_of_each_service():
     """Once the file itself is right: two types that are not installed are two mistakes."""
     text = "run: x\nfogft:\n  services:\n" + "".join(
