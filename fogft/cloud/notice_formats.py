@@ -8,11 +8,10 @@
 """
 
 import json
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from email.utils import parsedate_to_datetime
 from enum import Enum
-from typing import Any
+from typing import Any, NamedTuple
 
 
 class NoticeKind(str, Enum):
@@ -22,8 +21,7 @@ class NoticeKind(str, Enum):
     PREEMPTION = "preemption"  # the machine will be preempted
 
 
-@dataclass(frozen=True)
-class Notice:
+class Notice(NamedTuple):
     """A notice that a machine may be preempted, or will be."""
 
     kind: NoticeKind

@@ -36,7 +36,6 @@ class Launch:
     limit_usd_per_hour: float | None = None
     # The machine exists and is stopped (`RealCloud.stop`): start it under the same id.
     is_there: bool = False
-    # Further ports to open.
     more_ports: tuple[int, ...] = ()
     # The replica dials its robots, so it needs no open port.
     dials_out: bool = False

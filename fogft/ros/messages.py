@@ -125,8 +125,7 @@ class Comparison:
         tolerances: Path of a float field -> the maximum difference of two values. A path passes
             through lists to their elements. All other fields must be equal.
 
-    Raises:
-        RosError: The type cannot be loaded, or has no such float field.
+    Raises RosError: The type cannot be loaded, or has no such float field.
     """
 
     def __init__(self, type_name: str, tolerances: Mapping[str, float]) -> None:

@@ -50,8 +50,7 @@ class SerialisedNode:
         domain_id: The ROS domain; None for ``ROS_DOMAIN_ID``, else 0.
         early: This process's participant in that domain, if it has joined already.
 
-    Raises:
-        RosError: ROS 2 is not usable here, or refuses the name.
+    Raises RosError: ROS 2 is not usable here, or refuses the name.
     """
 
     def __init__(
@@ -85,7 +84,6 @@ class SerialisedNode:
 
         self_test()
         self._middleware: str = get_rmw_implementation_identifier()
-        # Maps a request's handle to an id that is the same in each process that received it.
         by_cyclone = self._middleware == cyclone.MIDDLEWARE
         self.identity: Callable[[bytes], bytes] = cyclone.identity if by_cyclone else bytes
         self._new_wait_set: Any = rclpy_implementation.WaitSet

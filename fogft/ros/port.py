@@ -91,8 +91,7 @@ class RosNode(Protocol):
             on_request: Called with the serialised request and a handle.
             on_burst: Called by the same thread before and after requests that came together.
 
-        Raises:
-            RosError: The type cannot be loaded.
+        Raises RosError: The type cannot be loaded.
         """
 
     def client(self, name: str, type_name: str) -> RosClient:

@@ -53,7 +53,8 @@ def reserve_port() -> Reservation | None:
     for port in random.sample(PORTS, len(PORTS)):
         reservation = _reserve("port", port)
         if reservation is not None:
-            if _can_listen(port):
+            with contextlib.suppress(OSError):  # somebody listens there
+                socket.create_server(("127.0.0.1", port)).close()
                 return reservation
             reservation.release()
     return None
@@ -67,16 +68,6 @@ def _reserve(what: str, number: int) -> Reservation | None:
         name.close()
         return None
     return Reservation(number, name)
-
-
-def _can_listen(port: int) -> bool:
-    with socket.socket() as attempt:
-        attempt.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            attempt.bind(("127.0.0.1", port))
-        except OSError:
-            return False
-    return True
 
 
 def _domains_in_use() -> set[int]:

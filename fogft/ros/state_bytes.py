@@ -9,6 +9,7 @@ Owns: reading and writing that field. Not here: when (`fogft.proxy.replica.order
 
 import array
 import re
+from functools import reduce
 from typing import Any
 
 from fogft.errors import RosError
@@ -85,13 +86,8 @@ class _Field:
         if not self.is_text and not self._element:
             raise _no_field(where, part, where.field)
 
-    def _parent(self, message: Any) -> Any:
-        for parent in self._parents:
-            message = getattr(message, parent)
-        return message
-
     def get(self, message: Any) -> bytes:
-        value = getattr(self._parent(message), self._name)
+        value = reduce(getattr, (*self._parents, self._name), message)
         if self.is_text:
             return str(value).encode()
         if self._element == "octet":  # rclpy represents these as a list of single bytes
@@ -107,7 +103,7 @@ class _Field:
         else:
             value = array.array("b" if self._element == "int8" else "B")
             value.frombytes(state)
-        setattr(self._parent(message), self._name, value)
+        setattr(reduce(getattr, self._parents, message), self._name, value)
 
 
 def _no_field(where: StateService, part: str, path: str) -> RosError:

@@ -7,6 +7,7 @@ Owns: names of types, their errors and hints, shapes, definitions.
 Not here: messages (`messages`), comparing two definitions (`fogft.model.type_definition`).
 """
 
+import contextlib
 import difflib
 import importlib
 import json
@@ -132,15 +133,13 @@ def installed_service_types() -> list[str]:
     found: set[str] = set()
     for prefix in filter(None, prefixes):
         index = Path(prefix, "share", "ament_index", "resource_index", "rosidl_interfaces")
-        try:
+        with contextlib.suppress(OSError):
             for package in index.iterdir():
                 found.update(
                     f"{package.name}/{line.removesuffix('.srv')}"
                     for line in package.read_text().split()
                     if line.startswith("srv/") and line.endswith(".srv")
                 )
-        except OSError:
-            continue
     return sorted(found)
 
 
@@ -208,9 +207,7 @@ def _hashes(type_name: str) -> dict[str, str]:
     code = Path(str(importlib.import_module(package).__file__)).resolve()
     for prefix in code.parents:
         path = prefix / "share" / package / "srv" / f"{short}.json"
-        try:
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             told = json.loads(path.read_text())["type_hashes"]
             return {str(one["type_name"]): str(one["hash_string"]) for one in told}
-        except (OSError, ValueError, KeyError, TypeError):
-            continue
     return {}

@@ -33,8 +33,7 @@ class VisibleNode:
         judge: Called by this node's thread with parameters that somebody sets. Returns why they
             are rejected; empty if they apply from now on.
 
-    Raises:
-        RosError: ROS refuses the node.
+    Raises RosError: ROS refuses the node.
     """
 
     def __init__(self, name: str, context: Any, judge: Callable[[Mapping[str, Any]], str]) -> None:

@@ -18,7 +18,6 @@ from fogft.errors import CloudError
 from fogft.model.replica import ReplicaId
 from fogft.poolfile.tree import nearest, shown
 
-# In an outage a machine is cut off first, and ends this much later.
 OUTAGE_KILL_AFTER_S = 1.0
 
 

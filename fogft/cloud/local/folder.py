@@ -127,16 +127,13 @@ class MachineFolder:
         state = self.state()
         if self.locked:
             return Life.ALIVE
-        if state is None:
-            return Life.ORDERED if self._may_start(now) else Life.DEAD
-        return Life.FAILED if state.phase is MachinePhase.FAILED else Life.DEAD
-
-    def _may_start(self, now: float) -> bool:
-        """Whether a machine without a sign of life may still be starting."""
+        if state is not None:
+            return Life.FAILED if state.phase is MachinePhase.FAILED else Life.DEAD
         age_s = abs(now - self.record().launched_at)
-        if age_s < START_LIMIT_S:
-            return True
-        return age_s < SLOW_START_LIMIT_S and bool(processes.find(machine=str(self.id)))
+        may_start = age_s < START_LIMIT_S
+        if not may_start and age_s < SLOW_START_LIMIT_S:
+            may_start = bool(processes.find(machine=str(self.id)))
+        return Life.ORDERED if may_start else Life.DEAD
 
     def lives(self, now: float) -> bool:
         """Whether the machine counts against capacity: it is ordered or alive."""

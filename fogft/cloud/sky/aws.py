@@ -140,12 +140,8 @@ class Aws:
         alive = {"Name": "instance-state-name", "Values": _ALIVE}
         with self._asked(region) as ec2:
             pages = ec2.get_paginator("describe_instances").paginate(Filters=[ours, alive])
-            listed = [
-                _instance(region, raw)
-                for page in pages
-                for reservation in page["Reservations"]
-                for raw in reservation["Instances"]
-            ]
+            found = pages.search("Reservations[].Instances[]")
+            listed = [_instance(region, raw) for raw in found]
         return [instance for instance in listed if instance is not None]
 
     def regions(self) -> list[str]:

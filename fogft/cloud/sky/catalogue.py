@@ -54,8 +54,7 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
     fetched = {cloud: _fetched_at(cloud) for cloud in {place.cloud for place in prices}}
     offers = [Offer(p, price, "catalogue", fetched[p.cloud]) for p, price in prices.items()]
     offers.sort(key=lambda o: (o.usd_per_hour, o.placement))
-    sold = {place.cloud for place in prices}
-    left_out = {name: why for name, why in left_out.items() if name not in sold}
+    left_out = {name: why for name, why in left_out.items() if name not in fetched}
     return Sale(offers, left_out, {key: quota for key, quota in quotas.items() if quota[0]})
 
 

@@ -67,7 +67,6 @@ _NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # after the caller
 _FOR_AWS = "Encoded authorization failure message"  # a thousand characters
 _SPEAKER = re.compile(r"^\([^()]{1,60} pid=\d+[^()]{0,60}\) ")
 _DECORATION = ("├──", "└──", "✓ ", "⚙︎ ")  # SkyPilot's own progress lines
-# The prefix of SkyPilot's log lines.
 _LOGGED = re.compile(r"^[A-Z] [\d-]+ [\d:.]+ (?:PID=\d+ )?\S+:\d+\] ")
 _COLOUR = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from fogft.cloud.sky.catalogue import best
 from fogft.cloud.sky.installed import InstalledSky
@@ -39,8 +39,7 @@ _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kmgtp]?)i?b?\+?", re.IGNORECASE)
 _GB = {"k": 1e-6, "m": 1e-3, "": 1.0, "g": 1.0, "t": 1e3, "p": 1e6}
 
 
-@dataclass(frozen=True)
-class _Sold:
+class _Sold(NamedTuple):
     offers: tuple[Offer, ...]  # the cheapest of each `Placement.supply`
     instead: Mapping[Placement, Sequence[Offer]]  # the alternatives to each offer
     left_out: Collection[str]  # in sentences

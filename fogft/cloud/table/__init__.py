@@ -9,9 +9,8 @@ import csv
 import datetime
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fogft.cloud.local.catalogue import Instance
 from fogft.cloud.local.resources import alternatives, suffices
@@ -23,8 +22,7 @@ from fogft.poolfile.tree import shown
 _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """An instance type in a place. A price is NaN if it is not sold in that way."""
 
     place: tuple[str, str, str]  # cloud, region, zone
