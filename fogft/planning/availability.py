@@ -115,14 +115,12 @@ def joint_unavailability(
     Each replica is given by its placement and the fraction of time that it is down. Raises
     ValueError: a fraction is not in [0, 1].
     """
-    tree: dict[str, dict[str, dict[str, list[float]]]] = defaultdict(
-        lambda: defaultdict(lambda: defaultdict(list))
-    )
+    zones: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     steps = {0.0, 1.0}
     for place, down in replicas:
         if not 0 <= down <= 1:
             raise ValueError(f"an unavailability must be from 0 to 1, not {down}")
-        tree[place.cloud][place.region][place.zone].append(down)
+        zones[place.cloud, place.region, place.zone].append(down)
         steps.add(down)
     grid = _Grid(sorted(steps))
     # A replica follows its zone, a zone its region, a region its cloud, with these chances:
@@ -130,16 +128,14 @@ def joint_unavailability(
     by_replica = math.sqrt(correlation.zone)
     by_zone = math.sqrt(correlation.region / correlation.zone) if correlation.zone else 0.0
     by_region = math.sqrt(correlation.cloud / correlation.region) if correlation.region else 0.0
-    total = 1.0
-    for regions in tree.values():
-        in_cloud = []
-        for zones in regions.values():
-            in_region = [
-                grid.followed(grid.down(members, by_replica), by_zone) for members in zones.values()
-            ]
-            in_cloud.append(grid.followed(grid.product(in_region), by_region))
-        total *= grid.mean(grid.product(in_cloud))
-    return total
+    regions: dict[tuple[str, str], list[list[float]]] = defaultdict(list)
+    for (cloud, region, _), members in zones.items():
+        regions[cloud, region].append(grid.followed(grid.down(members, by_replica), by_zone))
+    clouds: dict[str, list[list[float]]] = defaultdict(list)
+    for (cloud, _), in_region in regions.items():
+        clouds[cloud].append(grid.followed(grid.product(in_region), by_region))
+    together = (grid.mean(grid.product(in_cloud)) for in_cloud in clouds.values())
+    return math.prod(together, start=1.0)
 
 
 class _Grid:

@@ -97,8 +97,6 @@ def _supersede(machines: Classification, health: Health, size: Size) -> None:
     So after a migration the old replica ends, once its successor serves, and not the successor.
     """
     newest = {s.slot: s.id.generation for s in machines.good}  # in the order of generations
-    if len(newest) == len(machines.good):
-        return
     for group, wanted in zip(size.groups, size.counts, strict=True):
         here = machines.part(size.groups, group)
         surplus = len(here.good) + len(here.replaced) - wanted

@@ -80,11 +80,6 @@ class Listing:
         """The supplies of all rows."""
         return frozenset(row.supply for row in self.rows)
 
-    @cached_property
-    def clouds(self) -> frozenset[str]:
-        """The clouds of all rows."""
-        return frozenset(row.cloud for row in self.rows)
-
 
 class Catalogue:
     """An index of one tuple of offers."""
@@ -146,9 +141,7 @@ def _listing(offers: Sequence[Offer], excluded: Collection[str], scale: Scale) -
     possible = [o for o in offers if is_possible(o)]
     if not possible:
         return Listing((), Reason(Cause.IMPOSSIBLE_PRICE))
-    allowed = possible
-    if excluded:
-        allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
+    allowed = [o for o in possible if not any(o.placement.within(p) for p in excluded)]
     if not allowed:
         return Listing((), Reason(Cause.ALL_EXCLUDED))
     best: dict[str, Row] = {}

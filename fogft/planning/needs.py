@@ -42,13 +42,6 @@ def needed_launches(
         return needs
     if any(not s.ever_ready for s in machines.good):  # one is on its way
         return []
-    return _replacement(groups, counts, machines)
-
-
-def _replacement(
-    groups: Sequence[Group], counts: Sequence[int], machines: Classification
-) -> list[Need]:
-    """Return the launch of one successor; empty if no replica needs one."""
     for replica in machines.replaced:
         group = group_of(groups, replica.slot)
         here = machines.part(groups, group)

@@ -60,18 +60,17 @@ class Market:
         self._avoid = frozenset(avoid)
         self._nothing = listing.trouble
         self.backing_off: Mapping[str, Backoff] = {}  # of all supplies, if all back off
-        self.rows, self._clouds = listing.rows, listing.clouds
+        self.rows = listing.rows
         if hazards:
             self.rows = _weighed(self.rows, hazards)
         if full:
             self.rows = tuple([row for row in self.rows if row.location not in full])
-            self._clouds = frozenset([row.cloud for row in self.rows])
             if not self.rows and not self._nothing:
                 self._nothing = Reason(Cause.LOCATION_FULL)
         left_out = listing.supplies.intersection(pauses) if pauses else frozenset()
         if left_out:
             self.rows = tuple([row for row in self.rows if row.supply not in left_out])
-            self._clouds = frozenset([row.cloud for row in self.rows])
+        self._clouds = frozenset([row.cloud for row in self.rows])
         if EVERYWHERE in pauses:
             pause = pauses[EVERYWHERE]
             self._nothing = Reason(

@@ -61,8 +61,6 @@ def plan(pool_uid: str, inputs: Inputs, *, health: Health | None = None) -> Plan
     """
     health = health or judge(pool_uid, inputs.spec, inputs.observed, inputs.history)
     decided = latest = plan_once(inputs, health)
-    if inputs.observed.machines is None:
-        return decided
     for _ in range(MOST_PASSES):
         changes = latest.launches or latest.terminations or _newly_marked(latest, inputs.history)
         if latest.closed or not changes:
@@ -86,8 +84,6 @@ def plan(pool_uid: str, inputs: Inputs, *, health: Health | None = None) -> Plan
 
 
 def _newly_marked(decided: Plan, history: History) -> list[ReplicaId]:
-    if not decided.draining:
-        return []
     marked = {(r.slot, r.generation) for r in history.open() if r.draining_since is not None}
     return [id for id in decided.draining if (id.slot, id.generation) not in marked]
 

@@ -83,8 +83,6 @@ def fault(
 
     `health` was judged by `spec`, the file that is being applied.
     """
-    if spec is good:
-        return None
     old = [judged for judged in health.replicas if is_current(good, judged.machine)]
     current = [judged for judged in health.replicas if is_current(spec, judged.machine)]
     new = [judged for judged in current if judged not in old]

@@ -49,16 +49,13 @@ async def connect(
 async def _reach(endpoint: str) -> socket.socket:
     """Return the socket of the first overlapping attempt that completes, or raise its error."""
     attempts: set[asyncio.Task[socket.socket]] = set()
-    loop = asyncio.get_running_loop()
     try:
         while True:
-            attempts.add(loop.create_task(_attempt(endpoint)))
-            tick = loop.create_task(asyncio.sleep(ATTEMPT_EVERY_S))
-            try:
-                await asyncio.wait({*attempts, tick}, return_when=asyncio.FIRST_COMPLETED)
-            finally:
-                tick.cancel()
-            for attempt in [a for a in attempts if a.done()]:
+            attempts.add(asyncio.create_task(_attempt(endpoint)))
+            done, _ = await asyncio.wait(
+                attempts, timeout=ATTEMPT_EVERY_S, return_when=asyncio.FIRST_COMPLETED
+            )
+            for attempt in done:
                 attempts.discard(attempt)
                 return attempt.result()  # or raises: the caller reports it and retries
     finally:

@@ -7,7 +7,6 @@ Not here: merging (`record_set`), what contents mean (`roster`), cryptography (p
 """
 
 import base64
-import binascii
 import json
 import re
 from collections.abc import Callable, Mapping
@@ -209,7 +208,7 @@ def from_plain(raw: Any) -> SignedRecord:
             base64.b64decode(certificate, validate=True),
             base64.b64decode(signature, validate=True),
         )
-    except (KeyError, TypeError, AttributeError, ValueError, binascii.Error) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise RecordError("malformed", "not a signed record") from error
     if len(signed.body) > BODY_LIMIT:
         raise RecordError("malformed", "a record that is too long")

@@ -59,7 +59,7 @@ class RendezvousServer:
         self.endpoint = f"{self.endpoint.rpartition(':')[0]}:{self._socket.getsockname()[1]}"
 
     async def serve(self) -> None:
-        """Accept callers until cancelled."""
+        """Accept callers until cancelled; then release the port and close all connections."""
         assert self._socket is not None
         loop = asyncio.get_running_loop()
         try:
@@ -85,7 +85,11 @@ class RendezvousServer:
                 task.add_done_callback(self._tasks.discard)
                 await asyncio.sleep(0)  # `sock_accept` never yields while many are waiting
         finally:
-            self.close()
+            for task in list(self._tasks):
+                task.cancel()
+            self._exchange.abort()
+            with contextlib.suppress(OSError):
+                self._socket.close()
 
     async def _attend(self, raw: socket.socket, host: str) -> None:
         try:
@@ -181,15 +185,6 @@ class RendezvousServer:
             "messages": dict(exchange.counts),
             "offered": dict(exchange.records.counts),
         }
-
-    def close(self) -> None:
-        """Release the port and close all connections."""
-        for task in list(self._tasks):
-            task.cancel()
-        self._exchange.abort()
-        if self._socket is not None:
-            with contextlib.suppress(OSError):
-                self._socket.close()
 
 
 def binding_of(certificate: bytes) -> bytes:

@@ -91,13 +91,7 @@ class Verifier:
     is read on first use; if it cannot be used, that raises `RecordError`.
     """
 
-    def __init__(
-        self,
-        ca: Path,
-        *,
-        any_time: bool = False,
-        lazy: bool = False,
-    ) -> None:
+    def __init__(self, ca: Path, *, any_time: bool = False, lazy: bool = False) -> None:
         self._ca = ca
         self._authorities = [] if lazy else _read_authorities(ca)
         self._any_time = any_time
@@ -110,15 +104,19 @@ class Verifier:
         from cryptography.hazmat.primitives.asymmetric import ec
 
         known = self._known.get(certificate) or self._judged(certificate)
-        if not self._any_time:
-            self._check_time(known)
+        name = attribute(known, "CN")
+        now = datetime.datetime.now(datetime.timezone.utc)
+        if not self._any_time and now < known.not_valid_before_utc:
+            raise RecordError("expired", f"the certificate of `{name}` is not valid yet")
+        if not self._any_time and now >= known.not_valid_after_utc:
+            raise RecordError("expired", f"the certificate of `{name}` has expired")
         key = known.public_key()
         assert isinstance(key, ec.EllipticCurvePublicKey)  # checked by `_judged`
         try:
             key.verify(signature, message, ec.ECDSA(hashes.SHA256()))
         except InvalidSignature:
             raise RecordError("forged", "a signature that is wrong") from None
-        return Writer(attribute(known, "OU"), attribute(known, "CN"))
+        return Writer(attribute(known, "OU"), name)
 
     def _judged(self, der: bytes) -> x509.Certificate:
         from cryptography import x509
@@ -141,14 +139,6 @@ class Verifier:
             self._known.clear()
         self._known[der] = certificate
         return certificate
-
-    def _check_time(self, certificate: x509.Certificate) -> None:
-        now = datetime.datetime.now(datetime.timezone.utc)
-        name = attribute(certificate, "CN")
-        if now < certificate.not_valid_before_utc:
-            raise RecordError("expired", f"the certificate of `{name}` is not valid yet")
-        if now >= certificate.not_valid_after_utc:
-            raise RecordError("expired", f"the certificate of `{name}` has expired")
 
 
 def _read_authorities(ca: Path) -> list[x509.Certificate]:

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
-from fogft.simulation.timeline import Timeline, of_changes
+from fogft.simulation.timeline import Timeline
 
 HOUR_S = 3600.0
 
@@ -49,7 +49,7 @@ def least_usd_per_hour(
         stay
         for place, usd in spot.items()
         if place in timelines
-        for stay in _stays(timelines[place], usd, replicas, boot_s, length_s)
+        for stay in _stays(timelines[place].window(0.0, length_s), usd, replicas, boot_s)
     ]
     if on_demand is not None:
         stays.append(_Stay(0.0, length_s, on_demand, replicas))
@@ -57,24 +57,13 @@ def least_usd_per_hour(
     return None if usd is None else usd / (length_s / HOUR_S)
 
 
-def _stays(
-    line: Timeline, usd: float, most: int, boot_s: float, length_s: float
-) -> Iterator[_Stay]:
-    layers = Counter(tuple(_spells(line, level, length_s)) for level in range(1, most + 1))
+def _stays(line: Timeline, usd: float, most: int, boot_s: float) -> Iterator[_Stay]:
+    layers = Counter(tuple(line.spells(level)) for level in range(1, most + 1))
     for spells, machines in layers.items():
-        for begin, end in spells:
+        for has_room, begin, end in spells:
             ready = begin + boot_s if begin > 0 else 0.0
-            if ready < end:
+            if has_room and ready < end:
                 yield _Stay(ready, end, usd, machines)
-
-
-def _spells(line: Timeline, level: int, length_s: float) -> Iterator[tuple[float, float]]:
-    """Yield the periods in which there is room for `level` machines."""
-    changes = of_changes(((at, int(n >= level)) for at, n in line.changes), length_s).changes
-    ends = [*(at for at, _ in changes[1:]), length_s]
-    for (begin, has_room), end in zip(changes, ends, strict=True):
-        if has_room and begin < length_s:
-            yield begin, min(end, length_s)
 
 
 class _Flow:

@@ -75,11 +75,11 @@ def of_zones(timelines: Mapping[str, Timeline]) -> dict[str, tuple[float, float]
 
 def _means(timelines: Iterable[Timeline]) -> tuple[float | None, ...]:
     """Return the mean times with and without room; None for one that never ended."""
-    spells = [spell for line in timelines for spell in line.spells()]
+    spells = [(*spell, line.length_s) for line in timelines for spell in line.spells()]
     means = []
     for room in (True, False):
-        ended = sum(over for has_room, _, over in spells if has_room is room)
-        whole_s = sum(s for has_room, s, _ in spells if has_room is room)
+        ended = sum(end < length_s for has_room, _, end, length_s in spells if has_room is room)
+        whole_s = sum(end - begin for has_room, begin, end, _ in spells if has_room is room)
         means.append(whole_s / ended if ended else None)
     return tuple(means)
 
@@ -118,7 +118,8 @@ def correlation(one: Timeline, other: Timeline) -> float | None:
     """Return the correlation of two locations' capacity over shared time; None if constant."""
     length_s = min(one.length_s, other.length_s)
     a, b = one.window(0, length_s), other.window(0, length_s)
-    mean_a, mean_b = (sum(s for room, s, _ in x.spells() if room) / length_s for x in (a, b))
+    free_s = [[end - begin for room, begin, end in x.spells() if room] for x in (a, b)]
+    mean_a, mean_b = (sum(spells) / length_s for spells in free_s)
     spread = mean_a * (1 - mean_a) * mean_b * (1 - mean_b)
     if spread <= 0:
         return None

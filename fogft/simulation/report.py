@@ -157,7 +157,6 @@ def simulate(
         prices: A folder of spot prices, laid out like the traces, in US dollars per hour.
         model: ``KEY=VALUE,...``, see `fogft.simulation.model`.
         cloud: The cloud whose prices count; None for the one the pool file names, else `local`.
-        told: Called with the number of runs done and in total.
     """
     source = read_text(file)
     spec = parse(source, file=str(file), folder=file.resolve().parent)

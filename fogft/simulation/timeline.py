@@ -34,12 +34,13 @@ class Timeline:
         later = [(at - begin_s, n) for at, n in self.changes if begin_s < at < begin_s + length_s]
         return Timeline(((0.0, self.capacity(begin_s)), *later), length_s)
 
-    def spells(self) -> Iterator[tuple[bool, float, bool]]:
-        """Yield each spell with or without capacity: ``(room, seconds, seen to its end)``."""
-        merged = list(_distinct((at, int(n > 0)) for at, n in self.changes))
-        ends = [*(at for at, _ in merged[1:]), self.length_s]
-        for index, ((at, room), end) in enumerate(zip(merged, ends, strict=True)):
-            yield bool(room), end - at, index < len(merged) - 1
+    def spells(self, level: int = 1) -> Iterator[tuple[bool, float, float]]:
+        """Yield each spell with or without room for `level` machines: ``(room, begin, end)``."""
+        states = ((at, int(n >= level)) for at, n in self.changes)
+        changes = of_changes(states, self.length_s).changes
+        ends = [*(at for at, _ in changes[1:]), self.length_s]
+        for (begin, room), end in zip(changes, ends, strict=True):
+            yield bool(room), begin, end
 
 
 def of_samples(counts: Sequence[int], gap_s: float) -> Timeline:
@@ -50,8 +51,5 @@ def of_samples(counts: Sequence[int], gap_s: float) -> Timeline:
 
 def of_changes(changes: Iterable[tuple[float, int]], length_s: float) -> Timeline:
     """Return the timeline of changes in order of time; those without effect are left out."""
-    return Timeline(tuple(_distinct(changes)), length_s)
-
-
-def _distinct(changes: Iterable[tuple[float, int]]) -> Iterator[tuple[float, int]]:
-    return (next(same) for _, same in groupby(changes, itemgetter(1)))
+    distinct = (next(same) for _, same in groupby(changes, itemgetter(1)))
+    return Timeline(tuple(distinct), length_s)

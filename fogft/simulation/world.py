@@ -61,12 +61,7 @@ class World:
     """
 
     def __init__(
-        self,
-        market: Market,
-        *,
-        seed: int,
-        length_s: float,
-        settle_s: float = 0.0,
+        self, market: Market, *, seed: int, length_s: float, settle_s: float = 0.0
     ) -> None:
         self.now = EPOCH
         self.market = market

@@ -5,7 +5,6 @@ An existing file is never overwritten unless that was asked for.
 
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 from fogft import template_files
@@ -34,7 +33,12 @@ def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Pa
     if name not in known:
         raise FogftError(f"there is no example `{name}`", nearest(name, known))
     source, target = template_files.folder() / name, Path(into)
-    names = sorted(_files(source), key=lambda path: (path.name != POOL_FILE, path))
+    found = [
+        path.relative_to(source)
+        for path in source.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    ]
+    names = sorted(found, key=lambda path: (path.name != POOL_FILE, path))
     written = [*(target / relative for relative in names), target / schema.FILE]
     try:
         _check_room(target, written[:-1], force)
@@ -47,13 +51,6 @@ def copy_example(name: str, into: Path | str, *, force: bool = False) -> list[Pa
         what = f"`{error.filename or target}` cannot be written: {error.strerror}"
         raise FogftError(what, "choose another folder with `--into DIR`") from error
     return written
-
-
-def _files(source: Path) -> Iterator[Path]:
-    """Yield the example's files, relative to its folder, without `__pycache__`."""
-    for path in source.rglob("*"):
-        if path.is_file() and "__pycache__" not in path.parts:
-            yield path.relative_to(source)
 
 
 def _check_room(target: Path, files: list[Path], force: bool) -> None:

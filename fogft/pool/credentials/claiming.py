@@ -7,7 +7,7 @@ claim wins, whichever rendezvous each has reached.
 
 import secrets
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from fogft import disk
@@ -53,7 +53,6 @@ def claim(
     *,
     limit_s: float = LIMIT_S,
     settle_s: float = SETTLE_S,
-    clock: Callable[[], float] = time.monotonic,
 ) -> None:
     """Claim a holder's certificate for this machine. Repeatable with the same token.
 
@@ -64,7 +63,7 @@ def claim(
         return
     # Two clients: the second receives what the rendezvous holds, whatever the first has published.
     speaker, hearer = (RendezvousClient(endpoints, credentials, holder.pool_uid) for _ in range(2))
-    until = clock() + limit_s
+    until = time.monotonic() + limit_s
     speaker.start()
     hearer.start()
     try:
@@ -75,7 +74,7 @@ def claim(
             kind, generation = _KINDS[holder.role], holder.generation
             speaker.publish(kind, holder.name, generation, said, sequence=sequence)
             while _standing(hearer, holder, sequence) is None:
-                if clock() > until:
+                if time.monotonic() > until:
                     raise _nobody_tells(hearer)
                 time.sleep(_POLL_S)
             time.sleep(pause_s)

@@ -55,16 +55,10 @@ class PoolStore(HistoryFile):
     """A pool's folder. Safe to use from several threads; one process writes each file.
 
     Raises `StateError`: a file cannot be written. Raises `PoolNotFound`: there is no such pool.
-
-    Args:
-        parse: Reads a pool file's text: ``parse(text, file) -> PoolSpec``.
     """
 
     def __init__(
-        self,
-        paths: PoolPaths,
-        parse: Callable[[str, str], PoolSpec],
-        clock: Callable[[], float],
+        self, paths: PoolPaths, parse: Callable[[str, str], PoolSpec], clock: Callable[[], float]
     ) -> None:
         self.paths = paths
         self.name = paths.folder.name  # the pool's name

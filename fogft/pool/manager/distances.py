@@ -152,7 +152,9 @@ class Latencies:
             if told is not None:
                 out[region] = Distance(told, "pool file")
                 continue
-            found = measured.get(region) or _estimated(region, placement)
+            found = measured.get(region)
+            if not found and placement.robot_at and (there := positions().get(region)):
+                found = Distance(estimated_rtt_s(placement.robot_at, there), "estimated")
             if found is not None:
                 out[region] = Distance(links[region], "links") if region in links else found
         return out
@@ -214,10 +216,3 @@ class Distances:
 def regions_of(offers: Iterable[Offer]) -> set[str]:
     """Return the ``cloud/region`` of offers."""
     return {f"{o.placement.cloud}/{o.placement.region}" for o in offers}
-
-
-def _estimated(region: str, placement: PlacementSpec) -> Distance | None:
-    there = positions().get(region)
-    if placement.robot_at is None or there is None:
-        return None
-    return Distance(estimated_rtt_s(placement.robot_at, there), "estimated")

@@ -110,13 +110,12 @@ def without_client_proxy(paths: PoolPaths, done: Callable[[str], None]) -> Itera
         yield
 
 
-@contextlib.contextmanager
-def without_orders(paths: PoolPaths, spec: PoolSpec, done: Callable[[str], None]) -> Iterator[None]:
+def without_orders(
+    paths: PoolPaths, spec: PoolSpec, done: Callable[[str], None]
+) -> contextlib.AbstractContextManager[None]:
     """Like `without_client_proxy`, if a service is stateful: only one robot may order requests."""
-    with contextlib.ExitStack() as ended:
-        if any(service.state is not None for service in spec.services):
-            ended.enter_context(without_client_proxy(paths, done))
-        yield
+    is_stateful = any(service.state is not None for service in spec.services)
+    return without_client_proxy(paths, done) if is_stateful else contextlib.nullcontext()
 
 
 @contextlib.contextmanager

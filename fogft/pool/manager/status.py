@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 from fogft import __version__
 from fogft.model.plain import Moment, from_plain, stored, to_plain
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import LinkReport, LinkState, Machine, Phase, ReplicaId
+from fogft.model.replica import LinkReport, LinkState, Phase, ReplicaId
 from fogft.model.topic import PREFIX, Origin
 from fogft.model.topology import Gateway, RobotRoute, Topology, trouble
-from fogft.planning.observed.history import OF_NO_REPLICA, Event, EventKind, History, Record
+from fogft.planning.observed.history import OF_NO_REPLICA, Event, EventKind, History
 from fogft.pool.manager.proxy_report import Counters, GatewayLink, ProxyReport, TopicCounted
 from fogft.reason_words import words
 
@@ -221,7 +221,6 @@ class PoolStatus:
         usd_to_date: What the pool has cost since its first `up`, as the manager saw it.
         notes: Why the pool is not yet as wanted, in sentences.
         reasons: The same, one for each note, as ``{cause, ...}``.
-        version: The version of this schema; see `fogft.pool.commands.status`.
         topology: ``{robot, gateways, robots, through, links}``: who connects through whom, and
             how this machine's robot reaches its gateways; empty without gateways.
         manager_version: The manager's version of fogft; empty before 0.2.0.
@@ -273,7 +272,6 @@ class PoolStatus:
         Args:
             report: The last report, however old.
             links: The current links; None if unknown.
-            stale: The manager's last observation is too old.
         """
         up = [link for link in links or () if link.state is LinkState.UP]
         by_id = {(link.id.slot, link.id.generation): link for link in links or ()}
@@ -394,6 +392,7 @@ def _replica(
     machine = one.machine
     record = history.record(one.id.slot, one.id.generation)
     launched_at = record.launched_at if record is not None else machine.launched_at
+    ready_at = record.first_ready_at if record is not None else None
     drains = one.id in draining and one.phase is not Phase.GONE
     return ReplicaStatus(
         slot=one.id.slot,
@@ -408,24 +407,17 @@ def _replica(
         age_s=max(0.0, now - launched_at),
         detail=words(one.why) or machine.progress,
         reason=one.why,
-        has_served=record is not None and record.first_ready_at is not None,
-        **_phases(launched_at, machine, record),
+        has_served=ready_at is not None,
+        provisioning_s=_between(launched_at, machine.running_at),
+        setup_s=_between(machine.running_at, machine.set_up_at),
+        starting_s=_between(machine.set_up_at, ready_at),
+        ready_after_s=_between(launched_at, ready_at),
     )
 
 
-def _phases(launched_at: float, machine: Machine, record: Record | None) -> dict[str, Any]:
-    """Return how long each phase of a launch took, as far as it is known."""
-    ready_at = record.first_ready_at if record is not None else None
-
-    def between(begin: float, end: float | None) -> float | None:
-        return max(0.0, end - begin) if begin and end else None
-
-    return {
-        "provisioning_s": between(launched_at, machine.running_at),
-        "setup_s": between(machine.running_at, machine.set_up_at),
-        "starting_s": between(machine.set_up_at, ready_at),
-        "ready_after_s": between(launched_at, ready_at),
-    }
+def _between(begin: float, end: float | None) -> float | None:
+    """Return how long a phase of a launch took; None if that is not known."""
+    return max(0.0, end - begin) if begin and end else None
 
 
 def event_status(event: Event) -> EventStatus:
