@@ -1,5 +1,6 @@
 """Run one part of a pool in the foreground, or let systemd do so."""
 
+import importlib.util
 from pathlib import Path
 from typing import Annotated
 
@@ -8,6 +9,7 @@ import typer
 from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption
+from fogft.model.choices import Speaks
 from fogft.pool.commands import composition
 from fogft.pool.commands import service as units
 
@@ -198,6 +200,9 @@ def install(
         return
     if paths is not None:
         units.hand_over(paths)
+        speaks = composition.store_of(pool).spec().rmw.robot
+        if speaks is Speaks.RCLPY and importlib.util.find_spec("rclpy") is None:
+            output.warn("the units have no ROS 2: source it and repeat (`sudo -E` drops its paths)")
     output.done("systemd starts them at boot, and restarts any that die")
     if not system:
         output.hint("`loginctl enable-linger` starts them before you log in")

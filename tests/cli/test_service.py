@@ -233,3 +233,12 @@ def test_the_client_proxy_that_runs_gives_way_once_another_stands_by(home, units
         with disk.locked(paths.standby_lock):
             service.hand_over(paths)
         assert old.wait(20) == -signal.SIGTERM
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_units_without_ros_are_warned_of(home, units, tmp_path, monkeypatch, capsys, there):
+    """As under `sudo -E`, which drops `PYTHONPATH`: the client proxies would fail at each boot."""
+    Systemd(tmp_path / "bin", monkeypatch)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: object() if there else None)
+    assert main.run(["service", "install"]) == 0
+    assert ("the units have no ROS 2" in capsys.readouterr().err) is not there
