@@ -229,7 +229,7 @@ def judge_links(pool: str, seen: Seen) -> Iterator[Finding]:
                 if by_hand
                 else f"it is replaced if it stays silent; see `fogft status` and {log}",
             )
-        elif one.detail and one.phase == Phase.READY.value:
+        elif one.detail and one.phase in (Phase.READY.value, Phase.DRAINING.value):
             yield warn("replicas", f"{replica}: {one.detail}", "it is used all the same")
         elif one.detail:
             yield warn(

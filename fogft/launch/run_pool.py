@@ -60,7 +60,7 @@ def _is_ours(asked: argparse.Namespace) -> bool:
 
 
 def _run(asked: argparse.Namespace) -> int:
-    options = ["--yes"]
+    launch, options = os.getppid(), ["--yes"]
     if asked.cloud:
         options += ["--cloud", asked.cloud]
     if asked.timeout:
@@ -69,7 +69,6 @@ def _run(asked: argparse.Namespace) -> int:
     if status != 0:
         return status
     print(READY, flush=True)
-    launch = os.getppid()
     while os.getppid() == launch and _is_ours(asked):  # both go on if `logs` is killed
         _wait(_fogft("logs", "--follow", "--lines", "0", "--pool", asked.pool))
         time.sleep(_LOGS_AGAIN_S)

@@ -139,9 +139,9 @@ class UplinksLink:
         policy = self._dialer.policies.get(attempt.service, UplinkPolicy.PREFER)
         taken = False
         usable = [i for i, link in enumerate(self._links) if link.usable and (not by or i in by)]
-        usable.sort(key=self._rests)
         while usable and not taken:
-            chosen, current = choose(policy, usable, self._current)
+            first = [i for i in usable if policy is not UplinkPolicy.ALL and not self._rests(i)]
+            chosen, current = choose(policy, first or usable, self._current)
             if policy is UplinkPolicy.FAILOVER:
                 self._current = current
             for index in chosen:
@@ -284,7 +284,7 @@ class UplinksLink:
         if link.usable:
             self._up.add(name)
         elif name in self._up:
-            self._up.remove(name)
+            self._up.discard(name)
             at, rest_s = self._lost.get(name, (now, 0.0))
             rest_s = 0.0 if now > at + 4 * rest_s + _SOON_S else rest_s
             self._lost[name] = now, min(max(_REST_S, 2 * rest_s), _LONGEST_REST_S)

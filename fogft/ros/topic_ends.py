@@ -62,7 +62,7 @@ class Publisher:
     publisher: Any
     shape: Shape
     withdraw: Callable[[Publisher], None]
-    mismatch: Callable[[], str]  # returns why a subscriber receives nothing; empty if all do
+    find_mismatch: Callable[[], str]
 
     def __post_init__(self) -> None:
         self._open = True
@@ -88,6 +88,10 @@ class Publisher:
             return int(self.publisher.get_subscription_count())
         except Exception:  # rclpy's InvalidHandle: withdrawn meanwhile
             return 0
+
+    def mismatch(self) -> str:
+        """Return why no subscriber receives anything; empty if one does, or if there is none."""
+        return "" if self.subscribers() else self.find_mismatch()
 
     def close(self) -> None:
         """Withdraw the publisher; idempotent."""

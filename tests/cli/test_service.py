@@ -171,6 +171,16 @@ def test_units_of_a_pool_that_is_shut_down_and_started_again_can_start(
     assert main.run(["service", "install"]) == 0, "it is still the same unit"
 
 
+def test_units_of_one_pool_are_installed_again_by_another_path_to_it(
+    home, units, tmp_path, monkeypatch
+):
+    Systemd(tmp_path / "bin", monkeypatch)
+    assert main.run(["service", "install"]) == 0
+    (tmp_path / "other").symlink_to(home)
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "other"))
+    assert main.run(["service", "install"]) == 0
+
+
 def test_systemd_that_stops_no_unit_is_told(home, units, tmp_path, monkeypatch, capsys):
     """Without the user's bus, as under `sudo -u`: what runs goes on."""
     Systemd(tmp_path / "bin", monkeypatch, "*disable*")

@@ -383,9 +383,10 @@ def test_a_replica_whose_program_ends_is_found():
     assert "`fogft logs 1`" in found[0].advice
 
 
-def test_an_uplink_that_is_down_is_told_of_and_its_replica_is_not_called_unready():
+@pytest.mark.parametrize("phase", ["ready", "draining"])
+def test_an_uplink_that_is_down_is_told_of_and_its_replica_is_not_called_unready(phase):
     down = LinkReport(ReplicaId(UID, 1, 2), LinkState.UP, detail="uplink `wlan0`: unreachable")
-    found = judged_links(down)
+    found = judged_links(down, phase=phase)
     assert [f.verdict for f in found] == [Verdict.WARN, Verdict.OK]
     assert found[0].text.endswith("`1.2`: uplink `wlan0`: unreachable")
 

@@ -14,6 +14,7 @@ import pytest
 from fogft.launch.run_pool import READY
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, write_identity
+from tests.fakes.waiting import wait_for
 
 # Stands in for `python -m fogft`: notes its words, and behaves as FAKE_UP says.
 FAKE = """
@@ -23,6 +24,9 @@ with open(os.environ["TRACE"], "a") as trace:
 if sys.argv[1] == "up":
     if os.environ["FAKE_UP"] == "slow":
         signal.pause()
+    if os.environ["FAKE_UP"] == "orphaned":  # launch dies meanwhile
+        os.kill(int(os.environ["LAUNCH"]), signal.SIGKILL)
+        sys.exit(0)
     sys.exit(int(os.environ["FAKE_UP"]))
 if sys.argv[1] == "logs":
     print(f"0.1 a line, pid {os.getpid()}", flush=True)
@@ -51,6 +55,9 @@ def run_pool(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
             "TRACE": str(tmp_path / "trace"), "FOGFT_HOME": str(tmp_path / "home"),
         }  # fmt: skip
         words = [sys.executable, "-m", "fogft.launch.run_pool", "f.yaml", "--pool", "p", *options]
+        if up == "orphaned":
+            program = "import os, subprocess, sys; os.environ['LAUNCH'] = str(os.getpid());"
+            words = [sys.executable, "-c", f"{program} subprocess.call(sys.argv[1:])", *words]
         child = subprocess.Popen(
             words, env=environ, cwd=tmp_path, stdout=subprocess.PIPE, text=True
         )
@@ -89,6 +96,11 @@ def test_the_pool_goes_on_without_its_logs(run_pool, tmp_path: Path) -> None:
     child.send_signal(signal.SIGINT)
     assert child.wait(20) == 0
     assert trace(tmp_path)[-1] == "down p --yes"
+
+
+def test_a_pool_whose_launch_has_died_during_up_ends(run_pool, tmp_path: Path) -> None:
+    run_pool("--down", up="orphaned").wait(20)
+    wait_for(lambda: trace(tmp_path)[1:] == ["down p --yes"], 20)
 
 
 def test_a_pool_that_another_file_has_started_goes_on(run_pool, tmp_path: Path) -> None:

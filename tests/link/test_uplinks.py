@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import pytest
@@ -162,6 +163,56 @@ def test_an_uplink_that_is_lost_again_and_again_comes_last_for_ever_longer(monke
     assert [rested_s() for _ in range(4)] == [2.0, 4.0, 8.0, 16.0]
     now[0] += 3600.0
     assert rested_s() == 2.0
+
+
+def test_failover_goes_back_to_a_good_uplink_rather_than_on_to_one_that_rests():
+    scene = Scene("failover", 3)
+
+    def change(at: int, ready: frozenset[str]) -> None:
+        scene.uplinks[at].ready = ready
+        scene.uplinks[at].events.changed(scene.uplinks[at])
+
+    scene.uplinks[0].ready = frozenset()
+    change(1, READY)
+    assert scene.offer()
+    scene.link.forget(ID)
+    scene.uplinks[0].ready = READY
+    for ready in (READY, frozenset(), READY):
+        change(2, ready)
+    assert scene.offer()
+    scene.link.forget(ID)
+    assert scene.counts() == [0, 2, 0]
+    change(1, frozenset())
+    change(1, READY)  # it is back, and rests: nothing was asked meanwhile
+    assert scene.offer()
+    assert scene.counts() == [1, 2, 0]
+
+
+def test_two_threads_that_tell_of_one_loss_both_reach_the_owner():
+    scene = Scene("prefer")
+    one, both = scene.uplinks[0], threading.Barrier(2)
+
+    class Slow(set[str]):
+        def __contains__(self, name: object) -> bool:
+            found = super().__contains__(name)
+            both.wait(5)
+            return found
+
+    scene.link._up = Slow({one.peer.interface})  # type: ignore[attr-defined]
+    one.ready, failed = frozenset(), list[Exception]()
+
+    def tell() -> None:
+        try:
+            one.events.changed(one)
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=tell) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
 
 
 def test_what_is_too_slow_on_one_uplink_goes_out_on_the_other():

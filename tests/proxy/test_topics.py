@@ -6,6 +6,7 @@ import os
 import random
 import threading
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import pytest
@@ -548,7 +549,7 @@ def test_a_replica_that_answers_at_once_with_nothing_is_not_asked_again_at_once(
 
 def test_a_publisher_that_is_not_heard_is_told_of(caplog):
     """Otherwise nothing would pass, and nobody would know why."""
-    for topic, side in ((TO, "robot_node"), (BACK, "nodes")):
+    for topic, side in product((TO, BACK), ("robot_node", "nodes")):
         world = World(topic)
         node = getattr(world, side)
         (node[0] if side == "nodes" else node).mismatch = "offers best effort"
@@ -556,6 +557,16 @@ def test_a_publisher_that_is_not_heard_is_told_of(caplog):
             world.clock.now += 3
             world.robot.tick()
             world.replicas[0].tick()
-        told = world.replicas[0].trouble or world.robot.report()["/to"].get("trouble")
+        told = world.replicas[0].trouble or world.robot.report()[topic.name].get("trouble")
         assert told == "offers best effort"
-    assert len([r for r in caplog.records if "best effort" in r.getMessage()]) == 2
+    assert len([r for r in caplog.records if "best effort" in r.getMessage()]) == 4
+
+
+def test_what_a_command_did_wrong_is_not_told_instead_of_its_end():
+    world = World(TO)
+    world.nodes[0].mismatch = "asks for reliable messages"
+    world.clock.now += 3
+    world.replicas[0].tick()
+    assert world.replicas[0].trouble
+    world.replicas[0].use(None)
+    assert world.replicas[0].trouble == ""

@@ -59,6 +59,8 @@ def test_a_subscriber_that_asks_for_more_is_told_of_with_the_remedy(make_node, r
     assert "`latched: true`" in plain.mismatch()
     assert "`reliable: true`" in easy.mismatch()
     assert fine.mismatch() == ""
+    other.subscribe(SAID, print)  # as beside a tool that asks for more than others
+    wait_for(lambda: not plain.mismatch(), "a subscriber that receives messages")
 
 
 def test_a_publisher_of_another_type_is_told_of(make_node, ros_domain):

@@ -136,7 +136,17 @@ def test_what_no_vm_gets_no_image_has(docker: Path):
     (docker / "lab/.skyignore").write_text(lines)
     commands.bake(docker / "lab/pool.yaml", "lab/baked:1", None, push=False)
     ignored = (docker / "context/.dockerignore").read_text()
-    assert ignored == "workdir/**/*.pem\nworkdir/secrets/\n!workdir/**/ours.pem\n"
+    assert ignored == "workdir/**/*.pem\nworkdir/secrets/**\n!workdir/**/ours.pem\n"
+
+
+def test_what_a_folder_leaves_out_of_itself_no_image_has(docker: Path):
+    """SkyPilot reads each folder's `.gitignore`: a virtual environment's leaves out all of it."""
+    for name, line in (("conf", "/key\nbuild/\n"), (".venv", "*\n")):
+        (docker / "lab" / name).mkdir()
+        (docker / "lab" / name / ".gitignore").write_text(line)
+    commands.bake(docker / "lab/pool.yaml", "lab/baked:1", None, push=False)
+    ignored = (docker / "context/.dockerignore").read_text()
+    assert ignored == "workdir/.venv/**/*\nworkdir/conf/key\nworkdir/conf/**/build/**\n"
 
 
 def test_a_workdir_that_cannot_be_copied_is_told(docker: Path):

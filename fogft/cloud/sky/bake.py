@@ -66,12 +66,14 @@ def write(
 
 def _ignored(workdir: Path) -> str:
     """Return a `.dockerignore` for the folder above, of the files that SkyPilot does not upload."""
-    found = [one for name in (".skyignore", ".gitignore") if (one := workdir / name).is_file()]
-    lines = found[0].read_text(errors="replace").splitlines() if found else []
+    name = ".skyignore" if (workdir / ".skyignore").exists() else ".gitignore"
     text = ""
-    for line in lines:
-        path = line.strip().removeprefix("!")
-        if path and not path.startswith("#"):
-            under = "workdir" if path.startswith("/") else "workdir/**/"
-            text += ("!" if line.startswith("!") else "") + under + path + "\n"
+    for one in sorted(filter(Path.is_file, workdir.rglob(name))):
+        at = Path("workdir", one.parent.relative_to(workdir))
+        for line in one.read_text(errors="replace").splitlines():
+            path = line.strip().removeprefix("!")
+            if path and not path.startswith("#"):
+                under = f"{at}" if path.startswith("/") else f"{at}/**/"
+                path += "**" if path.endswith("/") else ""  # a file of that name is uploaded
+                text += ("!" if line.startswith("!") else "") + under + path + "\n"
     return text

@@ -8,6 +8,8 @@ issuer's clock is over a day ahead of the verifier's, which TLS's own message do
 
 import contextlib
 import datetime
+import errno
+import os
 import socket
 import ssl
 from collections.abc import Iterator
@@ -58,14 +60,16 @@ def explain(peer: Peer, credentials: CredentialPaths) -> str:
 def _tls(peer: Peer, context: ssl.SSLContext) -> Iterator[ssl.SSLSocket]:
     """Connect through the peer's interface, as its link does. Raises OSError."""
     host, port = host_and_port(peer.endpoint)
-    family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
-    with socket.socket(family, kind) as raw:
-        raw.settimeout(_TIMEOUT_S)
-        if peer.interface:
-            raw.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, peer.interface.encode())
-        raw.connect(address)
-        with context.wrap_socket(raw) as link:
-            yield link
+    with contextlib.ExitStack() as ends:
+        for family, kind, _, _, address in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
+            raw = ends.enter_context(socket.socket(family, kind))
+            raw.settimeout(_TIMEOUT_S)
+            if peer.interface:
+                raw.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, peer.interface.encode())
+            if not (refused := raw.connect_ex(address)):
+                yield ends.enter_context(context.wrap_socket(raw))
+                return
+        raise TimeoutError if refused == errno.EAGAIN else OSError(refused, os.strerror(refused))
 
 
 def _context(credentials: CredentialPaths) -> ssl.SSLContext:

@@ -150,9 +150,8 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
     """
     if not where.folder.is_dir():
         disk.make_folder(where.folder)
-    needs = re.findall("^ConditionPathExists=.*\n", units[0].text, re.MULTILINE)[0].encode()
     there = disk.read_bytes(where.folder / units[0].name)
-    if there is not None and needs not in there:
+    if there is not None and _needs(there.decode(errors="replace")) != _needs(units[0].text):
         told = f"`{units[0].name}` runs something else"
         raise StateError(told, "remove it, or rename this configuration: a unit bears its name")
     disk.write_whole(units[0].environment, environment())
@@ -167,6 +166,10 @@ def install(where: Services, units: Sequence[Unit], paths: PoolPaths | None = No
                 process_control.end_holder(lock)
         said.append(where.systemctl("restart", "--no-block", *names))
     return [one.stderr.strip() for one in said if one.returncode]
+
+
+def _needs(text: str) -> list[Path]:
+    return [Path(path).resolve() for path in re.findall("^ConditionPathExists=(.*)$", text, re.M)]
 
 
 def hand_over(paths: PoolPaths) -> None:

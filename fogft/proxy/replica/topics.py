@@ -209,7 +209,7 @@ class TopicsOnReplica:
 
     def use(self, node: SerialisedNode | None) -> None:
         """Publish and subscribe with this node from now on; None for no node."""
-        self._publishers, self._subscriptions = {}, {}
+        self._publishers, self._subscriptions, self._trouble = {}, {}, {}
         if node is None:
             return
         if not self._running:

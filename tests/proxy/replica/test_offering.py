@@ -104,6 +104,8 @@ def test_a_service_that_is_there_and_cannot_be_called_is_not_said_to_be_missing(
     scene = Scene(ServiceSpec("/s", SET_BOOL), graph={"/s": SET_BOOL})
     scene.node.clients["/s"].there = False
     scene.look()
+    assert "cannot be called" not in scene.probe().detail, "it has only just been found"
+    scene.clock.now += SETTLED_S
     assert "`run` offers /s, but it cannot be called" in scene.probe().detail
 
 

@@ -63,9 +63,9 @@ def test_an_interface_that_is_not_there_is_named() -> None:
     assert "`no-such`" in opening.failed(0.01, 0.0, CREDENTIALS)
 
 
-def answering(said: bytes) -> socket.socket:
+def answering(said: bytes, host: str = "0.0.0.0") -> socket.socket:
     """Listen, say this to whoever has spoken, and hang up."""
-    port = socket.create_server(("0.0.0.0", 0))
+    port = socket.create_server((host, 0))
 
     def serve() -> None:
         with contextlib.suppress(OSError):
@@ -89,6 +89,22 @@ def test_what_speaks_no_tls_is_not_called_by_an_error_of_openssl(
     with answering(said) as port:
         at = peer(f"127.0.0.1:{port.getsockname()[1]}")
         assert words in diagnosis.explain(at, Authority(tmp_path).robot())
+
+
+def test_the_reason_is_looked_for_at_each_address_of_a_host(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with answering(b"no TLS", "127.0.0.1") as port:
+        number = port.getsockname()[1]
+        found = [
+            (socket.AF_INET, socket.SOCK_STREAM, 6, "", (host, number))
+            for host in ("127.0.0.2", "127.0.0.1")
+        ]
+        monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: found)
+        at, files = peer(f"lab.test:{number}"), Authority(tmp_path).robot()
+        assert "TLS" in diagnosis.explain(at, files)
+        found.pop()
+        assert "connection refused" in diagnosis.explain(at, files)
 
 
 def test_the_reason_is_looked_for_through_the_links_own_interface(
