@@ -64,7 +64,7 @@ def printable(text: str) -> str:
 
 def say(text: str) -> None:
     """Write a message to stderr, flushed. If nobody reads it, the command goes on."""
-    with contextlib.suppress(OSError):
+    with _goes_on():
         print(printable(text), file=sys.stderr, flush=True)
 
 
@@ -149,10 +149,22 @@ def silenced_stdout() -> bool:
         poll.register(sys.stdout.fileno(), 0)
         if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
             return False
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.close(nowhere)
+    _discard(1)
     return True
+
+
+@contextlib.contextmanager
+def _goes_on() -> Iterator[None]:
+    try:
+        yield
+    except OSError:
+        _discard(2)  # what is buffered, too: Python's exit would fail on it
+
+
+def _discard(descriptor: int) -> None:
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, descriptor)
+    os.close(nowhere)
 
 
 def _drawn(stream: IO[str], *parts: RenderableType, limit: int | None) -> str:
@@ -170,7 +182,7 @@ def _tagged(tag: str, style: str, text: str) -> None:
     from rich.text import Text
 
     told = Text.assemble((tag, style), " ", printable(text))  # not wrapped: users copy commands
-    with contextlib.suppress(OSError):
+    with _goes_on():
         show(told, stream=sys.stderr, folds=False)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from dataclasses import replace
 
 import pytest
@@ -186,33 +185,6 @@ def test_failover_goes_back_to_a_good_uplink_rather_than_on_to_one_that_rests():
     change(1, READY)  # it is back, and rests: nothing was asked meanwhile
     assert scene.offer()
     assert scene.counts() == [1, 2, 0]
-
-
-def test_two_threads_that_tell_of_one_loss_both_reach_the_owner():
-    scene = Scene("prefer")
-    one, both = scene.uplinks[0], threading.Barrier(2)
-
-    class Slow(set[str]):
-        def __contains__(self, name: object) -> bool:
-            found = super().__contains__(name)
-            both.wait(5)
-            return found
-
-    scene.link._up = Slow({one.peer.interface})  # type: ignore[attr-defined]
-    one.ready, failed = frozenset(), list[Exception]()
-
-    def tell() -> None:
-        try:
-            one.events.changed(one)
-        except Exception as error:
-            failed.append(error)
-
-    threads = [threading.Thread(target=tell) for _ in range(2)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert failed == []
 
 
 def test_what_is_too_slow_on_one_uplink_goes_out_on_the_other():
