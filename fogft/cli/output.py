@@ -158,7 +158,7 @@ def _goes_on() -> Iterator[None]:
     try:
         yield
     except OSError:
-        _discard(2)  # what is buffered, too: Python's exit would fail on it
+        _discard(2)  # with the buffer, which Python would fail to flush at exit
 
 
 def _discard(descriptor: int) -> None:

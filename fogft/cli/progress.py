@@ -109,7 +109,7 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
     with _shown() as show:
         while True:
             before_s, ahead_s = ahead_s, time.time() - time.monotonic()
-            if ahead_s < before_s:  # the clock was set back: what comes now is told by that
+            if ahead_s < before_s:  # the clock was set back: observations follow it
                 awaited = replace(awaited, since=awaited.since + ahead_s - before_s)
             seen = status.read(paths, time.time())
             if seen.manager_alive:

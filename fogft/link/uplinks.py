@@ -30,8 +30,8 @@ from fogft.model.spec import ServiceSpec
 from fogft.requests.load import Handling
 
 _KEPT = 2048
-_REST_S, _LONGEST_REST_S = 2.0, 300.0
-_SOON_S = 60.0
+_REST_S, _LONGEST_REST_S = 2.0, 300.0  # how long a lost uplink is used last: doubles
+_SOON_S = 60.0  # a loss this long after the rest, or later, starts anew
 _STATES = (LinkState.UP, LinkState.SUSPECT, LinkState.CONNECTING)
 
 
@@ -78,7 +78,7 @@ class UplinksLink:
         # How many uplinks may still report the end of a forgotten or answered request.
         self._may_tell: OrderedDict[bytes, int] = OrderedDict()
         self._current: int | None = None
-        self._up: set[str] = set()  # interfaces
+        self._up: set[str] = set()  # interfaces whose link is up
         self._lost: dict[str, tuple[float, float]] = {}  # when, and for how long others go first
         self._closed = False
         self._links: list[Link] = []

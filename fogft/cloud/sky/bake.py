@@ -54,7 +54,7 @@ def write(
     if carried:
         try:
             shutil.copytree(asked["workdir"], folder / "workdir", symlinks=True)
-        except shutil.Error as error:  # a pipe, or what another user has
+        except shutil.Error as error:  # a pipe, or a file that we may not read
             raise SpecError.of_key("workdir", f"cannot be copied: {error.args[0][0][2]}") from error
         write_whole(folder / ".dockerignore", _ignored(Path(asked["workdir"])))
     text = _DOCKERFILE.format(

@@ -46,7 +46,7 @@ class Jump:
 def moved(at: float, by_s: float, now: float) -> float:
     """Return a remembered time after the clock gained `by_s`; it is `now`.
 
-    What is later than the clock was then, a better one wrote before a reboot: that stays.
+    A time later than the clock was before is kept: a better clock wrote it before a reboot.
     """
     return at + by_s if at <= now - by_s else at
 

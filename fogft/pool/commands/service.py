@@ -206,7 +206,7 @@ def states(where: Services, names: Sequence[str]) -> dict[str, str]:
 
 
 def remove(where: Services, names: Sequence[str]) -> str:
-    """Stop units, and delete them and their environment; return what systemd said against it."""
+    """Stop units, and delete them and their environment; return systemd's error, if any."""
     runs, refused = shutil.which("systemctl") is not None, ""
     if runs and names:
         done = where.systemctl("disable", "--now", *names)

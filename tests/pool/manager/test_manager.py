@@ -41,15 +41,21 @@ def test_manager_brings_up_what_the_file_asks_for(scene: Scene) -> None:
     ]
 
 
-def test_killed_manager_stops_nothing_and_the_next_one_adopts(scene: Scene) -> None:
-    """SIGKILL of the manager costs no machine and no proxy; its successor launches nothing."""
-    scene.write(replicas=2)
+def with_a_second_manager(scene: Scene, replicas: int) -> int:
+    """Kill a manager once its pool is whole, and start another; return the client proxy's pid."""
     first = scene.start_manager()
-    scene.wait(lambda: scene.whole(2))
-    proxy = scene.status()["proxy_pid"]
+    scene.wait(lambda: scene.whole(replicas))
+    proxy: int = scene.status()["proxy_pid"]
     first.send_signal(signal.SIGKILL)
     first.wait()
     scene.start_manager()
+    return proxy
+
+
+def test_killed_manager_stops_nothing_and_the_next_one_adopts(scene: Scene) -> None:
+    """SIGKILL of the manager costs no machine and no proxy; its successor launches nothing."""
+    scene.write(replicas=2)
+    proxy = with_a_second_manager(scene, 2)
     scene.wait(lambda: scene.status().get("epoch") == 2 and scene.whole(2))
     assert scene.cloud.launched() == ["0.1", "1.1"]
     assert scene.status()["proxy_pid"] == proxy
@@ -110,12 +116,7 @@ def test_a_client_proxy_that_tells_no_version_is_replaced(scene: Scene) -> None:
     """It is of a fogft before 0.2.0: what is written for it now it may not read."""
     scene.write(replicas=1)
     (scene.paths.folder / "version").write_text("")
-    first = scene.start_manager()
-    scene.wait(lambda: scene.whole(1))
-    proxy = scene.status()["proxy_pid"]
-    first.send_signal(signal.SIGKILL)
-    first.wait()
-    scene.start_manager()
+    proxy = with_a_second_manager(scene, 1)
     scene.wait(lambda: scene.whole(1) and scene.status()["proxy_pid"] not in (None, proxy))
 
 
