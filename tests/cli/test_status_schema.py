@@ -85,6 +85,7 @@ def test_the_schema_in_the_docs_is_this_one() -> None:
     """Written by `fogft status --schema > docs/reference/status.schema.json`."""
     path = Path(__file__).parents[2] / "docs/reference/status.schema.json"
     assert json.loads(path.read_text()) == SCHEMA
+    assert [name for name in SCHEMA["$defs"] if f"#/$defs/{name}" not in path.read_text()] == []
 
 
 def test_a_reason_survives_json() -> None:

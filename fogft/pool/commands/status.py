@@ -197,7 +197,7 @@ def status_schema() -> dict[str, Any]:
     own = _object(PoolStatus, definitions)
     of_reader = _object(Seen, definitions)
     properties = {**own["properties"], **of_reader["properties"]}
-    del properties["status"]  # its keys are at the top level
+    del properties["status"], definitions["PoolStatus"]  # its keys are at the top level
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "fogft status --json",
