@@ -116,7 +116,10 @@ def up(
             Outcome.NEVER_READY: "does not answer: no replica has become ready",
             Outcome.TYPES_DIFFER: "cannot answer: robot and replicas disagree on its type",
         }
-        raise _not_answering(seen, what.get(outcome, f"does not answer after {limit_s:.0f} s"))
+        hint = ""
+        if outcome is Outcome.RUN_KEEPS_ENDING and not order.spec.task.get("workdir"):
+            hint = "add `workdir: .` if `run` needs files from the pool file's folder; "
+        raise _not_answering(seen, what.get(outcome, f"does not answer after {limit_s:g} s"), hint)
     found = seen.status
     if not found.target:
         output.done(f"`{name}` is set up; its schedule asks for no replicas now")
@@ -172,7 +175,7 @@ def _end_of_log(status: PoolStatus, of: str = "") -> list[str]:
     return [f"the end of the log of `{label}`:", *(f"  {line}" for line in last_lines)]
 
 
-def _not_answering(seen: Seen, what: str) -> FogftError:
+def _not_answering(seen: Seen, what: str, hint: str) -> FogftError:
     from fogft.pool.commands.outcome import is_given_up
 
     status = seen.status
@@ -186,7 +189,7 @@ def _not_answering(seen: Seen, what: str) -> FogftError:
     tries = "the manager keeps trying: see `fogft status` and `fogft logs`"
     if is_given_up(seen):
         tries = "change the file and run `fogft up` again, or `fogft retry`; nothing is running now"
-    return FogftError("\n".join(lines), f"{tries}; `fogft down {status.pool}` ends it")
+    return FogftError("\n".join(lines), f"{hint}{tries}; `fogft down {status.pool}` ends it")
 
 
 def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) -> None:

@@ -139,6 +139,12 @@ def test_it_gives_up_at_once_when_run_keeps_ending(home, file, looks, capsys):
     said = capsys.readouterr().err
     assert "error: `/plan` of `planner` does not answer: `run` keeps exiting\n" in said
     assert f"  replica 0.1: {detail}\n" in said
+    advice = "add `workdir: .` if `run` needs files from the pool file's folder"
+    assert f"hint: {advice}; the manager keeps trying" in said
+    file.write_text(f"{POOL}workdir: .\n")
+    looks(updated(file, services=(silent,), replicas=(hopeless,)))
+    assert main.run(["up", str(file), "--timeout", "1000"]) == 1
+    assert advice not in capsys.readouterr().err
 
 
 def test_one_replica_that_still_starts_is_worth_waiting_for(file, looks, capsys):
