@@ -120,4 +120,7 @@ def _explain_usage(problem: Exception) -> None:
         message = message.replace(theirs, ours)
     metavar = getattr(getattr(problem, "param", None), "metavar", None)
     slot = "; the slot of replica `2.1` is 2" if metavar == "SLOT" else ""
-    output.error(message[:1].lower() + message[1:].rstrip("."), f"see `{path} --help`{slot}")
+    has_pool = context and any("--pool" in one.opts for one in context.command.params)
+    is_extra = type(problem).__name__ == "UsageError"  # itself: too many arguments
+    pool = "; name a pool with `--pool NAME`" if has_pool and is_extra else ""
+    output.error(message[:1].lower() + message[1:].rstrip("."), f"see `{path} --help`{slot}{pool}")

@@ -133,6 +133,16 @@ def test_wrong_usage_is_2_with_a_way_to_help(arguments, message, capsys):
     assert said.err.endswith("--help`\n")
 
 
+@pytest.mark.parametrize("arguments", [["retry"], ["drain", "0"], ["scale", "up", "1"]])
+def test_a_pool_in_the_wrong_place_is_told_the_right_one(arguments, capsys):
+    assert main.run([*arguments, "planner"]) == 2
+    words = " ".join(word for word in arguments if word.isalpha())
+    hint = f"see `fogft {words} --help`; name a pool with `--pool NAME`\n"
+    assert capsys.readouterr().err.endswith(hint)
+    assert main.run(["list", "planner"]) == 2
+    assert capsys.readouterr().err.endswith("see `fogft list --help`\n")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message", "hint"),
     [

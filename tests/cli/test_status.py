@@ -223,7 +223,8 @@ def test_which_pool_is_meant_must_be_clear(home, capsys):
     for name in ("planner", "detector"):
         lay_down(home, replace(STATUS, pool=name))
     assert main.run(["status"]) == 1
-    assert "there are 2 pools: `detector`, `planner`" in capsys.readouterr().err
+    said = "there are 2 pools: `detector`, `planner`\n\nhint: name one with `--pool NAME`\n"
+    assert said in capsys.readouterr().err
     assert main.run(["status", "detector"]) == 0
     assert capsys.readouterr().out.startswith("detector  ")
     assert main.run(["status", "planer"]) == 1

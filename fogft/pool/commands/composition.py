@@ -35,7 +35,7 @@ def paths_of(name: str | None = None) -> PoolPaths:
     known = pools()
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
-        raise PoolNotFound(f"there are {len(known)} pools: {listed}", "name one of them")
+        raise PoolNotFound(f"there are {len(known)} pools: {listed}", "name one with `--pool NAME`")
     if name is not None and name not in known and not PoolPaths.of(name).exported.exists():
         hint = f"pools: {listed}" if known else "start one with `fogft up FILE`"
         raise PoolNotFound(f"there is no pool `{name}`", hint)
