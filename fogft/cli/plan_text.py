@@ -142,9 +142,10 @@ def _summary(shown: PlanShown) -> list[str]:
     if extras:
         out.append(f"  ${extras:.3f}/h of it for disks and addresses")
     if shown.ready_p90_s is not None:
+        use = "used as the recovery below" if plan.target is None else "set `recovery_s` to it"
         out.append(
             f"ready         within {shown.ready_p90_s:.0f} s of the order "
-            f"(p90 of {shown.launches} launches; used as the recovery below)"
+            f"(p90 of {shown.launches} launches; {use})"
         )
     for name, one in shown.traffic.items():
         out.append(

@@ -97,7 +97,7 @@ def explain(
     Args:
         inputs: Of the history, only the losses and failures of locations count.
         on_demand: Offers of one on-demand machine of this kind, for comparison.
-        recovery_s: How long launches have taken; replaces the default, not the pool file's value.
+        recovery_s: How long launches have taken; used if the file has no availability target.
     """
     spec, intent, observed, history = inputs
     inputs = inputs._replace(
@@ -108,7 +108,7 @@ def explain(
     cap = size(inputs).max_usd_per_hour
     reasons = _Reasons(inputs, planned.launches, cap)
     assumed: Assumption = spec.availability or Assumption()
-    if recovery_s is not None and assumed.recovery_s == Assumption().recovery_s:
+    if recovery_s is not None and spec.availability is None:
         assumed = replace(assumed, recovery_s=recovery_s)
     places = [launch.offer.placement for launch in planned.launches]
     sold = spot_sold(inputs)

@@ -191,8 +191,14 @@ def test_how_long_launches_took_is_shown_and_taken_for_the_time_away(pool, capsy
         known = 700 if generation == 5 else None
         assert shown["ready_p90_s"] == known
         assert shown["availability"]["assumed"]["recovery_s"] == (known or 1200)
+    said = "within 700 s of the order (p90 of 5 launches; "
     assert main.run(["plan", str(pool)]) == 0
-    assert "within 700 s of the order (p90 of 5 launches" in capsys.readouterr().out
+    assert f"{said}used as the recovery below)" in capsys.readouterr().out
+    pool.write_text(POOL + "  availability: 0.9995\n")  # its replicas are counted by the file alone
+    assert main.run(["plan", str(pool)]) == 0
+    text = capsys.readouterr().out
+    assert f"{said}set `recovery_s` to it)" in text
+    assert "recovery 20 min" in text
 
 
 @needs("matplotlib")

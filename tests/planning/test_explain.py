@@ -139,8 +139,9 @@ def test_a_pool_is_compared_with_one_machine_that_would_do(target, usd_per_hour,
     assert wrong.single is None
 
 
-def test_a_measured_recovery_replaces_the_assumed_one_only():
-    assumed = of(World(spec(1))).assumed.recovery_s
+def test_a_measured_recovery_replaces_the_assumed_one_only_without_a_target():
+    """A target's replicas are counted by the file alone, and so is what is expected of them."""
     assert of(World(spec(1)), recovery_s=77.0).assumed.recovery_s == 77.0
-    said = World(spec(1, availability=AvailabilitySpec(target=0.9, recovery_s=assumed + 1)))
-    assert of(said, recovery_s=77.0).assumed.recovery_s == assumed + 1
+    for said in (AvailabilitySpec(target=0.9), AvailabilitySpec(target=0.9, recovery_s=7.0)):
+        asked = World(spec(1, availability=said))
+        assert of(asked, recovery_s=77.0).assumed.recovery_s == said.recovery_s
