@@ -25,7 +25,10 @@ def plan(  # noqa: PLR0917 - Typer reads the command line from them
     as_json: AsJson = False,
     plot: Plot = None,
 ) -> None:
-    """Show what a pool file would launch, where, why, and at what price."""
+    """Show what a pool file would launch, where, why, and at what price.
+
+    LOST is an estimate, from the pool's history, of how often a spot machine is lost there.
+    """
     from fogft.cli import plan_text
     from fogft.cli.screens import plan_plot
     from fogft.pool.commands.plan import plan_file

@@ -117,9 +117,7 @@ def _row(shown: PlanShown, one: Considered) -> list[str | Text]:
         f"{one.offer.usd_per_hour:.3f}",
         price_source(one.offer, shown.now) or "simulated",
         "?" if one.rtt_s is None else f"{one.rtt_s * 1000:.0f} ms",
-        "-"
-        if one.losses_per_hour is None
-        else f"{'~' * one.losses_assumed}{one.losses_per_hour:.2f}/h",
+        "-" if one.losses_per_hour is None else f"{one.losses_per_hour:.2f}/h",
         output.cell(words(one.why_not), "dim"),
     ]
 
@@ -240,7 +238,6 @@ def _offer_json(shown: PlanShown, one: Considered) -> dict[str, Any]:
         "rtt_source": None if distance is None else distance.source,
         "recent_losses": one.losses,
         "losses_per_hour": one.losses_per_hour,
-        "losses_assumed": one.losses_assumed,
         "slots": list(one.slots),
         "why_not": words(one.why_not),
     }

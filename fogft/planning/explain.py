@@ -21,7 +21,7 @@ from fogft.planning.buying import PlannedLaunch
 from fogft.planning.cost import Cost, cost
 from fogft.planning.listing import Scale, is_possible
 from fogft.planning.observed.backoff import EVERYWHERE, backing_off
-from fogft.planning.observed.hazard import UNKNOWN, hazards
+from fogft.planning.observed.hazard import hazards
 from fogft.planning.placement import crowding
 from fogft.planning.planner import plan
 from fogft.planning.sizing import Inputs, size, spot_sold
@@ -39,8 +39,7 @@ class Considered:
     why_not: Reason | None
     rtt_s: float | None  # round trip to its region in seconds; None for not known
     losses: int  # replicas of this pool lost there in the last hours
-    losses_per_hour: float | None = None  # the rate that the planner uses; None on demand
-    losses_assumed: bool = True  # no spot history there: the rate is the prior
+    losses_per_hour: float | None = None  # learned there; None on demand or without history
 
 
 @dataclass(frozen=True)
@@ -189,9 +188,8 @@ class _Reasons:
         recent = [t for t in self._losses.get(location, ()) if 0 <= self._now - t < LATELY_S]
         why = None if slots else self._why_not(offer)
         rtt_s = self._scale.latency(offer.placement)
-        rate = self._hazards.get(location, UNKNOWN) if offer.placement.spot else None
-        is_assumed = location not in self._hazards
-        return Considered(offer, slots, why, rtt_s, len(recent), rate, is_assumed)
+        rate = self._hazards.get(location) if offer.placement.spot else None
+        return Considered(offer, slots, why, rtt_s, len(recent), rate)
 
     def _why_not(self, offer: Offer) -> Reason:
         location = offer.placement.location

@@ -75,6 +75,8 @@ def test_text_has_costs_availability_and_response(pool, capsys):
     assert "one on-demand cpu8" in out
     assert "0.996346 expected (0.999527 if replicas failed independently)" in out
     assert "uptime 15 h spot" in out
+    assert "LOST" in out
+    assert "/h  " not in out.partition("replicas")[0], "without history, no loss rate is shown"
     assert "response      11 ms plus the service's own time; 23 ms while" in out
     assert "(pool file)" in out
 

@@ -104,8 +104,8 @@ def test_a_loss_is_told_for_some_hours(age_s, losses):
     )
     told = {one.offer: one for one in of(World(spec(1), events=events)).considered}
     assert told[OFFERS[0]].losses == losses
-    assert not told[OFFERS[0]].losses_assumed
-    assert told[OFFERS[1]].losses_assumed
+    assert told[OFFERS[0]].losses_per_hour
+    assert told[OFFERS[1]].losses_per_hour is None
     assert told[OFFERS[1]].losses == 0
 
 
