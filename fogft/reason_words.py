@@ -135,7 +135,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
         f"excluded location {r.location}" if r.location else "excluded by `fogft exclude`"
     ),
     Cause.NO_GROUP: "its group is not in the pool file",
-    Cause.OUTDATED: "runs another version than the pool",
+    Cause.OUTDATED: "was launched from another pool file or by another version of fogft",
     Cause.SUPERSEDED: "superseded by {r.replica}",
     Cause.BETTER_SPREAD: "moves to {r.location}: better spread",
     Cause.BETTER_SCORE: "moves to {r.location}: {r.share:.0%} better",
@@ -190,7 +190,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     ),
     Cause.MOST_REPLICAS: "{r.count} is the maximum",
     Cause.OVER_CAP: _over_cap,
-    Cause.UPDATING: ("update in progress: {r.count} of {r.of} replicas run the new version"),
+    Cause.UPDATING: "update in progress: {r.count} of {r.of} replicas are up to date",
     Cause.UPDATE_STOPPED: (
         "update stopped, {main}: the pool returns to the last good file, "
         "{r.count} of {r.of} replicas run it"
@@ -200,8 +200,8 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.TYPES_DIFFER: lambda r: r.words or "its types differ between robot and replica",
     Cause.RUN_ENDS: "`run` exited {r.count} times{in_brackets}",
     Cause.MORE_ERRORS: (
-        "{r.because[0].count} of {r.because[0].of} requests to the new version failed, "
-        "{r.because[1].count} of {r.because[1].of} to the old one"
+        "{r.because[0].count} of {r.because[0].of} requests to updated replicas failed, "
+        "{r.because[1].count} of {r.because[1].of} to the others"
     ),
     Cause.LAUNCHES_FAIL: "{r.count} launches failed ({names}), and none served",
     Cause.CLOUD_UNREACHABLE: "the cloud cannot be reached: nothing is launched or ended",

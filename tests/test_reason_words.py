@@ -27,6 +27,10 @@ def test_every_cause_has_words(cause: Cause) -> None:
     [
         (None, ""),
         (Reason(Cause.NOTICE), "preemption notice"),
+        (
+            Reason(Cause.UPDATING, count=1, of=3),
+            "update in progress: 1 of 3 replicas are up to date",
+        ),
         (Reason(Cause.CAPACITY), "capacity"),
         (Reason(Cause.SETUP, words="exit 3\nno {x}"), "setup: exit 3\nno {x}"),
         (
