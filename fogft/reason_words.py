@@ -177,7 +177,8 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.CROWDED: ("spread: `{r.location}` already has {r.count} when slot {r.slot} is placed"),
     Cause.NEVER_READY: _never_ready,
     Cause.LAUNCH_LIMIT: (
-        "{r.count} machines were launched within an hour, which is the limit: the next one waits"
+        "{r.count} machines were launched within an hour, which is the limit: the next one waits "
+        "(`fogft events` shows why they ended, `fogft retry` goes on at once)"
     ),
     Cause.SCHEDULED_AHEAD: "launching ahead of the next schedule window",
     Cause.TARGET_UNMET: (

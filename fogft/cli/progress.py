@@ -60,6 +60,8 @@ def announce(
         output.say(f"pool `{spec.name}` is already being updated to this file: {done}; waiting")
     elif not preview.rolled_back and upgrade_from in ("", __version__):
         output.say(f"pool `{spec.name}` already matches its file")
+        if isinstance(spec.task.get("workdir"), str):
+            output.say("  files in `workdir` are not compared: to deploy them, change `envs` too")
     if upgrade_from not in ("", __version__):
         output.say(
             f"pool `{spec.name}` runs fogft {upgrade_from}: upgrading its manager, client proxy "

@@ -97,7 +97,7 @@ def include(intent: Intent, location: str) -> Intent:
 
 
 def retry(intent: Intent, now: float) -> Intent:
-    """Resume launching a pool file that the manager gave up on."""
+    """Resume launching a pool file that was given up, or reached the hourly limit."""
     return replace(intent, retried_at=now)
 
 

@@ -79,7 +79,6 @@ class Cause(str, Enum):
     CROWDED = "crowded"
     WORSE_SCORE = "worse_score"
     CHOSEN = "chosen"  # detail of a worse score: the offer chosen instead
-
     NEVER_READY = "never_ready"  # a version is given up: none of its launches ever served
     LAUNCH_LIMIT = "launch_limit"
 

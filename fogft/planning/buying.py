@@ -76,6 +76,10 @@ class Buyer:
         return backing_off(self.history, self.observed.now)
 
     @cached_property
+    def _retried_at(self) -> float:
+        return self.history.by_clock(self.intent.retried_at)
+
+    @cached_property
     def _lost_lately(self) -> Collection[str]:
         return lost_lately(self.history, self.observed.now)
 
@@ -92,8 +96,7 @@ class Buyer:
             old = need.replaces.id.short if need.replaces else ""
             self.notes.append(Reason(Cause.SURGE_FULL, slot=need.slot, replica=old))
             return False
-        retried_at = self.history.by_clock(self.intent.retried_at)
-        hopeless = given_up(self.history, replica_hash(self.spec, need.slot), retried_at)
+        hopeless = given_up(self.history, replica_hash(self.spec, need.slot), self._retried_at)
         if hopeless is not None:
             self.notes.append(hopeless)
             return False
@@ -111,7 +114,8 @@ class Buyer:
 
     def _is_within_limit(self, *, on_demand: bool) -> bool:
         """Whether the hourly limit of a market allows one more launch; adds a note if not."""
-        had = within_an_hour(self.history, self.observed.now, on_demand=on_demand)
+        now, since = self.observed.now, self._retried_at
+        had = within_an_hour(self.history, now, since, on_demand=on_demand)
         planned = sum(x.offer.placement.spot is not on_demand for x in self.launches)
         usual = sum(group.replicas for group in self.groups)  # the pool's size before a scale-down
         most = LAUNCHES_AN_HOUR * max(1, usual, self.sized.total)

@@ -297,13 +297,17 @@ def test_no_room_for_both_is_said_before(home, file, looks, capsys):
     assert "  $0.21/h (`max_usd_per_hour`) leaves no room for both: one fewer replica" in said
 
 
-def test_the_same_file_changes_nothing(home, file, looks, capsys):
-    lay_down(home, file=file)
-    file.write_text(SPEC)
+@pytest.mark.parametrize("workdir", ["", "workdir: .\n"])
+def test_the_same_file_changes_nothing(home, file, looks, capsys, workdir):
+    lay_down(home, file=file).spec.write_text(SPEC + workdir)
+    file.write_text(SPEC + workdir)
     looks(UP, started=False)
     assert main.run(["up", str(file)]) == 0
-    first, _, last = capsys.readouterr().err.splitlines()
+    first, *rest, _, last = capsys.readouterr().err.splitlines()
     assert first == "pool `planner` already matches its file"
+    assert ["files in `workdir` are not compared" in line for line in rest] == [True] * bool(
+        workdir
+    )
     assert last == "done: `planner` answers, with 1 of 1 replicas ready"
 
 

@@ -156,7 +156,9 @@ def test_a_server_that_never_listens_is_a_failed_launch(local):
 
 def test_a_missing_workdir_is_a_failed_launch(local, tmp_path):
     id = local.launch(task={"workdir": str(tmp_path / "none")})
-    assert "workdir" in local.wait(id, MachinePhase.FAILED).failure.words
+    failure = local.wait(id, MachinePhase.FAILED).failure
+    assert failure.cause is Cause.SETUP  # other zones would be no better
+    assert "workdir" in failure.words
 
 
 def test_a_machine_ends_with_its_server(local):

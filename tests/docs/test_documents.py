@@ -7,6 +7,7 @@ import shlex
 
 import pytest
 
+from fogft.model.reason import Cause
 from tests.docs.documents import ROOT, anchors, documents, links, table_rows
 
 DOCUMENTS = documents()
@@ -72,6 +73,11 @@ def test_the_messages_of_the_troubleshooting_page_are_the_programs_own():
     ]
     assert len(told) > 25
     assert [message for message in told if message not in code] == []
+
+
+def test_every_cause_is_listed():
+    page = (ROOT / "docs" / "reference" / "diagnostics.md").read_text()
+    assert [cause.value for cause in Cause if f"`{cause.value}`" not in page] == []
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ class Machine:
             workdir.mkdir(exist_ok=True)
             return workdir
         if not isinstance(wanted, str) or not Path(wanted).is_dir():
-            raise _Failed(Cause.ERROR, f"`workdir` is not a folder on this computer: {wanted}")
+            raise _Failed(Cause.SETUP, f"`workdir` is not a folder on this computer: {wanted}")
         return Path(wanted)
 
     def _set_up(self, workdir: Path) -> None:

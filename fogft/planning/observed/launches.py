@@ -31,12 +31,19 @@ def given_up(history: History, version: str, since: float) -> Reason | None:
     return Reason(Cause.NEVER_READY, count=len(failed), because=(failed[-1].fault,))
 
 
-def within_an_hour(history: History, now: float, *, on_demand: bool) -> Sequence[Record]:
-    """Return the launches of one market within the last hour that got a machine."""
+def within_an_hour(
+    history: History, now: float, since: float = 0.0, *, on_demand: bool
+) -> Sequence[Record]:
+    """Return the launches of one market within the last hour that got a machine.
+
+    Launches before `since` do not count: the user asked to go on.
+    """
     return [
         record
         for record in history.launches[on_demand]
-        if 0 <= now - record.launched_at < HOUR_S and not _was_refused(record)
+        if 0 <= now - record.launched_at < HOUR_S
+        and record.launched_at >= since
+        and not _was_refused(record)
     ]
 
 

@@ -94,6 +94,11 @@ def test_the_launches_of_the_last_hour_are_counted(times: list[float], now: floa
     found = [record.launched_at for record in within_an_hour(history, now, on_demand=False)]
     assert found == [at for at in times if now - at < HOUR_S]
     assert within_an_hour(history, now, on_demand=True) == []
+    assert within_an_hour(history, now, now - 60.0, on_demand=False) == [
+        record
+        for record in within_an_hour(history, now, on_demand=False)
+        if record.launched_at >= now - 60.0
+    ]
     assert next_change(history, now) == min((at + HOUR_S for at in found), default=float("inf"))
 
 
