@@ -1,7 +1,7 @@
 """Check the SkyPilot part of a pool file: key names, and values that no pool supports."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from fogft.model.spec import PoolSpec
 from fogft.poolfile import removed
@@ -12,6 +12,12 @@ TASK_KEYS = (
     *("name", "workdir", "event_callback", "num_nodes", "resources", "file_mounts", "setup", "run"),
     *("envs", "secrets", "managed_secrets", "inputs", "outputs", "config", "volumes"),
     "api_server_access",
+)
+RESOURCE_KEYS = (  # the same of its `resources`
+    *("infra", "cloud", "region", "zone", "use_spot", "instance_type", "cpus", "memory"),
+    *("accelerators", "accelerator_args", "autostop", "disk_size", "disk_tier", "hooks"),
+    *("ephemeral_storage", "image_id", "job_recovery", "labels", "local_disk", "max_hourly_cost"),
+    *("network_tier", "ports", "priority", "priority_class", "volumes"),
 )
 REFUSED_TASK_KEYS = {
     "service": "it is SkyServe's; list what to replicate under `fogft.services` instead",
@@ -72,12 +78,16 @@ def _workdir(top: Section) -> None:
     raise top.error("workdir", what, "write `workdir: .`, or `workdir: {url: ..., ref: ...}`")
 
 
-def check_resources(resources: Section) -> None:
-    """Check the keys that fogft reads before SkyPilot, which accepts any value as a boolean."""
-    for key in ("any_of", "ordered"):
+def check_resources(resources: Section, lists: Sequence[str] = ("any_of", "ordered")) -> None:
+    """Check the key names, and values that fogft reads: SkyPilot takes any value as a boolean."""
+    internal = [key for key in resources.children if key.startswith("_")]
+    resources.only((*RESOURCE_KEYS, *lists, *internal))
+    for key in lists:
         if resources.has(key):
             for one in resources.sections(key, "write a list of maps"):
-                check_resources(one)
+                check_resources(one, lists=())
+    if resources.has("any_of") and resources.has("ordered") and lists:
+        raise resources.error("ordered", "cannot be combined with `any_of`", "keep one of them")
     if resources.has("labels"):
         resources.section("labels", "write a map")
     if resources.has("use_spot"):

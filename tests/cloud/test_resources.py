@@ -139,13 +139,6 @@ def test_what_is_nothing_to_this_cloud_is_accepted():
             "resources.any_of[1].region: the local cloud has no region `us-east-9`",
             "us-west",
         ),
-        ({"use_spto": True}, "resources.use_spto: unknown key", "use_spot"),
-        ({"any_of": [{"cpu": 4}]}, "resources.any_of[0].cpu: unknown key", "cpus"),
-        (
-            {"any_of": [{}], "ordered": [{}]},
-            "resources.ordered: cannot be combined with `any_of`",
-            "keep one",
-        ),
         (
             {"cpus": "64+"},
             "resources.cpus: the local cloud has no machine with `64+`",

@@ -109,6 +109,21 @@ MISTAKES = {
         "pool.yaml:1: file_mount: unknown key",
         "did you mean `file_mounts`?",
     ),
+    "unknown key in resources": (
+        pool(top="resources: {infra: aws, use_spto: true}"),
+        "pool.yaml:1: resources.use_spto: unknown key",
+        "did you mean `use_spot`?",
+    ),
+    "unknown key in one of several resources": (
+        pool(top="resources: {any_of: [{cpu: 4}]}"),
+        "pool.yaml:1: resources.any_of[0].cpu: unknown key",
+        "did you mean `cpus`?",
+    ),
+    "two lists of resources": (
+        pool(top="resources: {any_of: [{}], ordered: [{}]}"),
+        "pool.yaml:1: resources.ordered: cannot be combined with `any_of`",
+        "keep one of them",
+    ),
     "key of fogft at the top": (
         pool(top="name: a\nreplicas: 3"),
         "pool.yaml:2: replicas: unknown key",

@@ -1,26 +1,17 @@
 """Match the local cloud's offers to a task's `resources`, written for any cloud. Pure."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from fogft.cloud.local.catalogue import CLOUD, Catalogue, Instance, Zone
 from fogft.errors import SpecError
 from fogft.model.names import VM_CLOUDS
 from fogft.model.replica import Offer, Placement
-from fogft.poolfile.named_clouds import alternatives as each
-from fogft.poolfile.named_clouds import place
+from fogft.poolfile.named_clouds import alternatives, place
 from fogft.poolfile.tree import nearest, shown
 
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)
-_PLACE_KEYS = ("infra", "cloud", "region", "zone")
-_MACHINE_KEYS = ("use_spot", "instance_type", "cpus", "memory", "accelerators")
-_IDLE_KEYS = (  # they affect neither place nor machine type
-    *("accelerator_args", "autostop", "disk_size", "disk_tier", "ephemeral_storage", "hooks"),
-    *("image_id", "job_recovery", "labels", "local_disk", "max_hourly_cost", "network_tier"),
-    *("ports", "priority", "priority_class", "volumes"),
-)
-_KNOWN = (*_PLACE_KEYS, *_MACHINE_KEYS, *_IDLE_KEYS)
 _AMOUNT = re.compile(r"(\d+(?:\.\d+)?)(\+?)")
 _PER_CPU = re.compile(r"(\d+(?:\.\d+)?)x")
 _ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
@@ -37,28 +28,6 @@ def offers_for(catalogue: Catalogue, resources: Mapping[str, Any]) -> list[Offer
             placement = Placement(CLOUD, zone.region, zone.name, instance.name, spot)
             best[placement] = Offer(placement, round(price * zone.price_factor, 4))
     return sorted(best.values(), key=lambda offer: (offer.usd_per_hour, offer.placement))
-
-
-def alternatives(resources: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    """Yield each alternative in full, with its key path.
-
-    `check_resources` has already checked the form of the lists and of `use_spot`.
-    """
-    _check_keys("resources", resources, ("any_of", "ordered"))
-    if resources.get("any_of") and resources.get("ordered"):
-        raise SpecError.of_key(
-            "resources.ordered", "cannot be combined with `any_of`", "keep one of them"
-        )
-    for where, entry in each(resources):
-        _check_keys(where, entry)
-        yield where, entry
-
-
-def _check_keys(where: str, entry: Mapping[str, Any], more: Sequence[str] = ()) -> None:
-    for key in entry:
-        if key not in _KNOWN and key not in more and not str(key).startswith("_"):
-            hint = nearest(str(key), (*_KNOWN, *more))
-            raise SpecError.of_key(f"{where}.{shown(key)[1:-1]}", "unknown key", hint)
 
 
 def _zones(catalogue: Catalogue, where: str, entry: Mapping[str, Any]) -> list[Zone]:

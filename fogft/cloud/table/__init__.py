@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fogft.cloud.local.catalogue import Instance
-from fogft.cloud.local.resources import alternatives, suffices
+from fogft.cloud.local.resources import suffices
 from fogft.errors import SpecError
 from fogft.model.replica import Offer, Placement
-from fogft.poolfile.named_clouds import sells
+from fogft.poolfile.named_clouds import alternatives, sells
 from fogft.poolfile.tree import shown
 
 _NEEDED = ("InstanceType", "Region", "Price", "SpotPrice")
