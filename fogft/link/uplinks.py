@@ -61,6 +61,7 @@ class _Attempt:
     deadline: float
     handling: Handling
     on: set[int] = field(default_factory=set)
+    via: object = None  # `offer` of the connection that took it last
 
 
 class UplinksLink:
@@ -106,7 +107,7 @@ class UplinksLink:
     @property
     def thin(self) -> bool:
         """Whether all uplinks were measured to be slow."""
-        return all(link.thin for link in self._links)
+        return all(link.thin or not link.usable for link in self._links)
 
     def offer(
         self,
@@ -127,8 +128,11 @@ class UplinksLink:
             if service.startswith(topic.PREFIX):  # on another uplink it would overtake earlier ones
                 if self._again:
                     return False
-                others = (one.on for one in self._attempts.values() if one.service == service)
-                by = frozenset(next(others, ()))
+                others = (one for one in self._attempts.values() if one.service == service)
+                first = next(others, attempt)
+                by = frozenset(first.on)
+                if any(self._links[i].offer != first.via for i in by):
+                    return False  # on a new connection, too
             self._attempts[request_id] = attempt
         if self._send(request_id, attempt, by):
             return True
@@ -163,7 +167,8 @@ class UplinksLink:
                 return True  # it was answered over another uplink, or is no longer wanted
             attempt.on.add(index)
         left_s = attempt.deadline - time.monotonic()
-        if not self._links[index].offer(
+        attempt.via = send = self._links[index].offer
+        if not send(
             attempt.service, request_id, attempt.payload, left_s, handling=attempt.handling
         ):
             with self._lock:
@@ -196,11 +201,13 @@ class UplinksLink:
     def flush(self) -> None:
         """Resend requests that lost their uplink, and send cancellations."""
         with self._lock:
-            again, self._again = self._again, []
+            again = tuple(self._again)
         for request_id in again:
             attempt = self._attempts.get(request_id)
             if attempt is not None and not attempt.on and not self._send(request_id, attempt):
                 self._end(request_id, Answer(request_id, None, Refusal.LOST, attempt.service))
+        with self._lock:  # only now: until then, no message of a topic may overtake them
+            del self._again[: len(again)]
         for link in self._links:
             link.flush()
 
@@ -245,6 +252,7 @@ class UplinksLink:
                 return  # another uplink still carries it
             kind = answer.refusal
             again = kind is not None and Effect.OTHER_UPLINK in kind.effect and not self._closed
+            again = again and time.monotonic() < attempt.deadline
             if again:
                 self._again.append(answer.request_id)
         if again:

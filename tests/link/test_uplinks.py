@@ -220,10 +220,39 @@ def test_no_message_of_a_topic_overtakes_what_waits_to_go_out_again():
     scene = Scene("prefer")
     scene.offer()
     scene.lose(0)
-    assert not scene.link.offer(f"{topic.PREFIX}/t", b"j" * 16, b"m", 5.0)
+    take, meanwhile = scene.uplinks[1].offer, []
+
+    def message() -> bool:
+        return scene.link.offer(f"{topic.PREFIX}/t", b"j" * 16, b"m", 5.0)
+
+    def taking(*args, **kwargs) -> bool:
+        scene.uplinks[1].offer = take
+        meanwhile.append(message())
+        return take(*args, **kwargs)
+
+    assert not message()
     assert scene.offer(b"k" * 16)
+    scene.uplinks[1].offer = taking
     scene.link.flush()
-    assert scene.link.offer(f"{topic.PREFIX}/t", b"j" * 16, b"m", 5.0)
+    assert meanwhile == [False]
+    assert message()
+
+
+def test_what_an_uplink_did_not_carry_before_the_deadline_is_lost():
+    scene = Scene("prefer")
+    assert scene.link.offer("/s", ID, b"payload", 0.0)
+    scene.end(0, refusal=LOST)
+    assert [a.refusal for a in scene.owner.answers] == [LOST]
+    scene.link.flush()
+    assert scene.counts() == [1, 0]
+
+
+def test_only_uplinks_that_are_up_count_as_slow_or_not():
+    scene = Scene("prefer")
+    scene.uplinks[1].thin = True
+    assert not scene.link.thin
+    scene.uplinks[0].ready = frozenset()
+    assert scene.link.thin
 
 
 def test_messages_of_a_topic_stay_on_their_uplink_while_any_is_under_way():
@@ -234,6 +263,10 @@ def test_messages_of_a_topic_stay_on_their_uplink_while_any_is_under_way():
     scene.uplinks[0].ready = READY
     assert scene.link.offer(name, b"2" * 16, b"m", 5.0)
     assert scene.counts() == [0, 2]
+    before = scene.uplinks[1].offer
+    scene.uplinks[1].offer = lambda *args, **kwargs: True  # its certificate is renewed
+    assert not scene.link.offer(name, b"3" * 16, b"m", 5.0), "on a new connection, too"
+    scene.uplinks[1].offer = before
     for id in (b"1" * 16, b"2" * 16):
         scene.end(1, b"", id=id)
     assert scene.link.offer(name, b"3" * 16, b"m", 5.0)

@@ -1,8 +1,8 @@
 """Requests known to a replica or gateway: each id once, its answer kept for a while. Pure.
 
-A robot that lost its link resends the requests in flight, under the same ids. So an id is kept
-until its deadline, and its answer is kept for copies as long as there is room. Called under the
-owner's lock.
+A robot that lost its link resends the requests in flight, under the same ids, and a copy on a slow
+uplink comes late. So an id is kept beyond its deadline, and its answer is kept for copies until
+then, as long as there is room. Called under the owner's lock.
 """
 
 import heapq
@@ -12,6 +12,7 @@ from fogft.byte_limit import SMALL_BYTES, ByteLimit
 from fogft.proxy.replica.service_queue import Job
 
 COPIES_LIMIT = 8  # copies of one request waiting for its answer, one per reopened link
+_COPIES_COME_S = 120.0  # a copy on a slow uplink can arrive this long after the deadline
 _DEADLINES_KEPT = 1024  # deadlines of forgotten jobs that are not worth cleaning up
 
 
@@ -58,7 +59,7 @@ class KnownRequests:
         if len(self._deadlines) > 2 * len(self._jobs) + _DEADLINES_KEPT:
             # Drop the deadlines of jobs that were forgotten or run again.
             live = ((due, self._jobs.get(due[1])) for due in self._deadlines)
-            self._deadlines = [due for due, job in live if job and job.deadline == due[0]]
+            self._deadlines = [due for due, job in live if job and job.deadline <= due[0]]
             heapq.heapify(self._deadlines)
         self.held += 1
         if job.size > SMALL_BYTES:
@@ -82,19 +83,26 @@ class KnownRequests:
     def forget(self, job: Job) -> None:
         """Forget a finished job, so that a copy is run again."""
         del self._jobs[job.id]
+        self._drop_answer(job)
+
+    def _drop_answer(self, job: Job) -> None:
         if self._kept.pop(job.id, None) is not None:
             self._kept_bytes -= len(job.answer or b"")
+            job.answer = None
 
     def expired(self, now: float) -> list[bytes]:
-        """Forget jobs past their deadline; return the ids that a caller still waits for."""
+        """Forget jobs long past their deadline; return ids past it that a caller waits for."""
         late = []
         while self._deadlines and self._deadlines[0][0] <= now:
-            _, id = heapq.heappop(self._deadlines)
+            due, id = heapq.heappop(self._deadlines)
             job = self._jobs.get(id)
             if job is None or job.deadline > now:
                 continue
-            if job.waiting is None:
-                self.forget(job)
-            else:
+            if job.waiting is not None:
                 late.append(id)
+            elif due == job.deadline:
+                heapq.heappush(self._deadlines, (due + _COPIES_COME_S, id))
+                self._drop_answer(job)
+            else:
+                self.forget(job)
         return late
