@@ -22,6 +22,7 @@ log = logging.getLogger(__name__)
 # A replica reads zlib, and compresses answers on its own: robots of 0.2.0 look for these words.
 ACCEPTED = frozenset({"zlib", "zlib-answers"})
 LEAST_BYTES = 2048  # smaller ones fit into one or two packets
+ASIDE_BYTES = 1 << 20  # larger ones take long to check, so they too are kept off Zenoh's thread
 LIMIT_BYTES = 64 << 20  # payloads that decompress to more are refused
 FASTEST_BYTES_PER_S = 30e6  # faster links gain nothing from zlib
 _SAMPLE_BYTES = 32 << 10
@@ -124,6 +125,10 @@ class Unpacker:
                 return False
             self._waiting[peer] = deque(((content, done, packed),))
         return True
+
+    def works(self, peer: str) -> bool:
+        """Whether a payload of this peer is not done yet."""
+        return peer in self._waiting
 
     def _run(self, peer: str) -> None:
         while True:

@@ -227,6 +227,9 @@ class Client:
 
     def call(self, payload: bytes, on_response: Callable[[bytes], None]) -> int:
         """Send a serialised request; return its ticket."""
+        end = self._end
+        if end is not None:
+            end.check(payload)  # not under the lock: of a large one this takes seconds
         with self._lock:
             if self._end is None:
                 raise RosError(f"the client of `{self._client.srv_name}` is closed")

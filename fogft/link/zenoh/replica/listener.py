@@ -15,7 +15,7 @@ from zenoh import handlers
 from fogft.counters import Counters
 from fogft.errors import FrameError, WireError
 from fogft.link import batch_frames, frame
-from fogft.link.compression import Unpacker
+from fogft.link.compression import ASIDE_BYTES, Unpacker
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.zenoh import sockets, threads
 from fogft.link.zenoh.handshakes import HandshakeLog
@@ -28,7 +28,7 @@ from fogft.link.zenoh.replica.sessions import AuthenticatedSessions
 from fogft.link.zenoh.settings import LinkSettings, replica_settings, to_zenoh
 from fogft.link.zenoh.sockets import Address, address
 from fogft.link.zenoh.work_queue import WorkQueue
-from fogft.model import names
+from fogft.model import names, topic
 from fogft.model.credentials import CredentialPaths, Role
 from fogft.model.refusal import Refusal
 from fogft.model.replica import ReplicaId
@@ -216,12 +216,15 @@ class ZenohListener:
         # A robot sends in its own name, whatever the header says; a gateway in any robot's name.
         if holder.role is Role.ROBOT and holder.name != requests[0][0].robot:
             requests = [(one._replace(robot=holder.name), content) for one, content in requests]
+        peer = holder.common_name
         for header, payload in requests:
-            if not header.packed:
+            large = header.packed or len(payload) > ASIDE_BYTES
+            # A topic's small message must not overtake a large one.
+            if not large and not (service.startswith(topic.PREFIX) and self._unpacker.works(peer)):
                 self._hand_over(service, header, stream, payload)
                 continue
             hand_over = partial(self._hand_over, service, header, stream)
-            if not self._unpacker.put(holder.common_name, payload, hand_over):
+            if not self._unpacker.put(peer, payload, hand_over, packed=header.packed):
                 self._refuse(stream, Refusal.OVERLOADED, (header, payload))
         stream.seen(requests[0][0].seen)
 

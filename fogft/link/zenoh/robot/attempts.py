@@ -11,7 +11,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from typing import Protocol
 
 from fogft.link import batch_frames, frame
-from fogft.link.compression import Compression, Unpacker
+from fogft.link.compression import ASIDE_BYTES, Compression, Unpacker
 from fogft.link.credit import LARGE_BYTES, Credit, LargeSendGate
 from fogft.link.port import Answer, SendOptions
 from fogft.link.socket_progress import DeadlineFilter
@@ -40,8 +40,6 @@ _STUCK_S = 0.1
 _ZENOH_HOLDS_BYTES = 2 * 65535
 # How long the link's thread checks often after it began to send the last large request.
 _WATCH_S = 5.0
-# Processing a larger answer takes long, so it is kept off the thread that serves all links.
-_ASIDE_BYTES = 1 << 20
 
 # In the queue, in place of an attempt: send the pending cancellations.
 _TELL = OpenAttempt("", b"", None, 0, 0.0, 0.0)
@@ -357,7 +355,7 @@ class Attempts:
                 continue
             if answer.payload is not None:
                 self._credit.heard(attempt.mark)  # requests of one connection arrive in order
-            aside = packed or len(answer.payload or b"") > _ASIDE_BYTES
+            aside = packed or len(answer.payload or b"") > ASIDE_BYTES
             if aside and self.window.holds(attempt):
                 self._take_aside(attempt, answer, packed=packed)
             elif not self._close(attempt, answer):

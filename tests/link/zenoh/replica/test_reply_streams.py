@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.link import frame
+from fogft.link.compression import ASIDE_BYTES
 from fogft.link.port import Incoming, Probe, ProbeAnswer
 from fogft.link.window import OpenAttempt, Unanswered
 from fogft.link.zenoh.replica.listener import ZenohListener
@@ -116,6 +117,7 @@ class Answering:
         self.arrived: list[Incoming] = []
         self.answers_itself = False
         self.senders: list[str] = []
+        self.takers: list[str] = []
         encode = frame.encode_answer
 
         def noted(*args: Any, **rest: Any) -> bytes:
@@ -134,6 +136,7 @@ class Answering:
         )
 
     def _take(self, incoming: Incoming) -> None:
+        self.takers.append(threading.current_thread().name)
         if self.answers_itself:
             incoming.reply(incoming.payload)
         self.arrived.append(incoming)
@@ -205,3 +208,20 @@ def test_zenohs_own_thread_never_sends(
         wait_for(lambda number=number: owner.of(number))  # type: ignore[misc]
     assert all(name.startswith("fogft-reply-") for name in answering.senders)
     assert len(answering.senders) == 3
+
+
+def test_a_large_request_is_taken_off_the_thread_that_receives_for_all(
+    answering: Answering, dial: Callable[..., ZenohLink], owner: Owner
+) -> None:
+    """Checking its bytes can take seconds."""
+    link = dial(answering.listener.endpoint)
+    wait_for(lambda: link.usable)
+    for number, size in enumerate((ASIDE_BYTES + 1, 1)):
+        assert link.offer(SERVICE, request_id(number), bytes(size), 60.0)
+        wait_for(lambda number=number: len(answering.takers) > number)  # type: ignore[misc]
+    large, small = answering.takers
+    assert large.startswith("fogft-unpack-robot.")
+    assert not small.startswith("fogft-")
+    for incoming in answering.arrived:
+        incoming.reply(b"")
+    wait_for(lambda: len(owner.answers) == 2)
