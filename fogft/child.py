@@ -18,6 +18,17 @@ os.execvp(sys.argv[2], sys.argv[2:])
 """
 
 
+def python(*words: str) -> list[str]:
+    """Return the command that runs this Python; it imports nothing from the current folder.
+
+    A pool file's folder can hold a `queue.py`. Only a checkout that is not installed is imported
+    from there; Python 3.10 cannot leave it out.
+    """
+    checkout = str(Path(__file__).resolve().parents[1])
+    safe = sys.version_info >= (3, 11) and (sys.flags.safe_path or sys.path[:1] != [checkout])
+    return [sys.executable, *(["-P"] if safe else []), *words]
+
+
 def tied(command: Sequence[str]) -> list[str]:
     """Wrap a command to get SIGKILL when the thread that starts it ends: use the main thread."""
     return [sys.executable, "-IS", "-c", _PROGRAM, str(os.getpid()), *command]

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from fogft.child import python
 from fogft.process import Hanging, begin_start, end_start, load_numpy
 from tests.fakes.waiting import paced, wait_for
 from tests.needs import needs
@@ -181,3 +182,16 @@ def test_what_a_start_made_is_not_looked_through_again():
     finally:
         gc.unfreeze()
         gc.enable()
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 imports from there first")
+def test_our_processes_import_nothing_from_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is the pool file's: a `queue.py` can lie there."""
+    (tmp_path / "queue.py").write_text("raise SystemExit('not this one')\n")
+    monkeypatch.setattr(sys, "path", ["/opt/bin", *sys.path])
+    ended = subprocess.run(
+        python("-m", "queue"), cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -7,14 +7,13 @@ import json
 import os
 import secrets
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import fogft
-from fogft.child import how_it_ended
+from fogft.child import how_it_ended, python
 from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.ros import environment
 
@@ -209,7 +208,7 @@ def _self_test(*arguments: str) -> dict[str, Any]:
 
 def child_command(*arguments: str) -> list[str]:
     """Return the command that tests ROS in a separate process, which may crash."""
-    return [sys.executable, "-m", "fogft.ros.self_test", *arguments]
+    return python("-m", "fogft.ros.self_test", *arguments)
 
 
 def _environ() -> dict[str, str]:

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import itertools
-import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +27,7 @@ from launch.frontend import Entity, Parser, expose_action
 from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
 from launch_ros.actions import Node
 
+from fogft.child import python
 from fogft.disk import make_folder, write_whole
 from fogft.errors import FogftError
 from fogft.launch.pool_file import NodeCommand, pool_tree, run_text
@@ -197,7 +197,7 @@ _Blocks.add_representer(str, _Blocks.represent_str)
 def _running(
     file: Path, name: str, asked: Mapping[str, Any], cloud: str, local: Sequence[Action]
 ) -> list[Action]:
-    words = [sys.executable, "-m", "fogft.launch.run_pool", str(file), "--pool", name]
+    words = python("-m", "fogft.launch.run_pool", str(file), "--pool", name)
     words += ["--cloud", cloud] if cloud else []
     words += ["--timeout", str(asked["timeout"])] if asked["timeout"] else []
     words += ["--down"] if asked["on_exit"] == "down" else []

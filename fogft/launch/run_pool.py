@@ -13,7 +13,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from fogft.child import tied
+from fogft.child import python, tied
 from fogft.errors import FogftError, StateError
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
@@ -78,7 +78,7 @@ def _run(asked: argparse.Namespace) -> int:
 def _fogft(*words: str) -> subprocess.Popen[bytes]:
     """Start a command in its own session, because we forward a terminal's Ctrl-C ourselves."""
     return subprocess.Popen(
-        tied([sys.executable, "-m", "fogft", *words]),
+        tied(python("-m", "fogft", *words)),
         stdin=subprocess.DEVNULL,
         stderr=subprocess.STDOUT,
         start_new_session=True,

@@ -35,6 +35,7 @@ from fogft.ros import spdp
 
 SETTLED_S = 2.0
 FOLDER = Path("/dev/shm")
+_OPEN_FLAGS = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK  # others' may be a FIFO
 
 _TURN_LIMIT_S = 5.0
 _IN_DELETE, _EVENTS_BYTES = 0x200, 1 << 16  # of inotify
@@ -141,7 +142,7 @@ def break_dead_ports(domain_id: int) -> set[str]:
     ports = {str(number) for number in range(first, first + spdp.DOMAIN_GAIN)}
     for path in FOLDER.glob("fast*_port*"):
         number = path.name.rpartition("port")[2]
-        if number in ports and semaphore(path.name, "sem_trywait"):
+        if number in ports and _is_ours(path) and semaphore(path.name, "sem_trywait"):
             try:
                 if not any(_locked(path.name + beside) for beside in ("_el", "_sl")):
                     with contextlib.suppress(OSError), path.open("r+b", buffering=0) as memory:
@@ -299,12 +300,20 @@ def semaphore(group: str, operation: str) -> bool:
         libc.sem_close(ctypes.c_void_p(opened))
 
 
+def _is_ours(path: Path) -> bool:
+    """Whether a file is this user's, and no link: others can plant what we would write to."""
+    try:
+        return path.lstat().st_uid == os.getuid()
+    except FileNotFoundError:
+        return False
+
+
 def _locked(name: str) -> bool:
     """Whether any process, even one hidden from us, holds a lock on a lock file."""
     if not name.endswith(("_el", "_sl")):
         return False
     try:
-        descriptor = os.open(FOLDER / name, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        descriptor = os.open(FOLDER / name, _OPEN_FLAGS)
     except FileNotFoundError:
         return False
     except OSError:

@@ -317,7 +317,9 @@ def _other_node(domain: int, program: str = NODE) -> subprocess.Popen[str]:
 
 @pytest.mark.ros
 @needs("fastdds")
-def test_the_ports_of_killed_processes_are_broken_and_others_not(ros_domain: int) -> None:
+def test_the_ports_of_killed_processes_are_broken_and_others_not(
+    ros_domain: int, request: pytest.FixtureRequest
+) -> None:
     """A client of the killed one would write to its memory when a new one has its number."""
     first = spdp.first_port(ros_domain)
     process = _other_node(ros_domain)
@@ -327,8 +329,26 @@ def test_the_ports_of_killed_processes_are_broken_and_others_not(ros_domain: int
     process.wait()
     assert ports
     assert not ports & alive
+    planted = shared_memory.FOLDER / f"{min(ports)}_el"
+    planted.unlink(missing_ok=True)
+    os.mkfifo(planted)  # opening it would wait for a writer
+    request.addfinalizer(lambda: planted.unlink(missing_ok=True))
     assert ports <= shared_memory.break_dead_ports(ros_domain)
     assert not ports & shared_memory.break_dead_ports(ros_domain)
+
+
+@pytest.mark.ros
+@needs("fastdds")
+def test_the_ports_of_other_users_are_let_be(
+    ros_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = _other_node(ros_domain)
+    process.kill()
+    process.wait()
+    with monkeypatch.context() as other:
+        other.setattr(os, "getuid", lambda: 12345)
+        assert not shared_memory.break_dead_ports(ros_domain)
+    assert shared_memory.break_dead_ports(ros_domain)
 
 
 @pytest.mark.ros

@@ -8,13 +8,12 @@ Not here: judging the file (`preview`), waiting for the services (`fogft.cli.pro
 
 import secrets
 import shutil
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 from fogft import __version__, disk, logfile
-from fogft.child import detached
+from fogft.child import detached, python
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
 from fogft.model import intent
 from fogft.model.intent import Intent
@@ -114,7 +113,7 @@ def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None =
     """
     paths = store.paths
     name = paths.folder.name
-    words = command(name) if command else [sys.executable, "-m", "fogft", "manager", name]
+    words = command(name) if command else python("-m", "fogft", "manager", name)
     child = None
     end = time.monotonic() + MANAGER_LIMIT_S
     while time.monotonic() < end:

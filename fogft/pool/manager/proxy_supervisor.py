@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fogft import disk
-from fogft.child import detached, how_it_ended
+from fogft.child import detached, how_it_ended, python
 from fogft.model.reason import Cause, Reason
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
@@ -50,7 +50,7 @@ class ProxySupervisor:
 
     def __post_init__(self) -> None:
         self._command = self.command or (
-            *(sys.executable, "-m", "fogft"),
+            *python("-m", "fogft"),
             *("proxy", "--spare", "--config", str(self.paths.proxy_config)),
         )
         self._children: dict[subprocess.Popen[bytes], float] = {}  # and when each was started
