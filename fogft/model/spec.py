@@ -406,7 +406,7 @@ class PoolSpec:
             4,
         ),
         "Network interfaces that this machine's robot uses at once, preferred first. Each needs "
-        "its own route to the replicas.",
+        "its own route to the replicas. Without effect with `dial_in`, where replicas connect.",
         default=(),
         usual="by route",
     )

@@ -80,6 +80,9 @@ class Exchange:
             for message in frames.records(accepted):
                 for connection in self._connections.keys() - {source}:
                     connection.send(message)
+            for connection in self._connections:
+                if connection.name in self.records.revoked:
+                    connection.abort()
             self._changed()
         return len(accepted)
 

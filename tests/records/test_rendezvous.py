@@ -76,6 +76,23 @@ def test_everybody_learns_who_is_where(authority, rendezvous, party):
     wait_for(lambda: robot.endpoint(0) == "10.9.9.9:1")
 
 
+def test_a_revoked_robot_hears_no_more_over_the_connection_that_it_has(
+    authority, rendezvous, party
+):
+    place = rendezvous()
+    eve, bob, manager = (
+        party(files, place)
+        for files in (authority.robot("eve"), authority.robot("bob"), manager_files(authority))
+    )
+    wait_for(lambda: eve.client.known.connected and bob.client.known.connected)
+    names = [certificate_names.robot(POOL_UID, "eve")]
+    manager.client.publish(RecordKind.REVOCATION, "", 1, {"names": names})
+    wait_for(lambda: not eve.client.known.connected)
+    manager.admit(1, (0, 1))
+    wait_for(lambda: bob.client.known.of(RecordKind.ADMISSION))
+    assert not eve.client.known.of(RecordKind.ADMISSION)
+
+
 def test_a_replica_that_moves_without_end_is_dialled_once_a_second(
     authority, rendezvous, party, tmp_path
 ):
