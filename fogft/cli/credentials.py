@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from pathlib import Path
@@ -61,18 +62,18 @@ def issue(
     from fogft.model.credentials import Role
     from fogft.pool.commands import joining
 
-    passphrase, is_new = _chosen_passphrase(passphrase_file)
     store = composition.store_of(pool)
     file = out or Path(f"{name}.join")
     if file.exists():
         raise FogftError(f"`{file}` exists", "choose another name with `--out`")
+    passphrase = _chosen_passphrase(passphrase_file)
     holder, data = joining.issue(
         store, _role(role), name, passphrase, time.time(), open_for_s=hours * 3600
     )
+    if passphrase_file is None:
+        _show(passphrase)
     disk.write_whole(file, data)
     output.data(str(file))
-    if is_new:
-        output.say(f"passphrase: {passphrase}")
     output.done(f"{holder.role.value} `{holder.short}` may join for {hours:g} hours")
     if not store.spec().rendezvous and holder.role is not Role.RENDEZVOUS:
         output.warn(_alone(holder))
@@ -214,10 +215,10 @@ def export(
     """
     from fogft.pool.commands import moving
 
-    passphrase, is_new = _chosen_passphrase(passphrase_file)
     store = composition.store_of(pool)
-    if is_new:  # shown before the export, which leaves only the file
-        output.say(f"passphrase: {passphrase}")
+    passphrase = _chosen_passphrase(passphrase_file)
+    if passphrase_file is None:
+        _show(passphrase)
     identity = moving.export(
         *(store, home(), file, passphrase, time.time()),
         open_for_s=hours * 3600,
@@ -277,11 +278,22 @@ def _role(text: str) -> Role:
     return allowed[text]
 
 
-def _chosen_passphrase(file: Path | None) -> tuple[str, bool]:
-    """Return the passphrase in a file, or a new one, and whether it is new."""
+def _chosen_passphrase(file: Path | None) -> str:
     from fogft.pool.credentials.bundle import new_passphrase
 
-    return (new_passphrase(), True) if file is None else (_read_passphrase(file), False)
+    return new_passphrase() if file is None else _read_passphrase(file)
+
+
+def _show(passphrase: str) -> None:
+    """Show a new passphrase, before there is a file that only it opens."""
+    try:
+        print(f"passphrase: {passphrase}", file=sys.stderr, flush=True)
+        shown = not os.path.samestat(os.fstat(2), os.stat(os.devnull))
+    except OSError:
+        shown = False
+    if not shown:
+        what = "the passphrase cannot be shown: nobody reads standard error"
+        raise FogftError(what, "use `--passphrase-file FILE`")
 
 
 def _read_passphrase(file: Path | None) -> str:

@@ -113,6 +113,18 @@ def test_an_exports_new_passphrase_is_shown_before_only_the_file_is_left(
     assert "passphrase: " in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("errors", ["2>/dev/full", "2>/dev/null", "2>&-"])
+@pytest.mark.parametrize("words", ["export planner p", "credentials issue robot ada"])
+def test_nothing_is_done_with_a_passphrase_that_nobody_can_read(paths, tmp_path, errors, words):
+    done = subprocess.run(
+        ["sh", "-c", f"{sys.executable} -m fogft {words} {errors}"], cwd=tmp_path, check=False,
+        env={**os.environ, "FOGFT_HOME": str(tmp_path / "home")},
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert not [*tmp_path.glob("*.join"), *tmp_path.glob("p")]
+    assert not paths.exported.exists()
+
+
 def test_an_imported_pool_is_managed_though_its_file_cannot_be_deleted(
     paths, tmp_path, capsys, monkeypatch
 ):
