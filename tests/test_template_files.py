@@ -10,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from fogft import template_files
+from fogft.cloud.local.catalogue import BUILT_IN
+from fogft.cloud.local.resources import offers_for
 from fogft.errors import FogftError
 from fogft.pool.commands import init
 from fogft.poolfile import file, named_clouds
@@ -72,6 +74,7 @@ class TestExamples:
         assert (there.services, there.task["run"]) == (here.services, here.task["run"])
         assert there.max_hours
         assert there.max_usd_per_hour
+        assert offers_for(BUILT_IN, there.task["resources"])  # for `--cloud local`
 
     @pytest.mark.parametrize("name", EXAMPLES)
     def test_its_nodes_know_nothing_of_fogft(self, name):
