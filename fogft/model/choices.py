@@ -123,7 +123,7 @@ class Assumption:
         default=1200.0,
     )
     no_room: float = key(
-        Number(1.0, "one", from_zero=True),
+        Number(1.0, from_zero=True),
         "Fraction of time that a location has no spot capacity; while no location has any, lost "
         "spot replicas cannot be replaced.",
         default=0.0625,
@@ -136,7 +136,7 @@ class AvailabilitySpec(Assumption):
     """The pool's target availability, and assumptions about machines."""
 
     target: float = key(
-        Number(0.99999, "one"),
+        Number(0.99999),
         "Fraction of time that at least one replica answers.",
         kw_only=True,
     )

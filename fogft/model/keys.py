@@ -20,7 +20,7 @@ class Number(NamedTuple):
     """A number above 0, or 0 and above, up to a limit."""
 
     most: float
-    unit: str = ""
+    unit: str = ""  # of a fraction: none
     from_zero: bool = False
 
 
@@ -123,7 +123,7 @@ def words(form: Form) -> str:  # noqa: PLR0911
     match form:
         case Number(most, unit, from_zero):
             limits = f"{'from' if from_zero else 'above'} 0, at most {most:.10g}"
-            return f"number {limits}{f' {unit}' if unit not in ('', 'one') else ''}"
+            return f"number {limits}{f' {unit}' if unit else ''}"
         case Whole(least, most, unit):
             return f"whole number, {least} to {most}{f' {unit}' if unit else ''}"
         case Flag():

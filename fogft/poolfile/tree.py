@@ -171,7 +171,8 @@ class Section:
             return default
         node = self.children[key]
         limits = f"{'from' if zero else 'above'} 0 {'to' if zero else 'and at most'} {high:g}"
-        hint = f"write a number of {unit} {limits}, such as `{key}: {min(2.5, high):g}`"
+        what = f"number of {unit}" if unit else "fraction"
+        hint = f"write a {what} {limits}, such as `{key}: {min(2.5, high):g}`"
         if isinstance(node.value, bool) or not isinstance(node.value, (int, float)):
             raise self.error(key, f"must be a number, not {_got(node)}", hint)
         if not math.isfinite(node.value):

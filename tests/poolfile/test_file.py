@@ -231,6 +231,11 @@ MISTAKES = {
         "pool.yaml:1: envs.a: the tag `!secret` is not allowed",
         "remove it",
     ),
+    "percentage for a fraction": (
+        pool("availability: 99.95"),
+        "pool.yaml:4: fogft.availability: must be above 0 and at most 0.99999, not `99.95`",
+        "write a fraction above 0 and at most 0.99999, such as `target: 0.99999`",
+    ),
     "time for a number": (
         pool("max_hours: 1:30"),
         "pool.yaml:4: fogft.max_hours: must be a number, not the text `1:30`",
