@@ -51,14 +51,18 @@ def test_the_reasons_of_sky_check_are_found_in_its_text():
         "  \x1b[33mAWS: disabled\x1b[0m\n"
         "    Reason [compute]: AWS credentials are not set. Run the following commands:\n"
         "      $ aws configure\n"
+        "    For more info: https://docs.aws.amazon.com/\n"
         "  GCP: enabled [compute, storage]\n"
-        "\n"
         "  Azure: disabled\n"
         "    Reason [compute]: Getting user's Azure identity failed.\n"
+        "\n"
+        "\x1b[32m🎉 Enabled infra 🎉\x1b[0m\n"
+        "  GCP [compute, storage]\n"
     )
     reasons = sdk.told_reasons(told)
     assert set(reasons) == {"aws", "azure"}
     assert reasons["aws"].endswith("Run the following commands: $ aws configure")
+    assert reasons["azure"] == "Getting user's Azure identity failed."
 
 
 def test_without_skypilot_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch):

@@ -192,7 +192,9 @@ def told_reasons(output: str) -> dict[str, str]:
         heading = re.fullmatch(r"(\w[\w ]*): (enabled|disabled).*", line)
         if heading:
             cloud = heading[1].lower() if heading[2] == "disabled" else ""
-        elif cloud and line:
+        elif not line:  # what follows is about no cloud
+            cloud = ""
+        elif cloud and not line.startswith("For more info"):
             text = re.sub(r"^Reason \[[^]]*\]: ", "", line)
             reasons[cloud] = " ".join(part for part in (reasons.get(cloud, ""), text) if part)
     return reasons
