@@ -36,8 +36,7 @@ _DISCOVERY_ADVICE = (
 def rclpy(_: Situation) -> Iterator[Finding]:
     """ROS 2 can be imported, with a middleware that is known to work."""
     described = _self_test("describe")
-    problem = described.get("error") or (not described["rmw"] and described["rclpy"])
-    if problem:
+    if problem := described.get("error"):
         yield fail(
             "rclpy",
             f"ROS 2 cannot be used from this Python: {problem}",

@@ -116,21 +116,18 @@ def _added_by_wheels(folder: Path) -> bool:
 
 
 def describe(environ: Mapping[str, str] = os.environ) -> dict[str, str]:
-    """Describe the ROS 2 installation, for people. Imports rclpy; never raises."""
-    try:
-        import rclpy
-        from rclpy.utilities import get_rmw_implementation_identifier
+    """Describe the ROS 2 installation, for people. Imports rclpy, which may raise anything."""
+    import rclpy
+    from rclpy.utilities import get_rmw_implementation_identifier
 
-        place = Path(rclpy.__file__).parent
-        version = _rclpy_version(place)
-        release = ".".join(version.split(".")[:2])
-        return {
-            "rclpy": f"{version} in {place}",
-            "rmw": get_rmw_implementation_identifier(),
-            "distribution": environ.get("ROS_DISTRO") or _DISTRIBUTIONS.get(release, "unknown"),
-        }
-    except Exception as error:  # a half-installed ROS fails in its own ways
-        return {"rclpy": f"not usable: {error}", "rmw": ""}
+    place = Path(rclpy.__file__).parent
+    version = _rclpy_version(place)
+    release = ".".join(version.split(".")[:2])
+    return {
+        "rclpy": f"{version} in {place}",
+        "rmw": get_rmw_implementation_identifier(),
+        "distribution": environ.get("ROS_DISTRO") or _DISTRIBUTIONS.get(release, "unknown"),
+    }
 
 
 def _shared_memory_free_bytes() -> int:
