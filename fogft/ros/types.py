@@ -42,7 +42,7 @@ def load_service_type(name: str) -> Any:
             f"`{name}` is not the name of a service type",
             f"write `package/srv/Type`, as in `std_srvs/srv/SetBool`.{_did_you_mean(name)}",
         )
-    service_type = _find(name, "services")
+    service_type = _find(name)
     _load_type_support(name, service_type, service_type.Request, service_type.Response)
     return service_type
 
@@ -55,7 +55,7 @@ def load_message_type(name: str) -> Any:
     if not _MESSAGE.fullmatch(name):
         example = "write `package/msg/Type`, as in `sensor_msgs/msg/Image`"
         raise RosError(f"`{name}` is not the name of a message type", example)
-    message_type = _find(name, "messages")
+    message_type = _find(name)
     _load_type_support(name, message_type)
     return message_type
 
@@ -85,15 +85,14 @@ _PARTS = {
 }
 
 
-def _find(name: str, what: str) -> Any:
+def _find(name: str) -> Any:
     """Return the Python class of a type, or of a part of an action. Raises RosError."""
     package, kind, type_name = name.split("/")
+    type_name, _, part = type_name.partition("_")
+    name = f"{package}/{kind}/{type_name}"  # not the part: users know only the action
     try:
-        module = importlib.import_module(f"{package}.{kind}")
-        if kind == "action":
-            action, _, part = type_name.rpartition("_")
-            return getattr(getattr(module, action).Impl, _PARTS[part])
-        return getattr(module, type_name)
+        found = getattr(importlib.import_module(f"{package}.{kind}"), type_name)
+        return getattr(found.Impl, _PARTS[part]) if part else found
     except AttributeError as error:
         raise RosError(
             f"package `{package}` has no {_KINDS[kind]} type `{type_name}`",
@@ -104,7 +103,8 @@ def _find(name: str, what: str) -> Any:
         if missing not in (package, f"{package}.{kind}"):
             raise RosError(f"`{name}` cannot be loaded: {error}", _SOURCE_HINT) from error
         raise RosError(
-            f"there is no package `{package}` with {what} here, so `{name}` cannot be loaded",
+            f"there is no package `{package}` with {_KINDS[kind]}s here, "
+            f"so `{name}` cannot be loaded",
             "install the package, or source its workspace; ROS 2's own are in "
             f"`fogft[ros]`.{_did_you_mean(name)}",
         ) from error

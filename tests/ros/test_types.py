@@ -36,6 +36,12 @@ pytestmark = pytest.mark.ros
         ("std_srvs/srv/SetBoll", "no service type `SetBoll`", "`std_srvs/srv/SetBool`?"),
         ("nav_msgs/srv/SetBool", "no service type `SetBool`", "`std_srvs/srv/SetBool`?"),
         ("json/srv/Dumps", "no package `json` with services", "install"),
+        (
+            "my_msgs/action/Search_SendGoal",
+            "no package `my_msgs` with actions here, so `my_msgs/action/Search` cannot",
+            "install",
+        ),
+        ("test_msgs/action/Fib_GetResult", "no action type `Fib`", "up to date"),
     ],
 )
 def test_a_wrong_type_says_what_is_wrong_and_what_to_do(name: str, message: str, hint: str) -> None:
