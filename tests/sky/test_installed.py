@@ -72,6 +72,19 @@ def test_without_skypilot_the_error_says_what_to_install(monkeypatch: pytest.Mon
     assert "fogft[cloud]" in caught.value.hint  # type: ignore[attr-defined]
 
 
+@needs("skypilot")
+def test_its_import_makes_no_command_log_to_the_terminal(home: Path):
+    """SkyPilot's own modules set up a log on stderr."""
+    code = (
+        "import logging; from fogft.cloud.sky.installed import InstalledSky; "
+        "InstalledSky().load(); logging.getLogger('fogft').warning('told to nobody')"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=100
+    )
+    assert "told to nobody" not in ended.stderr
+
+
 @pytest.fixture(scope="module")
 def home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A home with the emulation's catalogue: SkyPilot must not fetch one, nor touch the user's."""

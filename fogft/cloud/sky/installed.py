@@ -11,6 +11,7 @@ import copy
 import functools
 import importlib
 import io
+import logging
 import os
 import threading
 import time
@@ -288,6 +289,7 @@ class InstalledSky:
             if self.sdk is not None:
                 return
             os.environ.setdefault(NO_REPORTS, "1")  # unless the user has set it
+            logging.basicConfig(handlers=[logging.NullHandler()])  # else SkyPilot sets one up
             try:
                 self.sky = importlib.import_module("sky")
                 self.sdk = importlib.import_module("sky.client.sdk")
