@@ -101,6 +101,8 @@ def test_machines_have_different_domains_and_not_the_robots(local, monkeypatch):
 def test_terminate_while_booting(local):
     id = local.launch(where="slow-1/a")
     wait_for(lambda: local.machine(id).progress == "booting")
+    (local.folder(id) / "state.json").unlink()  # as before its process has started
+    assert local.machine(id).progress == "ordered"
     local.cloud.terminate(id)
     assert local.machine(id) is None
     assert processes.find(machine=str(id)) == []

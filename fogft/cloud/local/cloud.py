@@ -219,7 +219,7 @@ class LocalCloud:
 
 
 def _listed(folder: MachineFolder, record: Record, state: State | None) -> Machine:
-    state = state or State(MachinePhase.PROVISIONING, progress="starting")
+    state = state or State(MachinePhase.PROVISIONING, progress="ordered")
     order = record.order
     return Machine(
         id=folder.id,
