@@ -12,7 +12,7 @@ import typer
 
 from fogft.cli import options, output
 from fogft.cli.options import AsJson, PoolArgument, PoolOption
-from fogft.cli.status_text import age, price, show_table
+from fogft.cli.status_text import age, price, readiness, show_table
 from fogft.errors import PoolNotFound, StateError
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import PoolPaths, home
@@ -54,7 +54,7 @@ def list(as_json: AsJson = False) -> None:
             [
                 name,
                 output.cell(*(("ended", "dim") if status.ended else _ANSWERS[seen.answers])),
-                f"{status.ready if seen.links_known else '?'} of {status.target}",
+                readiness(seen).removesuffix(" ready"),
                 status.cloud,
                 "?" if seen.stale else price(status.usd_per_hour).removeprefix("$"),
                 "-" if seen.age_s is None else age(seen.age_s),

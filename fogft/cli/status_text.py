@@ -66,6 +66,14 @@ def starting(status: PoolStatus, *, width: int | None) -> Group:
     return Group(*_replicas(status.replicas, STARTING_COLUMNS, width, True), *notes(status))
 
 
+def readiness(seen: Seen) -> str:
+    """Return ``2 of 3 ready``, or ``3 ready, 2 wanted`` while one stands in for another."""
+    ready, target = seen.status.ready, seen.status.target
+    if seen.links_known and ready > target:
+        return f"{ready} ready, {target} wanted"
+    return f"{ready if seen.links_known else UNKNOWN} of {target} ready"
+
+
 def _headline(seen: Seen, width: int | None) -> Text:
     status = seen.status
     pool = cell(status.pool, "bold")
@@ -86,7 +94,7 @@ def _headline(seen: Seen, width: int | None) -> Text:
         [
             pool,
             *_answering(seen),
-            cell(f"{ready if seen.links_known else UNKNOWN} of {target} ready", enough),
+            cell(readiness(seen), enough),
             cell(f"{usd_per_hour}/h on {status.cloud}"),
             *([cell(f"{price(status.usd_to_date)} so far")] if status.usd_to_date else []),
             cell("not observed yet" if seen.age_s is None else f"seen {age(seen.age_s)} ago"),

@@ -53,6 +53,12 @@ def test_a_topic_that_does_not_pass_is_named(ready, trouble, said):
     assert f"note: {said}" in shown_lines(seen)
 
 
+def test_more_replicas_than_wanted_are_not_a_part_of_them():
+    """As while one stands in for another."""
+    seen = Seen(replace(STATUS, ready=3, target=2), 0.0, manager_alive=True)
+    assert "  3 ready, 2 wanted  " in shown_lines(seen)[0]
+
+
 def test_a_client_that_gets_no_answers_is_told():
     service = replace(STATUS.services[0], counters={"trouble": "a client runs on another"})
     assert troubles(replace(STATUS, services=(service,))) == ["a client runs on another"]
