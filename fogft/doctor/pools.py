@@ -180,7 +180,7 @@ def judge_traffic(pool: str, seen: Seen) -> Iterator[Finding]:
     """Report clients that get no answers, and topics whose messages do not arrive."""
     for service in seen.status.services:
         if why := service.counters.get("trouble"):
-            yield fail("middleware", f"pool `{pool}`: {why}", "see `fogft logs`")
+            yield fail("services", f"pool `{pool}`: {why}", "")  # it says itself what to do
     for topic in seen.status.topics:
         if topic.counters.trouble:
             yield fail("topics", f"pool `{pool}`: {topic.counters.trouble}", "see `fogft status`")

@@ -22,7 +22,7 @@ from fogft.pool.commands.status import Seen
 from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager.status import ReplicaStatus, TopicStatus
-from fogft.ros import environment
+from fogft.ros import environment, vendors
 from tests.fakes.pools import FILE, STATUS, alive, lay_down, report
 from tests.needs import needs
 
@@ -200,14 +200,16 @@ def test_the_middleware_is_named_with_what_is_known_of_it(rmw, verdict, said):
 
 
 def test_clients_without_answers_and_topics_that_nobody_hears_are_told():
-    service = replace(STATUS.services[0], counters={"trouble": "a client of `/plan` runs on X"})
+    trouble = vendors.of_others("/plan", ["/mine"])  # with what to do
+    service = replace(STATUS.services[0], counters={"trouble": trouble})
     topics = (TopicStatus("/scan", "sensor_msgs/msg/LaserScan", "robot"),)
     status = replace(STATUS, services=(service,), topics=topics)
     found = list(pools.judge_traffic("p", Seen(status, 0.0, manager_alive=True, answers=True)))
     assert [(one.check, one.verdict) for one in found] == [
-        ("middleware", Verdict.FAIL),
+        ("services", Verdict.FAIL),
         ("topics", Verdict.WARN),
     ]
+    assert (found[0].text, found[0].advice) == (f"pool `p`: {trouble}", "")
 
 
 @pytest.mark.parametrize(
