@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 
 class FogftError(Exception):
     """A failure that the user can understand and act on; `hint`, if any, says how."""
@@ -89,8 +87,3 @@ class LinkVersionError(FrameError):
 def told(error: FogftError) -> str:
     """Return an error and its hint in one sentence."""
     return f"{error.message}; {error.hint}" if error.hint else error.message
-
-
-def known_slots(slots: Iterable[int]) -> str:
-    """Format slots for a hint: ``0, 1, 10``, or ``none``."""
-    return ", ".join(map(str, sorted(set(slots)))) or "none"

@@ -9,7 +9,7 @@ import typer
 from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption, Slot
-from fogft.errors import FogftError, known_slots
+from fogft.errors import FogftError
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 
@@ -141,12 +141,14 @@ def _chaos() -> Chaos:
 
 
 def _machine(pool: str | None, slot: int) -> ReplicaId:
+    from fogft.model.groups import slots_hint
+
     identity = composition.store_of(pool).identity()
     machines = composition.cloud_of(identity).machines(identity.uid)
     found = [machine.id for machine in machines if machine.id.slot == slot]
     if not found:
-        known = known_slots(machine.id.slot for machine in machines)
         raise FogftError(
-            f"no machine is running in slot {slot} of `{identity.name}`", f"slots in use: {known}"
+            f"no machine is running in slot {slot} of `{identity.name}`",
+            slots_hint(slot, (machine.id.slot for machine in machines)),
         )
     return max(found)

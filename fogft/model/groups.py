@@ -5,7 +5,7 @@ A pool file without groups has a single one. A slot identifies its group: group 
 stand in for spot ones.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,6 +36,13 @@ class Group(GroupSpec):
     def owns(self, slot: int) -> bool:
         """Whether a slot belongs to the group."""
         return slot // BLOCK == self.block
+
+
+def slots_hint(slot: int, used: Iterable[int]) -> str:
+    """Return the hint where no machine is in a slot: where to look, or the slots in use."""
+    if slot >= FIRST_BY_HAND:
+        return f"replicas from slot {FIRST_BY_HAND} on are started by hand: use their own machine"
+    return f"slots in use: {', '.join(map(str, sorted(set(used)))) or 'none'}"
 
 
 def is_stand_in(slot: int) -> bool:

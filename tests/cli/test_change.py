@@ -72,7 +72,7 @@ def test_only_a_slot_with_a_replica_can_be_drained(home, capsys):
     paths = lay_down(home)
     assert main.run(["drain", "7"]) == 1
     assert capsys.readouterr().err == (
-        "error: pool `planner` has no replica in slot 7\n\nhint: slots with a replica: 0, 1, 2\n"
+        "error: pool `planner` has no replica in slot 7\n\nhint: slots in use: 0, 1, 2\n"
     )
     assert wish(paths)["drained"] == {}
 

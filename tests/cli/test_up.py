@@ -407,6 +407,9 @@ def test_logs_of_a_slot_that_never_was(home, capsys):
     lay_down(home, file=file)
     assert main.run(["logs", "4"]) == 1
     assert "no log of a replica in slot 4" in capsys.readouterr().err
+    for command in (["logs", "2000"], ["chaos", "kill", "2000"]):
+        assert main.run(command) == 1
+        assert "are started by hand: use their own machine" in capsys.readouterr().err
 
 
 # --- refresh

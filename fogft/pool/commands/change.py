@@ -10,9 +10,10 @@ from functools import partial
 
 from fogft import disk
 from fogft.cloud.port import Cloud
-from fogft.errors import FogftError, PoolBusy, known_slots
+from fogft.errors import FogftError, PoolBusy
 from fogft.model import intent
 from fogft.model.credentials import Holder, Role
+from fogft.model.groups import slots_hint
 from fogft.model.intent import Intent
 from fogft.pool.commands.status import read, slots
 from fogft.pool.credentials.ledger import Ledger
@@ -70,9 +71,9 @@ def generation_in(paths: PoolPaths, slot: int, now: float) -> int:
             f"end it on its own machine; `fogft credentials revoke replica {slot}` locks it out",
         )
     if not found:
-        known = known_slots(replica.slot for replica in status.replicas)
         raise FogftError(
-            f"pool `{status.pool}` has no replica in slot {slot}", f"slots with a replica: {known}"
+            f"pool `{status.pool}` has no replica in slot {slot}",
+            slots_hint(slot, (replica.slot for replica in status.replicas)),
         )
     return max(found)
 

@@ -9,7 +9,8 @@ import sys
 from pathlib import Path
 
 from fogft.cloud.port import Cloud
-from fogft.errors import CloudError, FogftError, known_slots
+from fogft.errors import CloudError, FogftError
+from fogft.model.groups import slots_hint
 from fogft.model.replica import ReplicaId
 from fogft.planning.observed.history import OF_NO_REPLICA
 from fogft.pool.folder.store import PoolStore
@@ -33,9 +34,8 @@ def find(store: PoolStore, cloud: Cloud, slot: int | None = None) -> list[tuple[
         if path is not None:
             found.append((id.short, Path(path)))
     if slot is not None and not found:
-        known = known_slots(slot for slot, _ in launched)
         raise FogftError(
             f"there is no log of a replica in slot {slot} of `{store.paths.folder.name}`",
-            f"slots in use: {known}",
+            slots_hint(slot, (one for one, _ in launched)),
         )
     return found

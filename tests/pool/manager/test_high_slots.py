@@ -173,7 +173,7 @@ def test_slots_are_listed_by_number(tmp_path: Path) -> None:
     disk.write_json(PoolPaths(tmp_path).status, replace(seen(), replicas=rows).to_json())
     with pytest.raises(FogftError) as caught:
         change.generation_in(PoolPaths(tmp_path), 5, NOW)
-    assert caught.value.hint == "slots with a replica: 9, 10, 99, 100"
+    assert caught.value.hint == "slots in use: 9, 10, 99, 100"
     with pytest.raises(FogftError, match="started manually") as caught:
         change.generation_in(PoolPaths(tmp_path), 2000, NOW)
     assert "`fogft credentials revoke replica 2000`" in caught.value.hint
