@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import time
 from typing import TYPE_CHECKING, Annotated
 
@@ -132,4 +133,4 @@ def _done(store: PoolStore, what: str) -> None:
     output.done(what)
     if not disk.is_locked(store.paths.manager_lock):
         output.warn(f"`{store.name}` has no manager: this takes effect once one is running")
-        output.hint(f"start it with `fogft up {store.identity().file}`")
+        output.hint(f"start it with `fogft up {shlex.quote(store.identity().file)}`")

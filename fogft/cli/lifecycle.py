@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import sys
 import time
@@ -52,7 +53,7 @@ def init(
     files = copy_example(name, into or Path(name), force=force)
     for file in files:
         output.data(str(file))
-    output.hint(f"look at `{files[0]}`, then run `fogft up {files[0]}`")
+    output.hint(f"look at `{files[0]}`, then run `fogft up {shlex.quote(str(files[0]))}`")
 
 
 def up(

@@ -6,6 +6,7 @@ import datetime
 import json
 import os
 import re
+import shlex
 import sys
 import time
 from collections import deque
@@ -102,22 +103,19 @@ def _watch(paths: PoolPaths, *, as_json: bool) -> None:
 
 
 def _remark(seen: Seen, folder: Path) -> None:
+    up = f"`fogft up {shlex.quote(seen.status.file)}`"
     if seen.status.proxy_alive and not seen.links_known:
         told = "nothing" if seen.report_age_s is None else f"nothing for {age(seen.report_age_s)}"
         output.warn(f"the client proxy runs but has reported {told}: whether it answers is unknown")
         output.hint(f"it is starting, hangs or cannot write to `{folder}`; see `fogft doctor`")
     if seen.status.ended and not seen.manager_alive:
-        output.hint(
-            f"restart it with `fogft up {seen.status.file}`, or remove it with `fogft down`"
-        )
+        output.hint(f"restart it with {up}, or remove it with `fogft down`")
     elif not seen.manager_alive:
         goes_on = "requests continue, but lost replicas are not replaced"
         if seen.lease_left_s is not None:
             goes_on += f", and the others shut down in {age(seen.lease_left_s)}"
         output.warn(f"no manager is running: {goes_on if seen.answers else 'nothing is replaced'}")
-        output.hint(
-            f"start one with `fogft up {seen.status.file}`, or shut the pool down with `fogft down`"
-        )
+        output.hint(f"start one with {up}, or shut the pool down with `fogft down`")
     elif why := disk.unwritable(folder):
         output.warn(f"the disk of `{folder}` is {why}: nothing is launched")
         output.hint("the manager resumes by itself once that is fixed; requests need no disk")
@@ -125,7 +123,7 @@ def _remark(seen: Seen, folder: Path) -> None:
         output.warn(
             f"the pool runs fogft {seen.status.manager_version}, this command is {__version__}"
         )
-        output.hint(f"`fogft up {seen.status.file}` upgrades it while it serves")
+        output.hint(f"{up} upgrades it while it serves")
     elif seen.age_s is not None and seen.stale:
         output.warn(f"the manager has not observed the pool for {seen.age_s:.0f} s")
         output.hint("see `fogft logs` and `fogft doctor`")

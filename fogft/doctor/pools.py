@@ -1,6 +1,7 @@
 """Checks of a pool file, of the pools on this machine, and of leftovers of lost pools."""
 
 import contextlib
+import shlex
 from collections.abc import Iterator
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
@@ -154,7 +155,7 @@ def processes(situation: Situation) -> Iterator[Finding]:
 
 
 def _judge_processes(pool: str, seen: Seen) -> Iterator[Finding]:
-    proxy, up = seen.status.proxy_alive, f"run `fogft up {seen.status.file}`"
+    proxy, up = seen.status.proxy_alive, f"run `fogft up {shlex.quote(seen.status.file)}`"
     if seen.manager_alive:
         yield ok("manager", f"pool `{pool}`: runs")
     else:

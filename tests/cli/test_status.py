@@ -22,7 +22,7 @@ from fogft.cli import main, status
 from fogft.cli.status_text import age, milliseconds, number
 from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus
-from tests.fakes.pools import FILE, STATUS, alive, lay_down, report
+from tests.fakes.pools import STATUS, alive, lay_down, report
 
 SCREEN = """\
 planner  answering  1 of 3 ready  $0.063/h on local  seen 0.4 s ago
@@ -83,14 +83,15 @@ def test_json_is_the_managers_status_with_what_is_known_now(home, capsys):
 
 def test_a_dead_manager_is_told_twice(home, capsys):
     """In the data, for whoever reads it alone, and as a warning with what to do."""
-    paths = lay_down(home)
+    paths = lay_down(home, replace(STATUS, file="/home/my robot/pool.yaml"))
     with disk.locked(paths.proxy_lock):
         assert main.run(["status"]) == 0
     said = capsys.readouterr()
     assert "NO MANAGER" in said.out
     assert said.err == (
         "warning: no manager is running: requests continue, but lost replicas are not replaced\n\n"
-        f"hint: start one with `fogft up {FILE}`, or shut the pool down with `fogft down`\n"
+        "hint: start one with `fogft up '/home/my robot/pool.yaml'`, or shut the pool down with "
+        "`fogft down`\n"
     )
 
 

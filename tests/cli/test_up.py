@@ -324,13 +324,13 @@ def test_up_again_gives_a_pool_its_manager_back(home, file, looks, capsys):
 
 
 def test_init_writes_an_example_and_says_how_to_go_on(tmp_path, capsys):
-    into = tmp_path / "mine"
+    into = tmp_path / "my pools"
     assert main.run(["init", "planner", "--into", str(into)]) == 0
     said = capsys.readouterr()
     files = [Path(line) for line in said.out.splitlines()]
     assert files[0] == into / "pool.yaml"
     assert all(path.is_file() for path in files)
-    assert said.err == f"\nhint: look at `{files[0]}`, then run `fogft up {files[0]}`\n"
+    assert said.err == f"\nhint: look at `{files[0]}`, then run `fogft up '{files[0]}'`\n"
     assert main.run(["init", "planner", "--into", str(into)]) == 1
     assert "exist" in capsys.readouterr().err
     assert main.run(["init", "planner", "--into", str(into), "--force"]) == 0

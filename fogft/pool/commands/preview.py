@@ -156,7 +156,8 @@ def check_same(identity: Identity, spec: PoolSpec, file: Path, cloud: str) -> No
     if Path(identity.file) != file:
         raise SpecError(
             f"{file}: name: pool `{spec.name}` was started from `{identity.file}`",
-            f"give this one another `name`, or shut that one down with `fogft down {spec.name}`",
+            "give this one another `name`, put that file back if it was moved, or shut its pool "
+            f"down with `fogft down {spec.name}`",
         )
     if identity.cloud != cloud:
         raise SpecError(

@@ -84,6 +84,7 @@ def test_the_same_name_from_another_file_is_refused(scene: Scene) -> None:
             file=other,
             cloud="folder",
         )
+    assert "put that file back if it was moved" in caught.value.hint
     assert "fogft down pool" in caught.value.hint
     assert scene.store.spec().replicas == 2
 
