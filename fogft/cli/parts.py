@@ -9,6 +9,7 @@ import typer
 from fogft.cli import options, output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import PoolOption
+from fogft.errors import FogftError
 from fogft.model.choices import Speaks
 from fogft.pool.commands import composition
 from fogft.pool.commands import service as units
@@ -196,8 +197,10 @@ def install(
     for unit in wanted:
         output.data(str(where.folder / unit.name))
     if refused:
-        output.warn(f"systemd did not start: {'; '.join(refused)}")
-        return
+        raise FogftError(
+            f"the units are written, but systemd did not start them: {'; '.join(refused)}",
+            "repeat this once your own systemd runs (`loginctl enable-linger`), or use `--system`",
+        )
     if paths is not None:
         units.hand_over(paths)
         speaks = composition.store_of(pool).spec().rmw.robot

@@ -82,7 +82,7 @@ def test_units_are_written_started_shown_and_removed(home, units, tmp_path, monk
 
 @pytest.mark.parametrize("refused", ["", "*enable*"])
 def test_the_manager_yields_to_units_that_systemd_starts_and_to_no_others(
-    home, units, tmp_path, monkeypatch, refused
+    home, units, tmp_path, monkeypatch, capsys, refused
 ):
     systemd = Systemd(tmp_path / "bin", monkeypatch, refused)
     order = []
@@ -91,7 +91,8 @@ def test_the_manager_yields_to_units_that_systemd_starts_and_to_no_others(
         "end_holder",
         lambda lock: order.append((lock, systemd.asked.read_text().count("restart"))),
     )
-    assert main.run(["service", "install"]) == 0
+    assert main.run(["service", "install"]) == (1 if refused else 0)
+    assert ("once your own systemd runs" in capsys.readouterr().err) == bool(refused)
     paths = PoolPaths.of("planner", home)
     ended = [] if refused else [paths.manager_lock, paths.spare_lock, paths.standby_lock]
     assert [name for name, _ in order] == ended
