@@ -249,8 +249,12 @@ def import_(
     Starts its manager here, and deletes the file. If copies are imported on several machines, all
     but one stop once a replica tells them, within a minute.
     """
+    from fogft.model.credentials import Role
     from fogft.pool.commands import joining, moving, startup
+    from fogft.pool.credentials.bundle import read_label
 
+    if read_label(joining.read(file)).holder.role is not Role.MANAGER:
+        raise FogftError(f"`{file}` lets a machine join a pool", "use it with `fogft join`")
     passphrase = _read_passphrase(passphrase_file)
     disk.make_folder(home())
     store = moving.import_(file, passphrase, home(), time.time(), pool_file=pool_file)

@@ -82,6 +82,15 @@ def test_the_passphrase_can_come_from_standard_input(paths, tmp_path, capsys, mo
     assert run("join", "ada.join", "--passphrase-file", "-") == 0
 
 
+def test_what_is_no_exported_pool_is_refused_before_its_passphrase_is_asked_for(paths, capsys):
+    issue_ada(capsys)
+    assert run("import", "ada.join") == 1
+    assert "lets a machine join a pool" in capsys.readouterr().err
+    Path("other.file").write_text("{}")
+    assert run("import", "other.file") == 1
+    assert "neither a join bundle nor an exported pool" in capsys.readouterr().err
+
+
 def test_without_a_terminal_it_says_how_to_give_the_passphrase(paths, capsys, monkeypatch):
     issue_ada(capsys)
     monkeypatch.setattr("sys.stdin", io.StringIO(""))

@@ -17,7 +17,7 @@ from typing import Annotated
 
 from fogft import disk
 from fogft.errors import FogftError, PoolBusy, PoolNotFound
-from fogft.model.credentials import Role, manager_of
+from fogft.model.credentials import manager_of
 from fogft.model.plain import Count, stored, to_plain
 from fogft.pool.commands import joining, startup
 from fogft.pool.commands.composition import make_store
@@ -124,8 +124,6 @@ def import_(
     `pool_file` is the pool file on this machine; relative paths in it start at its folder.
     """
     label, content = bundle.open_sealed(joining.read(file), passphrase, now)
-    if label.holder.role is not Role.MANAGER:
-        raise FogftError(f"`{file}` lets a machine join a pool", "use it with `fogft join`")
     brought = stored(_Moved, content, "the file contains no pool")
     was = brought.identity
     place = (pool_file or Path(was.file)).resolve()

@@ -126,7 +126,8 @@ def _parse(data: bytes) -> tuple[Label, dict[str, Any], bytes]:
             raise ValueError("its salt or nonce is of the wrong length")
     except (ValueError, TypeError, KeyError, RecursionError):
         raise CredentialError(
-            "this is not a join bundle", "`fogft credentials issue` creates one"
+            "this is neither a join bundle nor an exported pool",
+            "`fogft credentials issue` writes the former, `fogft export` the latter",
         ) from None
     return label, {key: value for key, value in raw.items() if key != "sealed"}, sealed
 

@@ -283,7 +283,7 @@ def test_any_damage_is_told(data: st.DataObject) -> None:
     | st.text().map(lambda t: json.dumps({"fogft_bundle": 1, "id": t}).encode())
 )
 def test_garbage_is_no_bundle(data: bytes) -> None:
-    with pytest.raises(CredentialError, match="not a join bundle"):
+    with pytest.raises(CredentialError, match="neither a join bundle nor an exported pool"):
         bundle.read_label(data)
 
 

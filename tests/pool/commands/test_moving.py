@@ -108,7 +108,7 @@ def test_a_join_bundle_moves_no_pool(made, tmp_path):
     bundle = tmp_path / "ada.join"
     _, data = joining.issue(store, Role.ROBOT, "ada", SECRET, NOW, open_for_s=60)
     bundle.write_bytes(data)
-    with pytest.raises(FogftError, match="lets a machine join"):
+    with pytest.raises(FogftError, match="contains no pool"):
         moving.import_(bundle, SECRET, tmp_path / "new", NOW)
 
 
