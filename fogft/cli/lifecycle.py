@@ -203,7 +203,7 @@ def down(pool: PoolArgument = None, yes: Yes = False, named: PoolOption = None) 
     from fogft.ros import shared_memory
 
     name = options.one_pool(pool, named)
-    if not composition.pools() and not (name and PoolPaths.of(name).exported.exists()):
+    if not composition.pools() and not composition.pools(exported=True):
         output.say("no pools on this machine")
         return
     store = composition.store_of(name)

@@ -13,7 +13,7 @@ import typer
 from fogft.cli import options, output
 from fogft.cli.options import AsJson, PoolArgument, PoolOption
 from fogft.cli.status_text import age, price, readiness, show_table
-from fogft.errors import PoolNotFound, StateError
+from fogft.errors import PoolBusy, PoolNotFound, StateError
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import PoolPaths, home
 
@@ -38,22 +38,24 @@ def list(as_json: AsJson = False) -> None:
 
     found: dict[str, dict[str, Any]] = {}
     rows: MutableSequence[Sequence[str | Text]] = []
-    for name in composition.pools():
+    exported = composition.pools(exported=True)
+    for name in sorted({*composition.pools(), *exported}):
         try:
             seen = read(PoolPaths.of(name), time.time())
         except PoolNotFound:  # it has just been ended
             continue
-        except StateError as error:
+        except (PoolBusy, StateError) as error:
             found[name] = {"pool": name, "error": error.message}
             rows.append([name, output.cell("?", "bold red"), "?", "?", "?", "?", error.message])
             continue
         status = seen.status
         said = {key: value for key, value in seen.to_json().items() if key in _LISTED}
-        found[name] = {"pool": name, **said, "error": ""}
+        found[name] = {"pool": name, **said, "exported": name in exported, "error": ""}
+        left = "exported" if name in exported else "ended" if status.ended else ""
         rows.append(
             [
                 name,
-                output.cell(*(("ended", "dim") if status.ended else _ANSWERS[seen.answers])),
+                output.cell(*((left, "dim") if left else _ANSWERS[seen.answers])),
                 readiness(seen).removesuffix(" ready"),
                 status.cloud,
                 "?" if seen.stale else price(status.usd_per_hour).removeprefix("$"),

@@ -77,7 +77,7 @@ def status(  # noqa: PLR0917 - Typer reads the command line from them
         output.json_data(seen.to_json())
     else:
         output.show(status_text.rendered(seen, width=output.width(sys.stdout)))
-    _remark(seen, paths.folder)
+    _remark(seen, paths)
     if check and not seen.answers:
         raise typer.Exit(1)
 
@@ -102,13 +102,15 @@ def _watch(paths: PoolPaths, *, as_json: bool) -> None:
             show(status_text.rendered(seen, width=width))
 
 
-def _remark(seen: Seen, folder: Path) -> None:
-    up = f"`fogft up {shlex.quote(seen.status.file)}`"
+def _remark(seen: Seen, paths: PoolPaths) -> None:
+    folder, up = paths.folder, f"`fogft up {shlex.quote(seen.status.file)}`"
     if seen.status.proxy_alive and not seen.links_known:
         told = "nothing" if seen.report_age_s is None else f"nothing for {age(seen.report_age_s)}"
         output.warn(f"the client proxy runs but has reported {told}: whether it answers is unknown")
         output.hint(f"it is starting, hangs or cannot write to `{folder}`; see `fogft doctor`")
-    if seen.status.ended and not seen.manager_alive:
+    if paths.exported.exists():
+        output.hint(f"exported: managed elsewhere; `fogft down {folder.name}` removes what is here")
+    elif seen.status.ended and not seen.manager_alive:
         output.hint(f"restart it with {up}, or remove it with `fogft down`")
     elif not seen.manager_alive:
         goes_on = "requests continue, but lost replicas are not replaced"

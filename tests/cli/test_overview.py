@@ -39,6 +39,22 @@ def test_each_pool_has_a_row_with_what_is_known_now(home, capsys, monkeypatch):
     assert "is damaged" in found["broken"]["error"]
 
 
+@pytest.mark.parametrize("status", [STATUS, None])
+def test_what_an_exported_pool_has_left_here_is_shown(home, capsys, status):
+    """Its client proxy may still answer; only `down` makes sense here."""
+    paths = lay_down(home, status)
+    paths.identity.rename(paths.exported)
+    assert main.run(["list"]) == 0
+    said = capsys.readouterr().out
+    assert "exported" in said
+    assert main.run(["status"]) == (0 if status else 1)
+    said = capsys.readouterr().err
+    assert "`fogft down planner` removes what is" in said
+    assert "fogft up" not in said
+    assert main.run(["down"]) == 0
+    assert not paths.folder.exists()
+
+
 def test_where_there_is_none_that_is_said(capsys):
     assert main.run(["list"]) == 0
     assert "no pools on this machine" in capsys.readouterr().err

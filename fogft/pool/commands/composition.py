@@ -21,18 +21,19 @@ SKY = "sky"
 CLOUDS = (LOCAL, SKY)
 
 
-def pools() -> list[str]:
-    """Return the names of the pools on this machine, sorted."""
+def pools(*, exported: bool = False) -> list[str]:
+    """Return the names of the pools on this machine, or of those exported from it, sorted."""
     try:
         folders = list((home() / "pools").iterdir())
     except FileNotFoundError:
         return []
-    return sorted(one.name for one in folders if PoolPaths(one).identity.exists())
+    kept = [one.exported if exported else one.identity for one in map(PoolPaths, folders)]
+    return sorted(one.parent.name for one in kept if one.exists())
 
 
 def paths_of(name: str | None = None) -> PoolPaths:
     """Return the paths of the named pool, or of the only one."""
-    known = pools()
+    known = pools() or pools(exported=True)
     listed = ", ".join(f"`{pool}`" for pool in known)
     if name is None and len(known) > 1:
         raise PoolNotFound(f"there are {len(known)} pools: {listed}", "name one with `--pool NAME`")
