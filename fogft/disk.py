@@ -70,7 +70,7 @@ def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
 
 
 class Report:
-    """A JSON file with the current status, updated even when the disk takes no new file.
+    """A JSON file with what is current, updated even when the disk takes no new file.
 
     In that case the previous file, kept open, is overwritten: a reader may then find it damaged.
     """

@@ -26,11 +26,15 @@ class _File:
     records: list[Any]
 
 
+def content(records: Sequence[SignedRecord]) -> dict[str, Any]:
+    """Return the content of a file with these records."""
+    plain = [to_plain(one) for one in records]
+    return {"version": VERSION, "checksum": checksum(plain), "records": plain}
+
+
 def write(path: Path, records: Sequence[SignedRecord]) -> None:
     """Replace the file's content with these records."""
-    content = [to_plain(one) for one in records]
-    whole = {"version": VERSION, "checksum": checksum(content), "records": content}
-    disk.write_json(path, whole)
+    disk.write_json(path, content(records))
 
 
 def read(path: Path) -> list[SignedRecord]:

@@ -106,14 +106,16 @@ def test_a_manager_that_hangs_is_told(home, capsys, age_s):
     )
 
 
-def test_a_full_disk_is_told_instead(home, capsys, monkeypatch):
+@pytest.mark.parametrize("why", ["full", "read-only"])
+def test_a_full_disk_is_told_instead(home, capsys, monkeypatch, why):
     """It is why what is shown is old; the manager is not to blame."""
-    monkeypatch.setattr(disk, "unwritable", lambda folder: "full")
+    monkeypatch.setattr(disk, "unwritable", lambda folder: why)
     paths = lay_down(home, age_s=40)
     with alive(paths):
         main.run(["status"])
     said = capsys.readouterr().err
-    assert said.startswith(f"warning: the disk of `{paths.folder}` is full: ")
+    assert said.startswith(f"warning: the disk of `{paths.folder}` is {why}: ")
+    assert ("`unmanaged_max_hours`" in said) == (why == "read-only")  # leases need a file there
     assert "observed" not in said
 
 

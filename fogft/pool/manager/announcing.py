@@ -7,6 +7,7 @@ to pass on.
 import datetime
 from typing import Any
 
+from fogft import disk
 from fogft.model.credentials import CredentialPaths, manager_of
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
@@ -42,13 +43,21 @@ class ManagerRecords:
         self._revoked: frozenset[str] = frozenset()
         self._lease: ServingLease | None = None
         self._leases = 0  # how many were signed in this epoch
-        self._announced = b""  # what was written last
+        self._announced: dict[str, Any] = {}  # as signed last
+        self._written = self._announced
+        self._report = disk.Report(paths.announcements)
 
     def look(
         self, endpoints: tuple[str, ...], membership: Membership | None, lease: ServingLease
     ) -> None:
-        """Publish changes at these rendezvous, and sign new announcements."""
+        """Publish changes at these rendezvous, and sign and write new announcements."""
         self._announce(self._revoked if membership is None else membership.revoked, lease)
+        self._publish(endpoints, membership)
+        if self._announced is not self._written:  # last: a rendezvous needs no disk
+            self._report.write(self._announced)
+            self._written = self._announced
+
+    def _publish(self, endpoints: tuple[str, ...], membership: Membership | None) -> None:
         if endpoints != self._endpoints:
             self.close()
             self._endpoints, self._said, self._said_lease = endpoints, None, None
@@ -78,7 +87,7 @@ class ManagerRecords:
     def announcements(self, lease: ServingLease) -> bytes:
         """Return the signed records for a launch: revocations so far, and a lease."""
         self._announce(Ledger(self._paths.credentials).revoked(), lease)
-        return self._announced
+        return disk.to_json(self._announced).encode()
 
     def _announce(self, more: frozenset[str], lease: ServingLease) -> None:
         """Sign new records for the client proxy to pass on: there may be no rendezvous."""
@@ -93,8 +102,7 @@ class ManagerRecords:
         if revoked:  # they only grow in number, so that is their sequence in one epoch
             names = {"names": sorted(revoked)}
             records.append(self._record(RecordKind.REVOCATION, len(revoked), names))
-        cache.write(self._paths.announcements, [sign_record(one, signer) for one in records])
-        self._announced = self._paths.announcements.read_bytes()
+        self._announced = cache.content([sign_record(one, signer) for one in records])
         self._revoked, self._lease = revoked, lease
 
     def _record(self, kind: RecordKind, sequence: int, content: dict[str, Any]) -> Record:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import tempfile
 import threading
 from pathlib import Path
 
 import pytest
 
+from fogft.errors import StateError
 from fogft.model.credentials import CredentialPaths, Holder, Role
 from fogft.model.membership import members_of
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, Placement, ReplicaId
@@ -118,6 +120,31 @@ def test_without_a_rendezvous_the_lease_is_signed_for_the_client_proxy_to_pass_o
     manager.look((), membership(1, 1), ServingLease(1e9 + 203.0, 30.0))
     assert lease(read_body(cache.read(paths.announcements)[0])) == ServingLease(1e9 + 203.0, 30.0)
     assert not paths.manager_records.exists()
+
+
+def test_a_full_disk_holds_no_lease_back(paths, place, monkeypatch):
+    """The client proxy finds it in the old file, and a rendezvous needs no file at all."""
+    manager = ManagerRecords(paths, UID, 1)
+    manager.look((place.endpoint,), membership(1, 1), LEASE)
+
+    def full(**_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "mkstemp", full)
+    later = ServingLease(LEASE.at + 60.0, LEASE.lasts_s)
+    manager.look((place.endpoint,), membership(1, 2, 0), later)
+    assert lease(read_body(cache.read(paths.announcements)[0])) == later
+    paths.announcements.unlink()
+    latest = ServingLease(LEASE.at + 120.0, LEASE.lasts_s)
+    for version in (3, 4):  # it is tried again, and said again
+        with pytest.raises(StateError, match=r"announcements\.json` cannot be written: No space"):
+            manager.look((place.endpoint,), membership(1, version, 0), latest)
+        wait_for(lambda version=version: place.admitted() == membership(1, version, 0))
+    wait_for(lambda: lease(place.records.get(RecordKind.LEASE).record) == latest)
+    monkeypatch.undo()
+    manager.look((place.endpoint,), membership(1, 4, 0), latest)
+    assert lease(read_body(cache.read(paths.announcements)[0])) == latest
+    manager.close()
 
 
 def test_it_says_when_none_can_be_reached_and_follows_a_changed_file(paths, place):
