@@ -10,7 +10,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -42,25 +42,27 @@ def make_folder(path: Path) -> None:
 def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> None:
     """Replace a file atomically, mode 0600; `durable`: it survives a power cut (one fsync)."""
     data = content.encode() if isinstance(content, str) else content
-    os.close(_replaced(path, data, durable=durable))
+    write_together({path: data}, durable=durable)
 
 
-def _replaced(path: Path, data: bytes, *, durable: bool) -> int:
-    temporary = ""
+def write_together(files: Mapping[Path, bytes], *, durable: bool = True) -> None:
+    """Replace files as `write_whole` does, one after another, once all are on the disk."""
+    made: dict[Path, str] = {}
     try:
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(descriptor, "wb", closefd=False) as file:
-            file.write(data)
-        if durable:
-            os.fsync(descriptor)
-        os.replace(temporary, path)
+        for path, data in files.items():
+            descriptor, made[path] = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(data)
+                if durable:
+                    file.flush()
+                    os.fsync(descriptor)
+        for path, temporary in made.items():
+            os.replace(temporary, path)
     except OSError as error:
-        if temporary:
-            os.close(descriptor)
+        for temporary in made.values():
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
         raise not_done("written", path, error) from error
-    return descriptor
 
 
 def write_json(path: Path, value: Any, *, durable: bool = True) -> None:
@@ -83,13 +85,14 @@ class Report:
         """Replace the file."""
         data = json.dumps(value).encode()
         try:
-            new = _replaced(self._path, data, durable=False)
+            write_whole(self._path, data, durable=False)
         except StateError:
             if not self._written_over(data):
                 raise
         else:
             self.close()
-            self._open = new
+            with contextlib.suppress(OSError):
+                self._open = os.open(self._path, os.O_RDWR | os.O_CLOEXEC)
 
     def _written_over(self, data: bytes) -> bool:
         """Overwrite the file in place, padded with spaces; return whether the data fitted."""

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from fogft import disk
 from fogft.errors import CredentialError
 from fogft.model.credentials import Role, holder_of
-from fogft.records.signing import attribute
+from fogft.records.signing import Signer, attribute
 
 if TYPE_CHECKING:
     from cryptography import x509
@@ -87,8 +87,7 @@ def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS
 def write(credential: Credential, folder: Path, stem: str) -> None:
     """Write its files to a folder (0700), each 0600."""
     disk.make_folder(folder)
-    for name, content in credential.files(stem).items():
-        disk.write_whole(folder / name, content)
+    disk.write_together({folder / name: data for name, data in credential.files(stem).items()})
 
 
 def describe(path: Path) -> Description:
@@ -97,10 +96,11 @@ def describe(path: Path) -> Description:
 
 
 def is_good(path: Path, now: datetime.datetime, revoked: frozenset[str] = frozenset()) -> bool:
-    """Whether a certificate exists, is not revoked, and is valid for two more months."""
+    """Whether a certificate exists with its key, is not revoked, and valid for two more months."""
     try:
         said = describe(path)
         holder_of(said.common_name)
+        Signer(path, path.with_suffix(".key"))
     except (CredentialError, ValueError):
         return False  # there is none yet, it is damaged, or of another form
     problem = said.problem(now) or said.problem(now + RENEW_BEFORE)

@@ -103,19 +103,24 @@ def proxy_config(
 def certify_robot(
     paths: PoolPaths, identity: Identity, spec: PoolSpec, now: datetime.datetime
 ) -> None:
-    """Ensure that the client proxy has a valid certificate."""
+    """Ensure that the client proxy has a valid certificate, and its key."""
     revoked = Ledger(paths.credentials).revoked()
-    if not authority.is_good(paths.credentials / "robot.crt", now, revoked):
-        rotate_robot(paths, identity, spec)
+    with disk.locked(paths.credentials / "robot.lock"):  # no rotation is under way
+        if not authority.is_good(paths.credentials / "robot.crt", now, revoked):
+            _rotate(paths, identity, spec)
 
 
 def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
     """Issue new credentials to this machine's client proxy, which switches to them itself."""
     with disk.locked(paths.credentials / "robot.lock"):  # key and certificate are two files
-        holder, issued = Ledger(paths.credentials).issue_next(
-            Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
-        )
-        authority.write(issued, paths.credentials, "robot")
+        return _rotate(paths, identity, spec)
+
+
+def _rotate(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
+    holder, issued = Ledger(paths.credentials).issue_next(
+        Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
+    )
+    authority.write(issued, paths.credentials, "robot")
     return holder
 
 

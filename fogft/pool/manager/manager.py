@@ -93,7 +93,7 @@ class Manager:
         )
         self._ledger = Ledger(self._paths.credentials)
         self._certified_at: float | None = None
-        self._revoked: frozenset[str] = frozenset()
+        self._certified_for: object = None  # the revocations, and the robot's key
         self._records = ManagerRecords(self._paths, self._identity.uid, self._lease.epoch)
         self._discovery = Discovery(self._paths.discovered)
         self._versions: dict[Path, tuple[int, int, int] | None] = {}
@@ -277,12 +277,12 @@ class Manager:
 
     def _keep_proxy(self) -> None:
         now = time.time()
-        revoked = self._ledger.revoked()
+        seen = self._ledger.revoked(), disk.version(self._paths.credentials / "robot.key")
         due = self._certified_at is None or abs(now - self._certified_at) > CERTIFY_EVERY_S
-        if due or revoked != self._revoked:
+        if due or seen != self._certified_for:
             utc = datetime.datetime.now(datetime.timezone.utc)
             configuration.certify_robot(self._paths, self._identity, self.store.spec(), utc)
-            self._certified_at, self._revoked = now, revoked
+            self._certified_at, self._certified_for = now, seen
         configuration.write_proxy_config(self._paths, self._identity, self.store.spec())
         over = lifetime.is_over(self.store.spec(), self._begun_at(), time.time())
         if self.keeps_proxy and not self.store.intent().stopping and not over:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import functools
+import os
+import tempfile
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from fogft import disk
+from fogft.errors import StateError
 from fogft.model.choices import MetricsSpec, Middleware, Speaks
 from fogft.model.replica import Offer, Placement, ReplicaId
 from fogft.model.spec import HealthSpec, OnTimeout, PoolSpec, ServiceSpec
@@ -170,19 +172,60 @@ def test_a_replicas_certificate_outlives_the_pool_and_a_margin(
 def test_of_two_rotations_at_once_key_and_certificate_are_of_the_same(
     paths: PoolPaths, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A key beside another's certificate opens no link, until somebody rotates again."""
-    asked = paths, identity(paths.folder), spec()
-    write, later = disk.write_whole, list[Future[object]]()
-    rotate = functools.partial(configuration.rotate_robot, *asked)
+    """A key beside another's certificate opens no link, until somebody rotates again.
 
-    def written(path: Path, *given: Any, **how: Any) -> None:
-        write(path, *given, **how)
+    The manager looks meanwhile: it waits, and does not rotate as well.
+    """
+    asked = paths, identity(paths.folder), spec()
+    replace, later = os.replace, list[Future[object]]()
+    rotate = functools.partial(configuration.rotate_robot, *asked)
+    now = datetime.datetime.now(datetime.timezone.utc)
+    look = functools.partial(configuration.certify_robot, *asked, now)
+
+    def replaced(temporary: str, path: Path) -> None:
+        replace(temporary, path)
         if path.name == "robot.key" and not later:
             later.append(threads.submit(object))
-            later[0] = amid(threads, rotate, paths.credentials / "robot.lock")
+            for step in (look, rotate):
+                later.append(amid(threads, step, paths.credentials / "robot.lock"))
 
-    with ThreadPoolExecutor(2) as threads:
-        monkeypatch.setattr(disk, "write_whole", written)
+    with ThreadPoolExecutor(3) as threads:
+        monkeypatch.setattr(os, "replace", replaced)
         rotate()
-        later[0].result()
-    assert Signer(paths.credentials / "robot.crt", paths.credentials / "robot.key").common_name
+        for one in later:
+            one.result()
+    assert _common_name(paths).startswith(f"robot.{configuration.robot_name()}.2.")
+
+
+def _common_name(paths: PoolPaths) -> str:
+    return Signer(paths.credentials / "robot.crt", paths.credentials / "robot.key").common_name
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_rotation_that_fails_leaves_a_key_and_its_certificate(
+    paths: PoolPaths, monkeypatch: pytest.MonkeyPatch, full: bool
+) -> None:
+    """On a full disk the old pair stays. What is killed in between, the manager rotates again."""
+    asked = paths, identity(paths.folder), spec()
+    now = datetime.datetime.now(datetime.timezone.utc)
+    configuration.certify_robot(*asked, now)
+    before, make, replace = _common_name(paths), tempfile.mkstemp, os.replace
+
+    def made(**how: Any) -> tuple[int, str]:
+        if full and how["prefix"] == ".robot.crt.":
+            raise OSError(28, "No space left on device")
+        return make(**how)
+
+    def replaced(temporary: str, path: Path) -> None:
+        if path.name == "robot.crt":
+            raise OSError(5, "Input/output error")
+        replace(temporary, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tempfile, "mkstemp", made)
+        patch.setattr(os, "replace", replaced)
+        with pytest.raises(StateError, match=r"robot\.crt` cannot be written"):
+            configuration.rotate_robot(*asked)
+    assert not list(paths.credentials.glob(".*"))
+    configuration.certify_robot(*asked, now)
+    assert (_common_name(paths) == before) == full
