@@ -964,6 +964,23 @@ def test_a_full_disk_keeps_no_machine(scene: Scene, monkeypatch):
     assert scene.machines() == []
 
 
+def test_a_launch_that_fails_on_a_full_disk_is_ended_and_forgotten(scene: Scene, monkeypatch):
+    """Why it failed cannot be kept; it is not ended again and again for that."""
+    scene.cloud.launch(scene.order())
+    scene.sky.boot(NAME)
+    scene.sky.finish(NAME)
+
+    def refuse(*_args, **_changes):
+        raise StateError("no space is left")
+
+    monkeypatch.setattr(scene.cloud.journal, "update", refuse)
+    scene.sky.fail(NAME, "CommandError", "Command failed with return code 1")
+    scene.work()
+    assert not scene.provider.found
+    assert scene.machines() == []
+    assert len(scene.sky.asked("down")) == 1
+
+
 def test_whose_machines_they_are_is_known_without_a_users_name_and_by_the_computer(
     tmp_path, monkeypatch
 ):

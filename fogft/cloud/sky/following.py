@@ -5,6 +5,7 @@ hangs is taken down at once, because a machine that it has created costs money. 
 from when this process first saw the launch.
 """
 
+import contextlib
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -15,7 +16,7 @@ from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.journal import UNDER_WAY, Entry, Journal, Stage
 from fogft.cloud.sky.naming import MAPPING_CLOUDS, cluster_name
 from fogft.cloud.sky.sdk import ClusterState, JobState, RefusedError
-from fogft.errors import CloudError
+from fogft.errors import CloudError, StateError
 from fogft.model.names import SETUP_LIMIT_S
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
@@ -151,9 +152,12 @@ class Following:
     def _fail(self, entry: Entry, failure: Reason) -> None:
         """Record the failure first, so that it is kept whatever happens during the teardown."""
         log.warning("launch_failed replica=%s reason=%r", entry.id.short, in_words(failure))
-        self.journal.update(entry.id, stage=Stage.FAILED, failure=failure)
+        with contextlib.suppress(StateError):  # a full disk is no reason to keep paying
+            self.journal.update(entry.id, stage=Stage.FAILED, failure=failure)
         try:
             self.ending.end(entry.id)
+            if self.journal.get(entry.id) == entry:  # not recorded: do not end it again and again
+                self.journal.close(entry.id)
         except CloudError as error:  # it stays listed as failed until `terminate` succeeds
             log.warning("end_failed replica=%s reason=%r", entry.id.short, str(error))
 

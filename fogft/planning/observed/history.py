@@ -38,7 +38,7 @@ class EventKind(str, Enum):
     DRAINING = "draining"  # marked to end
     UNDRAINED = "undrained"  # the mark was taken back
     FAILED = "failed"  # its launch has failed
-    ENDING = "ending"  # written before the cloud is asked to end it
+    ENDING = "ending"  # recorded before the cloud is asked to end it
     ENDED = "ended"  # gone, as asked
     GONE = "gone"  # gone, unasked: preempted, crashed or ended by someone else
     CLOCK = "clock"  # of no replica: the wall clock was set

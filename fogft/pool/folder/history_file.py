@@ -1,6 +1,7 @@
 """The history of a pool in a file: events are on disk before anything acts on them.
 
-A launch is written before the cloud is asked, so that its generation is never used twice.
+A launch is written before the cloud is asked, so that its generation is never used twice. Other
+events that cannot be written count all the same, and are written with the next one.
 
 Owns: `history.jsonl`. Not here: what follows from events (`fogft.planning.observed.history`).
 """
@@ -15,7 +16,7 @@ from pathlib import Path
 from fogft import disk
 from fogft.errors import StateError
 from fogft.model.plain import from_plain, to_plain
-from fogft.planning.observed.history import Event, History, compacted
+from fogft.planning.observed.history import Event, EventKind, History, compacted
 
 COMPACT_AFTER = 20_000
 
@@ -23,7 +24,7 @@ COMPACT_AFTER = 20_000
 class HistoryFile:
     """The events of one pool. Safe to use from several threads; one process writes it.
 
-    `heard` is called with each event, once it is written. Reading changes nothing on disk.
+    `heard` is called with each event, once it counts. Reading changes nothing on disk.
     """
 
     def __init__(self, path: Path, clock: Callable[[], float]) -> None:
@@ -32,6 +33,7 @@ class HistoryFile:
         self._lock = threading.Lock()
         self._known: History | None = None
         self._appended = 0
+        self._unwritten = b""
         self._is_long = False  # the file needs compaction, by its writer only
         self.heard: Callable[[Event], object] = lambda _: None
 
@@ -43,7 +45,7 @@ class HistoryFile:
             return self._known
 
     def append(self, event: Event) -> None:
-        """Append an event; it is on disk when this returns."""
+        """Append an event; a launch is on disk when this returns, or it raises `StateError`."""
         history = self.history()
         with self._lock:
             if self._is_long:
@@ -51,13 +53,17 @@ class HistoryFile:
                 kept = compacted(_read_events(self._path), self._clock())
                 with contextlib.suppress(StateError):  # no space: it is not compacted
                     disk.write_whole(self._path, "".join(map(_line, kept)))
+            lines = self._unwritten + _line(event).encode()
             try:
-                _append_durably(self._path, _line(event).encode())
+                _append_durably(self._path, lines)
+                self._unwritten = b""
             except OSError as error:
-                raise disk.not_done("written", self._path, error) from error
+                if event.kind is EventKind.LAUNCH:
+                    raise disk.not_done("written", self._path, error) from error
+                self._unwritten = lines  # a full disk is no reason to keep paying
             history.add(event)
             self._appended += 1
-            if self._appended >= COMPACT_AFTER:
+            if self._appended >= COMPACT_AFTER and not self._unwritten:
                 self._known = self._load()
         self.heard(event)
 

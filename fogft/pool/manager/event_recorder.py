@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class EventRecorder:
-    """Adds events to a pool's history: on disk before a method returns, or it raises `StateError`.
+    """Adds events to a pool's history. Raises `StateError` for a launch that cannot be written.
 
     `clock` gives the time of the observation: otherwise the plan that follows would ignore a loss
     as an event in the future, and choose the same location again.

@@ -173,12 +173,12 @@ class Manager:
         for step in (self._lease.beat, self._step_back, self._bound_logs, self._keep_proxy):
             self._attempt(step)
         tick = self._attempt(self._reconciler.tick)
+        self._attempt(lambda: self._announce(tick))
         if tick is None:
             return False
         self._scrape.at(tick.spec.metrics.manager if self.metrics is None else self.metrics)
         self._attempt(lambda: self._charge(tick))
         self._attempt(lambda: self._discover(tick))
-        self._attempt(lambda: self._announce(tick))
         if tick.over and tick.observed.machines == ():
             self._attempt(self._leave)
             if not self._trouble:
@@ -222,9 +222,9 @@ class Manager:
             for one in report.gateways
         )
 
-    def _announce(self, tick: Tick) -> None:
-        lease = self._serving_lease(tick.spec)
-        self._records.look(tick.spec.rendezvous, tick.membership, lease)
+    def _announce(self, tick: Tick | None) -> None:
+        spec, membership = self.store.spec(), tick.membership if tick is not None else None
+        self._records.look(spec.rendezvous, membership, self._serving_lease(spec))
 
     def _serving_lease(self, spec: PoolSpec) -> ServingLease:
         now, begun_at = time.time(), self._begun_at()

@@ -296,10 +296,20 @@ class Reconciler:
     def _apply(self, identity: Identity, inputs: Inputs, plan: Plan) -> None:
         spec, intent, observed, history = inputs
         self._mark_draining(plan, observed, history)
-        self._publish(identity, spec, observed, plan)
         slack = _slack(spec, observed, plan)
         starts = standbys.started(inputs, plan.launches, slack)
         stops = standbys.stopped(spec, plan.terminations, observed) if self._stopping else {}
+        try:
+            self._publish(identity, spec, observed, plan)
+        finally:  # before launches, for which a disk may be too full
+            for end in plan.terminations:
+                stopped = stops.get(end.id)
+                kept = None if stopped is None else bare_order(identity, spec, stopped)
+                self._terminate(end.id, end.reason, history, stopped=kept)
+            for id, reason in standbys.superfluous(
+                spec, observed, starts.values(), stopping=intent.stopping
+            ):
+                self._terminate(id, reason, history)
         for planned in plan.launches:
             started = starts.get(planned.slot)
             order = self.build_order(identity, spec, started or planned)
@@ -307,14 +317,6 @@ class Reconciler:
             if slack is not None:
                 order = replace(order, limit_usd_per_hour=order.usd_per_hour + slack)
             self._order(order, (started or planned).reason)
-        for end in plan.terminations:
-            stopped = stops.get(end.id)
-            kept = None if stopped is None else bare_order(identity, spec, stopped)
-            self._terminate(end.id, end.reason, history, stopped=kept)
-        for id, reason in standbys.superfluous(
-            spec, observed, starts.values(), stopping=intent.stopping
-        ):
-            self._terminate(id, reason, history)
 
     def _mark_draining(self, plan: Plan, observed: Observed, history: History) -> None:
         ends = {end.id for end in plan.terminations} | observed.ending

@@ -42,9 +42,9 @@ class Timekeeping:
         jumped = bool(self._unwritten)
         while self._unwritten:
             kind, by_s, reason = self._unwritten[0]
+            self._updating.move(by_s, self.now)  # first: a full disk refuses it, not the event
             self._store.append(Event(self.now, kind, 0, 0, reason=reason, by_s=by_s))
             del self._unwritten[0]
-            self._updating.move(by_s, self.now)
         return jumped
 
 

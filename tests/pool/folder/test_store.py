@@ -57,11 +57,13 @@ def test_torn_last_line_costs_that_line_only(pool: Scene, torn: str) -> None:
     assert store_of(pool.home).recent() == [LAUNCH, READY]
 
 
-def test_full_disk_is_an_error_and_nothing_has_happened(
+def test_on_a_full_disk_nothing_is_launched_and_all_else_is_written_later(
     pool: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An event that could not be written is not in the history, on disk or in memory."""
+    """A launch that could not be written is not in the history, on disk or in memory."""
     pool.store.append(LAUNCH)
+    second = replace(LAUNCH, generation=2)
+    ended = [Event(3.0, kind, 0, 1) for kind in (EventKind.ENDING, EventKind.ENDED)]
 
     def full(descriptor: int, data: bytes) -> int:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -69,9 +71,16 @@ def test_full_disk_is_an_error_and_nothing_has_happened(
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", full)
         with pytest.raises(StateError, match="No space left"):
-            pool.store.append(replace(LAUNCH, generation=2))
+            pool.store.append(second)
+        for event in ended:
+            pool.store.append(event)
+        with pytest.raises(StateError, match="No space left"):
+            pool.store.append(second)
     assert pool.store.history().generations[0] == 1
+    assert pool.store.history().open() == []
     assert store_of(pool.home).recent() == [LAUNCH]
+    pool.store.append(second)
+    assert store_of(pool.home).recent() == [LAUNCH, *ended, second]
 
 
 def test_half_written_event_is_taken_back(pool: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,7 +91,7 @@ def test_half_written_event_is_taken_back(pool: Scene, monkeypatch: pytest.Monke
     with monkeypatch.context() as patch:
         patch.setattr(os, "write", lambda d, data: write(d, data[:10]))
         with pytest.raises(StateError):
-            pool.store.append(READY)
+            pool.store.append(replace(LAUNCH, generation=2))
     assert pool.paths.history.read_bytes() == before
 
 

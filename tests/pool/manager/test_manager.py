@@ -13,12 +13,13 @@ from typing import Any
 import pytest
 
 from fogft import __version__, disk, logfile
-from fogft.errors import PoolBusy
+from fogft.errors import PoolBusy, StateError
 from fogft.model import intent as intents
 from fogft.pool.commands import startup
 from fogft.pool.folder.lease import TERM, Lease
 from fogft.pool.manager import process_control, teardown
 from fogft.pool.manager.manager import Manager
+from fogft.pool.manager.reconciler import Reconciler
 from tests.pool.scene import Scene
 
 
@@ -313,6 +314,27 @@ def test_a_manager_steps_back_from_a_later_import_and_from_no_other(scene: Scene
         scene.store.identity()
     assert len(list(scene.cloud.folder.glob("*.json"))) == 2
     assert scene.start_manager().wait(30) == 1
+
+
+def test_a_tick_that_fails_keeps_no_lease_from_the_replicas(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on a full disk, where a launch fails for days."""
+
+    def full(self: Reconciler) -> None:
+        raise StateError("no space left")
+
+    monkeypatch.setattr(Reconciler, "tick", full)
+    scene.write(replicas=1)
+    stop = threading.Event()
+    manager = Manager(scene.store, scene.cloud, keeps_proxy=False)
+    running = threading.Thread(target=manager.run, args=(stop,))
+    running.start()
+    try:
+        scene.wait(scene.paths.announcements.exists)
+    finally:
+        stop.set()
+        running.join()
 
 
 def test_an_up_beside_a_manager_whose_pool_is_just_over_has_a_manager(

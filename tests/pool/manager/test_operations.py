@@ -229,6 +229,27 @@ def test_order_that_cannot_be_built_launches_nothing() -> None:
     assert bench.cloud.calls.launched == []
 
 
+def test_a_full_disk_keeps_no_machine() -> None:
+    """A machine that failed is ended, though neither robots nor a successor's files are told."""
+    bench = Bench()
+    bench.cloud.zones["east/one/a"].fails = "error"
+    bench.reconciler.tick()
+    bench.run()
+    bench.now += 100.0
+
+    def full(*_: object) -> None:
+        raise StateError("no space left")
+
+    bench.reconciler.build_order = full  # type: ignore[assignment]
+    bench.store.write_membership = full  # type: ignore[method-assign]
+    for _ in range(3):
+        with pytest.raises(StateError):
+            bench.reconciler.tick()
+        bench.run()
+    assert bench.cloud.calls.terminated == [ID]
+    assert bench.kinds()[1:] == [EventKind.FAILED, EventKind.ENDING, EventKind.ENDED]
+
+
 def test_prices_are_kept_while_the_cloud_is_away_for_prices() -> None:
     """Old prices are better than none; a changed `resources` makes them useless."""
     bench = Bench()

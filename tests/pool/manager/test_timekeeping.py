@@ -32,7 +32,7 @@ def test_a_jump_that_cannot_be_written_down_is_written_later(
     assert not time.look()
     wall_s[0], awake_s[0] = 1e9 + 3601, 1.0
     with monkeypatch.context() as patched:
-        patched.setattr(store, "append", _full_disk)
+        patched.setattr(store, "write_trial", _full_disk)
         with pytest.raises(StateError):
             time.look()
     wall_s[0], awake_s[0] = 1e9 + 3602, 2.0
@@ -45,5 +45,5 @@ def test_a_jump_that_cannot_be_written_down_is_written_later(
     assert time.watch.doubt_s == 3600.0
 
 
-def _full_disk(event: Event) -> None:
+def _full_disk(trial: Trial) -> None:
     raise StateError("no space left")
