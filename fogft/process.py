@@ -95,9 +95,12 @@ def _sleeps(pid: int | None) -> str:
 
 
 def on_thread(run: Callable[..., object], *arguments: Any, name: str = "") -> threading.Thread:
-    """Start a daemon thread. Raises RuntimeError if the system allows no more threads."""
+    """Start a daemon thread. Raises OSError if the system allows no more threads."""
     thread = threading.Thread(target=run, args=arguments, name=name or None, daemon=True)
-    thread.start()
+    try:
+        thread.start()
+    except RuntimeError as error:
+        raise OSError(f"{error}: check `ulimit -u`, TasksMax and the free memory") from error
     return thread
 
 

@@ -121,7 +121,7 @@ class Unpacker:
                 return True
             try:
                 on_thread(self._run, peer, name=f"fogft-unpack-{peer}")
-            except RuntimeError:
+            except OSError:
                 return False
             self._waiting[peer] = deque(((content, done, packed),))
         return True

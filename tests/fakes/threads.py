@@ -4,12 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import Barrier
 
+import pytest
+
 from tests.fakes.waiting import wait_for
+
+
+@contextlib.contextmanager
+def no_more() -> Iterator[None]:
+    """Let no thread be started, as where the system allows no more of them."""
+
+    def start(thread: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    with pytest.MonkeyPatch.context() as full:
+        full.setattr(threading.Thread, "start", start)
+        yield
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ import threading
 import zlib
 
 from fogft.link.compression import WAITING_BYTES_LIMIT, WAITING_LIMIT, Unpacker
+from tests.fakes.threads import no_more
 from tests.link.wire_pool import wait_for
 
 
@@ -52,13 +53,9 @@ def test_too_many_of_one_peer_are_declined_and_another_peer_does_not_wait() -> N
     assert unpacker.put("eve", packed, lambda payload: None)
 
 
-def test_where_there_can_be_no_more_threads_the_next_payload_has_one(monkeypatch):
-    def none(thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
+def test_where_there_can_be_no_more_threads_the_next_payload_has_one():
     unpacker, came = Unpacker(), threading.Event()
-    with monkeypatch.context() as full:
-        full.setattr(threading.Thread, "start", none)
+    with no_more():
         assert not unpacker.put("r1", b"packed", lambda _: None)
     assert unpacker.put("r1", b"packed", lambda _: came.set())
     assert came.wait(30)

@@ -12,8 +12,9 @@ import socket
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import KW_ONLY, dataclass
+from functools import partial
 
 from fogft import poll
 from fogft.counters import Counters
@@ -71,32 +72,29 @@ class DialIn:
         self._door = listening(self.listen)
         host, port = self.listen.rpartition(":")[0], self._door.getsockname()[1]
         self.endpoint = f"{host}:{port}"
-        on_thread(self._accept, name="fogft-dial-in")
+        on_thread(self._accept, self._door, self._receive, name="fogft-dial-in")
 
     # -- connections from replicas ------------------------------------------------------------
 
-    def _accept(self) -> None:
-        for link, host in self._accepted(self._door):
-            with self._lock:
-                if len(self._greeting) >= GREETINGS_LIMIT:
-                    crowd = oldest_of_most(self._greeting)
-                    self._count("greeting_crowded", self._greeting.pop(crowd))
-                    tunnel.shut_down(crowd)  # its thread closes it
-                self._greeting[link] = host
-            on_thread(self._attend, link, host, name="fogft-greet")
+    def _receive(self, link: socket.socket, address: tuple[str, int]) -> None:
+        with self._lock:
+            if len(self._greeting) >= GREETINGS_LIMIT:
+                crowd = oldest_of_most(self._greeting)
+                self._count("greeting_crowded", self._greeting.pop(crowd))
+                tunnel.shut_down(crowd)  # its thread closes it
+            on_thread(self._attend, link, address[0], name="fogft-greet")
+            self._greeting[link] = address[0]
 
-    def _accepted(self, port: socket.socket) -> Iterator[tuple[socket.socket, str]]:
-        """Yield the connections to a port, with their hosts, until it is closed."""
+    def _accept(self, port: socket.socket, receive: Callable[..., None]) -> None:
+        """Pass on each connection to a port and its address, until it is closed."""
         while True:
             try:
-                link, address = port.accept()
+                receive(*port.accept())
             except OSError as error:
                 if self._closed or port.fileno() < 0:
                     return
-                self._count("accept_failed", str(error))  # e.g. out of file descriptors
+                self._count("accept_failed", str(error))  # e.g. out of descriptors or threads
                 time.sleep(0.1)
-            else:
-                yield link, str(address[0])
 
     def _attend(self, link: socket.socket, host: str) -> None:
         try:
@@ -188,8 +186,9 @@ class DialIn:
         with self._lock:
             port = self._local.get(id)
             if port is None:
-                port = self._local[id] = listening("127.0.0.1:0")
-                on_thread(self._accept_local, id, port, name="fogft-door")
+                port = listening("127.0.0.1:0")
+                on_thread(self._accept, port, partial(self._connect, id), name="fogft-door")
+                self._local[id] = port
             return f"127.0.0.1:{port.getsockname()[1]}"
 
     def keep(self, ids: Collection[ReplicaId]) -> None:
@@ -199,14 +198,13 @@ class DialIn:
         for port in gone:
             tunnel.hang_up(port)
 
-    def _accept_local(self, id: ReplicaId, port: socket.socket) -> None:
-        for link, _ in self._accepted(port):
-            one = self._take(id)
-            if one is None:
-                link.close()  # the link retries soon
-                continue
-            self._tunnels.carry(link, one.link)
-            self._counters.add("tunnels")
+    def _connect(self, id: ReplicaId, link: socket.socket, _: object) -> None:
+        one = self._take(id)
+        if one is None:
+            link.close()  # the link retries soon
+            return
+        self._tunnels.carry(link, one.link)
+        self._counters.add("tunnels")
 
     def _take(self, id: ReplicaId) -> _Waiting | None:
         """Return a replica's connection for use, waiting briefly for one; None if none came."""

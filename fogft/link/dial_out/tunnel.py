@@ -82,7 +82,11 @@ class Tunnels:
             self._open.update(ends)
         left = [other, one]  # one entry per open direction; list.pop is atomic
         for source, target in (ends, ends[::-1]):
-            on_thread(self._carry, source, target, left, name="fogft-tunnel")
+            try:
+                on_thread(self._carry, source, target, left, name="fogft-tunnel")
+            except OSError:
+                shut_down(*ends)
+                self._carry(source, target, left)  # ends at once
 
     def _carry(
         self, source: socket.socket, target: socket.socket, left: list[socket.socket]

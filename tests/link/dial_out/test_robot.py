@@ -16,9 +16,11 @@ import pytest
 from fogft.link.dial_out.replica import WAITING, DialOut
 from fogft.link.dial_out.robot import PURPOSE, SIGN, DialIn
 from fogft.model.credentials import CredentialPaths
+from fogft.model.names import host_and_port
 from fogft.model.replica import LinkState, ReplicaId
 from fogft.records import frames
 from fogft.records.signing import Signer, Verifier
+from tests.fakes.threads import no_more
 from tests.link.wire_pool import POOL_UID, SERVICE, Authority, request_id, wait_for
 from tests.records import hostile
 
@@ -49,11 +51,23 @@ def dial_out(authority: Authority) -> Iterator[Callable[..., DialOut]]:
 
 
 def test_requests_flow_to_a_replica_that_dialled(door, dial_out, start_replica, dial, owner):
-    """Small and large ones; the robot dials nothing but its own loopback."""
+    """Small and large ones; the robot dials nothing but its own loopback.
+
+    A moment in which no thread can be started costs only the connections made in it.
+    """
     replica = start_replica()
+    with no_more(), pytest.raises(OSError, match="thread"):
+        door.local(ID)
+    with no_more(), socket.create_connection(host_and_port(door.endpoint)) as refused:
+        refused.settimeout(30)
+        assert refused.recv(1) == b""
     dial_out(replica.endpoint, door.endpoint)
     wait_for(lambda: door.waiting().get(ID) == WAITING)
-    link = dial(door.local(ID))
+    local = door.local(ID)
+    with no_more(), socket.create_connection(host_and_port(local)) as refused:
+        refused.settimeout(30)
+        assert refused.recv(1) == b""
+    link = dial(local)
     wait_for(lambda: link.usable)
     payloads = [b"small", bytes(range(256)) * 8000, b""]
     for number, payload in enumerate(payloads):

@@ -203,10 +203,10 @@ def test_a_reply_that_cannot_be_sent_keeps_no_room():
     first, second = scene.ask(A), scene.ask(B)
 
     def fail(payload: bytes, **_: object) -> None:
-        raise RuntimeError("can't start new thread")
+        raise OSError("can't start new thread")
 
     first.reply = fail
-    with pytest.raises(RuntimeError, match="thread"):
+    with pytest.raises(OSError, match="thread"):
         scene.answer(0)
     scene.answer(1)
     assert second.outcome == [b"r"]

@@ -28,6 +28,7 @@ from fogft.ros.pacing.pace import (
 )
 from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import NotFoundYet
+from tests.fakes.threads import no_more
 from tests.nightly import by_day
 
 
@@ -461,7 +462,7 @@ def test_a_response_to_a_client_that_is_not_found_yet_is_sent_again():
     assert sorted(sent) == [b"early", b"other"]
 
 
-def test_where_there_can_be_no_more_threads_a_later_response_has_one(monkeypatch):
+def test_where_there_can_be_no_more_threads_a_later_response_has_one():
     """And what waited until then is sent, too."""
     sent, both, found = list[bytes](), threading.Event(), False
 
@@ -472,14 +473,9 @@ def test_where_there_can_be_no_more_threads_a_later_response_has_one(monkeypatch
         if len(sent) == 2:
             both.set()
 
-    def none(thread: threading.Thread) -> None:
-        raise RuntimeError("can't start new thread")
-
     pacer = Pacer(send, UNKNOWN, "/s")
-    with monkeypatch.context() as full:
-        full.setattr(threading.Thread, "start", none)
-        with pytest.raises(RuntimeError):
-            pacer.respond(bytes(24), b"1")
+    with no_more(), pytest.raises(OSError, match="TasksMax"):
+        pacer.respond(bytes(24), b"1")
     pacer.respond(bytes(24), b"2")
     found = True
     assert both.wait(30)

@@ -9,7 +9,6 @@ reads nothing affects no other link. Methods that send raise `zenoh.ZError` on a
 """
 
 import secrets
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +31,7 @@ from fogft.model import names, refusal
 from fogft.model.credentials import CredentialPaths
 from fogft.model.plain import as_line
 from fogft.model.refusal import Refusal
+from fogft.process import on_thread
 from fogft.records.signing import Signer
 
 
@@ -252,10 +252,13 @@ class Connection:
         )
 
     def close(self) -> None:
-        """Close it; open attempts are lost. Returns at once: the sender thread ends the session."""
+        """Close it; open attempts are lost. The sender thread ends the session, within 12 s."""
         self.attempts.close()
         # A large send still in progress is wanted by nobody, and may block for minutes.
-        threading.Thread(target=self._end_flow, name="fogft-end-link", daemon=True).start()
+        try:
+            on_thread(self._end_flow, name="fogft-end-link")
+        except OSError:
+            self._end_flow()
 
     def _end_flow(self) -> None:
         attempts = self.attempts

@@ -10,6 +10,7 @@ import pytest
 from fogft.counters import Counters
 from fogft.link.zenoh.replica import reply_queue
 from fogft.link.zenoh.replica.reply_queue import ReplyQueues
+from tests.fakes.threads import no_more
 from tests.link.wire_pool import wait_for
 
 
@@ -37,18 +38,10 @@ class Reply:
 def test_a_thread_that_cannot_be_started_costs_only_the_reply_it_was_for(monkeypatch):
     queues = ReplyQueues(Counters())
     queues.idle_s = 0.01
-    start, tries, sent = threading.Thread.start, [], []
-
-    def fails_once(thread: threading.Thread) -> None:
-        tries.append(thread)
-        if len(tries) == 1:
-            raise RuntimeError("can't start new thread")
-        start(thread)
-
-    monkeypatch.setattr(threading.Thread, "start", fails_once)
+    sent: list[Any] = []
     monkeypatch.setattr(reply_queue, "send_together", lambda replies, stamp: sent.extend(replies))
     lost, reply = cast("Any", Reply()), cast("Any", Reply())
-    with pytest.raises(RuntimeError, match="thread"):
+    with no_more(), pytest.raises(OSError, match="thread"):
         queues.put(b"token", "robot", lost, more=True)
     assert len(queues) == 0
     queues.put(b"token", "robot", reply, more=True)
