@@ -87,5 +87,5 @@ class ZenohDialer:
         for link in links:
             link.close()
         end = time.monotonic() + _CLOSE_WAIT_S
-        for link in links:
-            link.join(max(0.0, end - time.monotonic()))
+        for thread in filter(None, [link.thread for link in links]):
+            thread.join(max(0.0, end - time.monotonic()))

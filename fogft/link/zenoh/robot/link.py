@@ -78,8 +78,8 @@ class ZenohLink:
         self._looked_at = 0.0
         self._renew_at = NEVER
         self._retiring: list[Connection] = []  # replaced, with requests in flight
-        self._thread = on_thread(self._keep, name=f"fogft-keep-{peer.id.short}")
-        self.join = self._thread.join  # once closed
+        self.thread: threading.Thread | None = None
+        self.flush()
 
     # -- port.Link ------------------------------------------------------------------------
 
@@ -130,6 +130,11 @@ class ZenohLink:
             if connection is not None:
                 connection.attempts.send()
                 connection.attempts.flush()
+        if self.thread is None:
+            try:
+                self.thread = on_thread(self._keep, name=f"fogft-keep-{self.peer.id.short}")
+            except OSError as error:  # tried again at the next call
+                self._say(str(error))
 
     def status(self) -> LinkStatus:
         """Return a snapshot."""
@@ -150,7 +155,8 @@ class ZenohLink:
     def close(self) -> None:
         """Close the link; its thread frees the rest shortly afterwards."""
         self._closed = True
-        join_at_exit(self._thread)
+        if self.thread is not None:
+            join_at_exit(self.thread)
         self._wake.set()
         live = self._live
         self._nothing_live()

@@ -42,7 +42,12 @@ def test_a_killed_replica_is_noticed_by_the_lost_connection(
 ) -> None:
     """Not by silence: suspicion is set so late here that it could not have helped."""
     replica = start_replica(delay_s=3600.0)
-    link = dial(replica.endpoint, suspect_after_s=3600.0)
+    with no_more():
+        dial(replica.endpoint).close()
+        link = dial(replica.endpoint, suspect_after_s=3600.0)
+        link.flush()
+    assert "TasksMax" in link.status().detail
+    link.flush()
     wait_for(lambda: link.usable)
     link.offer(SERVICE, request_id(1), b"", 3600.0)
     wait_for(lambda: replica.count("requests") == 1)

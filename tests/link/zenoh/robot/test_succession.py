@@ -83,7 +83,8 @@ def link(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[links.ZenohLink, Own
     made = links.ZenohLink(shared, peer, {"/s": "k"}, owner, lambda _: None)  # type: ignore[arg-type]
     yield made, owner
     made.close()
-    made.join(10.0)
+    assert made.thread is not None
+    made.thread.join(10.0)
 
 
 def test_the_old_connection_sends_and_forgets_from_the_moment_that_the_new_one_is_up(link):
