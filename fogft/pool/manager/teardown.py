@@ -110,9 +110,12 @@ def _end(cloud: Cloud, machines: Sequence[Machine]) -> dict[ReplicaId, FogftErro
             return refused
         return None
 
-    with ThreadPoolExecutor(max_workers=8) as threads:
-        outcomes = zip(machines, threads.map(terminate, machines), strict=True)
-        return {machine.id: error for machine, error in outcomes if error is not None}
+    try:
+        with ThreadPoolExecutor(max_workers=8) as threads:
+            errors = list(threads.map(terminate, machines))
+    except RuntimeError:  # no thread can be started
+        errors = list(map(terminate, machines))
+    return {m.id: error for m, error in zip(machines, errors, strict=True) if error is not None}
 
 
 def _stubborn(refusals: dict[Machine, FogftError], known: Known) -> FogftError:
