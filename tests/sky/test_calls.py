@@ -10,6 +10,8 @@ from fogft.cloud.sky.installed import InstalledSky
 from fogft.cloud.sky.kept import Kept
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.errors import CloudError, CloudUnreachable
+from fogft.process import on_thread
+from tests.fakes.threads import no_more
 from tests.fakes.waiting import wait_for
 
 
@@ -96,6 +98,21 @@ def test_an_answer_is_old_where_the_clock_was_set(set_s: float):
     now[0] += set_s
     kept.get()
     assert len(asked) == 2
+
+
+def test_a_renewal_without_a_thread_is_made_up_for_once_the_answer_is_too_old():
+    now, asked = [1000.0], []
+    kept = Kept(lambda: asked.append(1) or 1, 5.0, 15.0, lambda: now[0], on_thread, failed=print)
+    kept.get()
+    now[0] += 6.0
+    with no_more(), pytest.raises(OSError, match="thread"):
+        kept.get()
+    now[0] += 10.0
+    kept.get()
+    assert len(asked) == 2
+    now[0] += 6.0
+    kept.get()
+    wait_for(lambda: len(asked) == 3)
 
 
 def test_what_was_asked_before_it_was_to_be_forgotten_is_asked_again():

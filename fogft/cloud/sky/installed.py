@@ -37,6 +37,7 @@ from fogft.cloud.sky.sdk import (
 from fogft.cloud.sky.settings import NO_REPORTS, Settings
 from fogft.errors import CloudError, CloudUnreachable
 from fogft.model.names import VM_CLOUDS
+from fogft.process import on_thread
 
 F = TypeVar("F", bound=Callable[..., Any])
 T = TypeVar("T")
@@ -102,7 +103,7 @@ class InstalledSky:
             wait([running], limit_s)
         if running is None or running.done():
             running, begun_at = Future(), time.monotonic()
-            threading.Thread(target=_run, args=(call, running), daemon=True).start()
+            on_thread(_run, call, running)
             wait([running], max(0.0, ends_at - time.monotonic()))
             if running.done():
                 self._given_up.pop(subject, None)

@@ -42,6 +42,7 @@ class Kept(Generic[T]):
         # An answer requested before `forget` is stale, even if it arrives afterwards.
         self.answer = answer
         self._at = begun_at if forgotten == self._forgotten else -math.inf
+        self._renewing = False  # also after a `submit` that failed
         return answer
 
     def forget(self) -> None:

@@ -60,7 +60,10 @@ class Operations(Generic[T]):
             if id in self._busy:
                 return False
             self._busy[id] = subject
-        self._submit(lambda: self._run(id, subject, operation))
+        try:
+            self._submit(lambda: self._run(id, subject, operation))
+        except OSError as error:  # no thread can be started
+            self._outcomes.append(Outcome(id, subject, error))
         return True
 
     def _run(self, id: ReplicaId, subject: T, operation: Callable[[], None]) -> None:

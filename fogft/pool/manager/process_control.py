@@ -7,12 +7,12 @@ signalled.
 import contextlib
 import os
 import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from fogft import disk, poll
+from fogft.process import on_thread
 
 POLL_S = 0.05
 
@@ -65,7 +65,7 @@ def call_at_end(pid: int, call: Callable[[], None]) -> None:
                 return
             call()
 
-    threading.Thread(target=wait, name=f"end-of-{pid}", daemon=True).start()
+    on_thread(wait, name=f"end-of-{pid}")
 
 
 def _send(pid: int, descriptor: int | None, number: signal.Signals) -> None:

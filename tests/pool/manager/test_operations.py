@@ -16,7 +16,9 @@ from fogft.planning.planner import PlannedLaunch
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager.operations import Operations
 from fogft.pool.manager.reconciler import Reconciler
+from fogft.process import on_thread
 from tests.fakes.cloud import MockCloud, zones
+from tests.fakes.threads import no_more
 from tests.planning.pool_worlds import NOW, SERVICE, UID, spec
 from tests.simulation.memory_store import MemoryStore
 
@@ -34,6 +36,15 @@ def test_one_operation_a_replica() -> None:
     assert not operations.start(ID, "second", lambda: None)
     assert [(o.subject, o.error) for o in operations.collect()] == [("first", None)]
     assert operations.start(ID, "second", lambda: None)
+
+
+def test_operation_without_a_thread_has_failed_and_keeps_no_slot() -> None:
+    """The rest of the tick goes on; the next one may try again."""
+    operations: Operations[str] = Operations(on_thread)
+    with no_more():
+        assert operations.start(ID, "first", lambda: None)
+    assert ["TasksMax" in str(outcome.error) for outcome in operations.collect()] == [True]
+    assert operations.busy() == {}
 
 
 def test_outcome_carries_the_error_and_wakes(caplog: pytest.LogCaptureFixture) -> None:
