@@ -55,12 +55,17 @@ def test_a_down_that_is_interrupted_says_what_does_the_rest(home, monkeypatch, c
 
 
 def test_a_file_that_is_not_ours_is_an_error_and_no_trace(tmp_path, monkeypatch, capsys):
-    home = tmp_path / "home"
-    home.write_text("no folder")
-    monkeypatch.setenv("FOGFT_HOME", str(home))
+    pools, loop = tmp_path / "pools", tmp_path / "loop"
+    pools.write_text("no folder")
+    loop.symlink_to(loop)
+    monkeypatch.setenv("FOGFT_HOME", str(tmp_path))
     assert main.run(["list"]) == 1
-    said = capsys.readouterr().err
-    assert said.startswith(f"error: `{home / 'pools'}`: Not a directory\n")
+    assert capsys.readouterr().err == f"error: `{pools}`: Not a directory\n"
+    for home, command in ((pools, "list"), (loop, "doctor")):
+        monkeypatch.setenv("FOGFT_HOME", str(home))
+        assert main.run([command]) == 1
+        told = f"error: `{home}` is not a folder\n\nhint: set FOGFT_HOME to a folder\n"
+        assert capsys.readouterr().err == told
 
 
 def test_what_a_locale_cannot_write_is_replaced(home):

@@ -16,9 +16,11 @@ from fogft.errors import StateError
 
 
 def home(environ: Mapping[str, str] = os.environ) -> Path:
-    """Return the folder that holds all of fogft's state for this user."""
-    if environ.get("FOGFT_HOME"):
-        return Path(environ["FOGFT_HOME"])
+    """Return the folder that holds all of fogft's state for this user. Raises StateError."""
+    if given := environ.get("FOGFT_HOME"):
+        if os.path.lexists(given) and not os.path.isdir(given):
+            raise StateError(f"`{given}` is not a folder", "set FOGFT_HOME to a folder")
+        return Path(given)
     return own_folder("XDG_STATE_HOME", "~/.local/state", environ) / "fogft"
 
 
