@@ -7,11 +7,11 @@ and keeps its stack trace.
 Slow imports are made inside the command that needs them (tests/cli/test_elsewhere).
 """
 
-import errno
 import io
 import os
 import sys
 from collections.abc import Sequence
+from errno import EDQUOT, ENOENT, ENOSPC
 from typing import Annotated
 
 import typer
@@ -104,10 +104,11 @@ def _run(args: Sequence[str]) -> int:
         _explain_usage(problem)
         return 2
     except OSError as problem:
-        if problem.filename is None and problem.errno not in (errno.ENOSPC, errno.EDQUOT):
+        if problem.filename is None and problem.errno not in (ENOSPC, EDQUOT, ENOENT):
             raise  # a connection's, not a file's
         where = "an open file" if problem.filename is None else f"`{problem.filename}`"
-        output.error(f"{where}: {problem.strerror}")
+        hint = "free some space, or set TMPDIR to a folder that has some"
+        output.error(f"{where}: {problem.strerror}", hint if problem.filename is None else "")
         return 1
     return 0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -66,6 +67,15 @@ def test_a_file_that_is_not_ours_is_an_error_and_no_trace(tmp_path, monkeypatch,
         assert main.run([command]) == 1
         told = f"error: `{home}` is not a folder\n\nhint: set FOGFT_HOME to a folder\n"
         assert capsys.readouterr().err == told
+
+
+def test_no_room_for_temporary_files_is_an_error_that_names_tmpdir(monkeypatch, capsys):
+    """It is raised by `tempfile`, without the name of a file."""
+    none = OSError(errno.ENOENT, "No usable temporary directory found in ['/tmp']")
+    assert run_failing(monkeypatch, none) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("error: an open file: No usable temporary directory found in ['/tmp']\n")
+    assert "set TMPDIR" in said
 
 
 def test_what_a_locale_cannot_write_is_replaced(home):
