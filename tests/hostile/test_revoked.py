@@ -114,7 +114,7 @@ def test_only_the_manager_prolongs_a_replica_s_life(
         files=config.credentials, slot=SLOT, generation=GENERATION, records=config.announcements
     )
     assert replica.count("lease") == 1
-    manager.announcements(ServingLease(1e9 + 60.0, 60.0))
+    paths.announcements.write_bytes(manager.announcements(ServingLease(1e9 + 60.0, 60.0)))
     genuine = cache.read(paths.announcements)
     content = {"at": 1e9, "lasts_s": 1e7}
     forged = Record(POOL_UID, RecordKind.LEASE, "", 7, 7, content)
