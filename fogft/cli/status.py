@@ -120,10 +120,10 @@ def _remark(seen: Seen, paths: PoolPaths) -> None:
         output.hint(f"start one with {up}, or shut the pool down with `fogft down`")
     elif why := disk.unwritable(folder):
         output.warn(f"the disk of `{folder}` is {why}: nothing is launched")
-        hint = "the manager resumes by itself once that is fixed; requests need no disk"
-        if why == "read-only":  # no new lease reaches the client proxy
-            hint += ", but without a rendezvous replicas shut down after `unmanaged_max_hours`"
-        output.hint(hint)
+        output.hint(
+            "the manager resumes by itself once that is fixed; requests need no disk, but while it "
+            "is read-only, a pool without a rendezvous lasts only for `unmanaged_max_hours`"
+        )
     elif seen.status.manager_version not in ("", __version__):
         output.warn(
             f"the pool runs fogft {seen.status.manager_version}, this command is {__version__}"
