@@ -25,7 +25,9 @@ def python(*words: str) -> list[str]:
     from there; Python 3.10 cannot leave it out.
     """
     checkout = str(Path(__file__).resolve().parents[1])
-    safe = sys.version_info >= (3, 11) and (sys.flags.safe_path or sys.path[:1] != [checkout])
+    safe = sys.version_info >= (3, 11) and (
+        sys.flags.safe_path or os.path.abspath(sys.path[0]) != checkout
+    )
     return [sys.executable, *(["-P"] if safe else []), *words]
 
 

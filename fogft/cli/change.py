@@ -102,7 +102,10 @@ def include(
 
 
 def retry(pool: PoolOption = None) -> None:
-    """Launch replicas again after fogft gave up on a pool file."""
+    """Launch replicas again after fogft gave up on a pool file.
+
+    It also lifts the limit of launches per hour, once.
+    """
     from fogft.model import intent
     from fogft.pool.commands.change import change
 

@@ -126,10 +126,6 @@ class Unpacker:
             self._waiting[peer] = deque(((content, done, packed),))
         return True
 
-    def works(self, peer: str) -> bool:
-        """Whether a payload of this peer is not done yet."""
-        return peer in self._waiting
-
     def _run(self, peer: str) -> None:
         while True:
             with self._lock:

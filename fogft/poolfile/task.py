@@ -15,7 +15,7 @@ TASK_KEYS = (
 )
 RESOURCE_KEYS = (  # the same of its `resources`
     *("infra", "cloud", "region", "zone", "use_spot", "instance_type", "cpus", "memory"),
-    *("accelerators", "accelerator_args", "autostop", "disk_size", "disk_tier", "hooks"),
+    *("accelerators", "accelerator_args", "autostop", "disk_size", "disk_tier"),
     *("ephemeral_storage", "image_id", "job_recovery", "labels", "local_disk", "max_hourly_cost"),
     *("network_tier", "ports", "priority", "priority_class", "volumes"),
 )

@@ -131,12 +131,12 @@ class Seen:
     def judge(self, robot: str, session: bytes, number: int) -> Judgement:
         """Return what to do with a message; if it is new, it counts as published."""
         starts = self._of[robot] = self._of.pop(robot, {})
-        last, published = starts.get(session, (0, 0))
+        last, published = starts.pop(session, (0, 0))
         ahead = number - last
-        if ahead > 0 and session in starts and session != next(reversed(starts)):
-            return Judgement.LATE  # the robot's proxy has been started again since
         if ahead > 0:
             starts[session] = number, (published << min(ahead, _KNOWN) | 1) & _MASK
+        else:
+            starts[session] = last, published
         for of, most in ((self._of, self.robots), (starts, self.starts)):
             if len(of) > most:
                 del of[next(iter(of))]  # type: ignore[arg-type]

@@ -124,7 +124,7 @@ def test_an_exports_new_passphrase_is_shown_before_only_the_file_is_left(
 
 @pytest.mark.parametrize("errors", ["2>/dev/full", "2>/dev/null", "2>&-"])
 @pytest.mark.parametrize("words", ["export planner p", "credentials issue robot ada"])
-def test_nothing_is_done_with_a_passphrase_that_nobody_can_read(paths, tmp_path, errors, words):
+def test_no_file_is_made_whose_passphrase_nobody_could_read(paths, tmp_path, errors, words):
     done = subprocess.run(
         ["sh", "-c", f"{sys.executable} -m fogft {words} {errors}"], cwd=tmp_path, check=False,
         env={**os.environ, "FOGFT_HOME": str(tmp_path / "home")},

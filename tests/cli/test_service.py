@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from fogft import disk
+from fogft.child import python
 from fogft.cli import main
 from fogft.pool.commands import service
 from fogft.pool.folder.paths import PoolPaths
@@ -70,7 +71,8 @@ def test_units_are_written_started_shown_and_removed(home, units, tmp_path, monk
     assert "not to be written" not in told
     assert env_file.stat().st_mode & 0o777 == 0o600
     manager = (units / names[0]).read_text()
-    assert f"ExecStart={sys.executable} -m fogft manager --no-proxy planner\n" in manager
+    own = " ".join(python("-m", "fogft"))
+    assert f"ExecStart={own} manager --no-proxy planner\n" in manager
     assert f"EnvironmentFile={env_file}\n" in manager
     assert main.run(["service", "status"]) == 0
     assert capsys.readouterr().out.splitlines() == [f"{name}  active" for name in names]

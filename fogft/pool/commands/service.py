@@ -13,13 +13,13 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from fogft import disk, template_files
+from fogft.child import python
 from fogft.errors import FogftError, StateError
 from fogft.pool.folder.paths import PoolPaths, home, own_folder
 from fogft.pool.manager import process_control
@@ -108,7 +108,7 @@ def of_part(command: str, config: Path, *, system: bool) -> list[Unit]:
 
 
 def _unit(name: str, words: Sequence[str], needs: Path, environment: Path, *, system: bool) -> Unit:
-    command = " ".join(_quoted(word) for word in (sys.executable, "-m", "fogft", *words))
+    command = " ".join(_quoted(word) for word in python("-m", "fogft", *words))
     text = template_files.read_text("systemd.service").format(
         mark=MARK,
         what=name.removeprefix("fogft-").removesuffix(".service"),

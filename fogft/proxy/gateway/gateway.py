@@ -61,8 +61,11 @@ class Forwarder:
         with self._lock:
             known = self._known.get(incoming.request_id)
             if known is not None and known.waiting is None and known.answer is None:
-                self._known.forget(known)  # the replica still has the answer
-                known = None
+                if known.deadline > self._clock():  # the replica still has the answer
+                    self._known.forget(known)
+                    known = None
+                else:  # a late copy
+                    reason = Refusal.FORGOTTEN
             if known is None:
                 reason = self._reason_to_refuse(incoming)
                 if reason is None:

@@ -100,8 +100,9 @@ class KnownRequests:
                 continue
             if job.waiting is not None:
                 late.append(id)
-            elif due == job.deadline:
-                heapq.heappush(self._deadlines, (due + _COPIES_COME_S, id))
+            elif due < job.deadline + _COPIES_COME_S:
+                heapq.heappush(self._deadlines, (job.deadline + _COPIES_COME_S, id))
+                self._jobs.move_to_end(id, last=False)  # the first to make room
                 self._drop_answer(job)
             else:
                 self.forget(job)

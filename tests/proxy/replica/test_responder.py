@@ -532,6 +532,18 @@ def test_work_past_its_deadline_is_dropped():
     assert scene.responder.in_flight == 0
 
 
+def test_ids_past_their_deadline_are_the_first_to_make_room():
+    scene = Scene(kept_ids=3)
+    scene.ask(A, remaining_s=300.0)
+    scene.answer(0, b"r")
+    for n in range(5):
+        scene.ask(n.to_bytes(16, "big"), remaining_s=1.0)
+        scene.answer(n + 1)
+        scene.clock.now += 1.0
+        scene.responder.tick()
+    assert scene.ask(A, remaining_s=200.0).outcome == [b"r"]
+
+
 def test_finished_ids_are_forgotten_when_no_copy_can_come_any_more():
     """Memory stays flat. A copy that a slow uplink brings after the deadline is not run."""
     scene = Scene()

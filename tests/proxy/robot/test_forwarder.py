@@ -96,8 +96,9 @@ def test_a_kept_answer_is_gone_with_its_deadline(scene):
     scene.answer(0, b"a")
     scene.clock.now += 2.1
     scene.forwarder.tick(READY)
-    scene.request()
-    assert len(scene.links[0].offered) == 2
+    late = scene.request()
+    assert late.outcome == [refused(Refusal.FORGOTTEN)]  # it is not run again
+    assert len(scene.links[0].offered) == 1
 
 
 def test_who_gives_up_stops_all_who_work_on_it(scene):

@@ -218,9 +218,9 @@ class ZenohListener:
             requests = [(one._replace(robot=holder.name), content) for one, content in requests]
         peer = holder.common_name
         for header, payload in requests:
-            large = header.packed or len(payload) > ASIDE_BYTES
-            # A topic's small message must not overtake a large one.
-            if not large and not (service.startswith(topic.PREFIX) and self._unpacker.works(peer)):
+            # A topic's messages are checked on its own thread, and none may overtake another.
+            large = len(payload) > ASIDE_BYTES and not service.startswith(topic.PREFIX)
+            if not (header.packed or large):
                 self._hand_over(service, header, stream, payload)
                 continue
             hand_over = partial(self._hand_over, service, header, stream)
