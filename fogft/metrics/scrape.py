@@ -109,7 +109,7 @@ class Scrape:
     def at(self, endpoint: str) -> None:
         """Serve at ``host:port`` (port 0: any free port); empty to stop. Repeatable.
 
-        If the port cannot be bound, that is logged and nothing is served.
+        If the port cannot be bound, or no thread starts, that is logged and nothing is served.
         """
         if endpoint == self._wanted:
             return
@@ -123,12 +123,16 @@ class Scrape:
 
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
+        server = None
         try:
-            self._server = bound(endpoint, make_wsgi_app(registry))
+            server = bound(endpoint, make_wsgi_app(registry))
+            on_thread(server.serve_forever, name="fogft-metrics")
         except (OSError, OverflowError, ValueError) as error:
             log.error("metrics_not_served endpoint=%s reason=%r", endpoint, str(error))
+            if server is not None:
+                server.server_close()
             return
-        on_thread(self._server.serve_forever, name="fogft-metrics")
+        self._server = server
         log.info("metrics_served endpoint=%s", self.endpoint)
 
     def close(self) -> None:

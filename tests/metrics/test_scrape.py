@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from fogft.metrics.scrape import Scrape, gauge
+from tests.fakes.threads import no_more
 
 
 def one():
@@ -54,6 +55,15 @@ def test_a_port_that_is_taken_is_logged_and_nothing_is_raised(scrape, caplog):
         scrape.at(f"127.0.0.1:{taken.getsockname()[1]}")
     assert scrape.endpoint == ""
     assert "metrics_not_served" in caplog.text
+
+
+def test_where_no_thread_can_be_started_nothing_is_served_and_the_port_is_free(scrape, caplog):
+    with no_more():
+        scrape.at("127.0.0.1:0")
+    assert scrape.endpoint == ""
+    assert "metrics_not_served" in caplog.text
+    scrape.at("localhost:0")
+    assert get(scrape.endpoint)
 
 
 def test_what_cannot_be_measured_is_an_error_of_that_request_only():
