@@ -19,11 +19,8 @@ os.execvp(sys.argv[2], sys.argv[2:])
 
 
 def python(*words: str) -> list[str]:
-    """Return the command that runs this Python; it imports nothing from the current folder.
-
-    A pool file's folder can hold a `queue.py`. Only a checkout that is not installed is imported
-    from there; Python 3.10 cannot leave it out.
-    """
+    """Return a command of this Python that imports nothing from the current folder, if possible."""
+    # The folder can hold a `queue.py`, or the checkout that we run from. Python 3.10 has no `-P`.
     checkout = str(Path(__file__).resolve().parents[1])
     safe = sys.version_info >= (3, 11) and (
         sys.flags.safe_path or os.path.abspath(sys.path[0]) != checkout

@@ -102,10 +102,7 @@ def include(
 
 
 def retry(pool: PoolOption = None) -> None:
-    """Launch replicas again after fogft gave up on a pool file.
-
-    It also lifts the limit of launches per hour, once.
-    """
+    """Launch again after fogft gave up, or reached an hour's limit."""
     from fogft.model import intent
     from fogft.pool.commands.change import change
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
@@ -290,14 +291,12 @@ def _chosen_passphrase(file: Path | None) -> str:
 
 def _show(passphrase: str) -> None:
     """Show a new passphrase, before there is a file that only it opens."""
-    try:
+    with contextlib.suppress(OSError):
         print(f"passphrase: {passphrase}", file=sys.stderr, flush=True)
-        shown = not os.path.samestat(os.fstat(2), os.stat(os.devnull))
-    except OSError:
-        shown = False
-    if not shown:
-        what = "the passphrase cannot be shown: nobody reads standard error"
-        raise FogftError(what, "use `--passphrase-file FILE`")
+        if not os.path.samestat(os.fstat(2), os.stat(os.devnull)):
+            return
+    what = "the passphrase cannot be shown: nobody reads standard error"
+    raise FogftError(what, "use `--passphrase-file FILE`")
 
 
 def _read_passphrase(file: Path | None) -> str:

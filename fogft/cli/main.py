@@ -11,7 +11,7 @@ import io
 import os
 import sys
 from collections.abc import Sequence
-from errno import EDQUOT, ENOENT, ENOSPC
+from errno import EDQUOT, ENOSPC
 from typing import Annotated
 
 import typer
@@ -104,7 +104,8 @@ def _run(args: Sequence[str]) -> int:
         _explain_usage(problem)
         return 2
     except OSError as problem:
-        if problem.filename is None and problem.errno not in (ENOSPC, EDQUOT, ENOENT):
+        no_room = problem.errno in (ENOSPC, EDQUOT) or "usable temporary" in str(problem)
+        if problem.filename is None and not no_room:
             raise  # a connection's, not a file's
         where = "an open file" if problem.filename is None else f"`{problem.filename}`"
         hint = "free some space, or set TMPDIR to a folder that has some"

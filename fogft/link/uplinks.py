@@ -251,8 +251,8 @@ class UplinksLink:
             if answer.payload is None and attempt.on:
                 return  # another uplink still carries it
             kind = answer.refusal
-            again = kind is not None and Effect.OTHER_UPLINK in kind.effect and not self._closed
-            again = again and time.monotonic() < attempt.deadline
+            elsewhere = kind is not None and Effect.OTHER_UPLINK in kind.effect
+            again = elsewhere and time.monotonic() < attempt.deadline and not self._closed
             if again:
                 self._again.append(answer.request_id)
         if again:

@@ -114,8 +114,7 @@ class Buyer:
 
     def _is_within_limit(self, *, on_demand: bool) -> bool:
         """Whether the hourly limit of a market allows one more launch; adds a note if not."""
-        now, since = self.observed.now, self._retried_at
-        had = within_an_hour(self.history, now, since, on_demand=on_demand)
+        had = within_an_hour(self.history, self.observed.now, self._retried_at, on_demand=on_demand)
         planned = sum(x.offer.placement.spot is not on_demand for x in self.launches)
         usual = sum(group.replicas for group in self.groups)  # the pool's size before a scale-down
         most = LAUNCHES_AN_HOUR * max(1, usual, self.sized.total)

@@ -80,8 +80,7 @@ def _workdir(top: Section) -> None:
 
 def check_resources(resources: Section, lists: Sequence[str] = ("any_of", "ordered")) -> None:
     """Check the key names, and values that fogft reads: SkyPilot takes any value as a boolean."""
-    internal = [key for key in resources.children if key.startswith("_")]
-    resources.only((*RESOURCE_KEYS, *lists, *internal))
+    resources.only((*RESOURCE_KEYS, *lists, *(k for k in resources.children if k[:1] == "_")))
     for key in lists:
         if resources.has(key):
             for one in resources.sections(key, "write a list of maps"):

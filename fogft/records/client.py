@@ -18,6 +18,7 @@ from typing import Any
 
 from fogft.errors import FogftError, StateError
 from fogft.model.credentials import CredentialPaths
+from fogft.process import on_thread
 from fogft.records.cache import restore, write
 from fogft.records.dialling import connect
 from fogft.records.exchange import Exchange
@@ -76,12 +77,15 @@ class RendezvousClient:
         self._loop = asyncio.new_event_loop()
         self._main: asyncio.Task[None] | None = None
         self._closing = False
-        self._thread = threading.Thread(target=self._run, name="fogft-rendezvous", daemon=True)
-        self.start = self._thread.start  # dialling; returns at once
+        self._thread: threading.Thread | None = None
+
+    def start(self) -> None:
+        """Start dialling; return at once. Raises OSError: no thread can be started."""
+        self._thread = on_thread(self._run, name="fogft-rendezvous")
 
     def close(self) -> None:
         """End all connections and write the cache. Repeatable."""
-        if self._closing or not self._thread.is_alive():
+        if self._closing or self._thread is None or not self._thread.is_alive():
             return
         self._closing = True
         self._loop.call_soon_threadsafe(self._end)

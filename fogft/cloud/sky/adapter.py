@@ -325,7 +325,12 @@ class SkyCloud:
             if id in self._followed or self._closed:
                 return
             self._followed.add(id)
-        self.repeat(lambda: self._step(id))
+        try:
+            self.repeat(lambda: self._step(id))
+        except OSError as error:  # no thread: `machines` tries again
+            log.warning("launch_not_followed replica=%s reason=%r", id.short, str(error))
+            with self._lock:
+                self._followed.discard(id)
 
     def _step(self, id: ReplicaId) -> bool:
         more = True

@@ -103,7 +103,10 @@ class InstalledSky:
             wait([running], limit_s)
         if running is None or running.done():
             running, begun_at = Future(), time.monotonic()
-            on_thread(_run, call, running)
+            try:
+                on_thread(_run, call, running)
+            except OSError as lack:
+                raise CloudUnreachable(f"SkyPilot cannot be asked: {lack}") from lack
             wait([running], max(0.0, ends_at - time.monotonic()))
             if running.done():
                 self._given_up.pop(subject, None)

@@ -18,6 +18,8 @@ from typing import Any
 
 import zenoh
 
+from fogft.process import on_thread
+
 log = logging.getLogger(__name__)
 
 idents: set[int] = set()  # Zenoh's threads, by `threading.get_ident`
@@ -44,12 +46,15 @@ def close_session(session: Any) -> None:
         log.debug("session_closed_late reason=%r", str(error))
 
 
-def close_aside(session: Any, name: str) -> threading.Thread:
-    """Close a Zenoh session on a new thread, which the process waits for at exit."""
-    closer = threading.Thread(target=close_session, args=(session,), name=name, daemon=True)
-    closer.start()
-    join_at_exit(closer)
-    return closer
+def close_aside(session: Any, name: str, wait_s: float = 0.0) -> None:
+    """Close a Zenoh session, if possible on a thread that the process waits for at exit."""
+    try:
+        closer = on_thread(close_session, session, name=name)
+    except OSError:
+        close_session(session)
+    else:
+        join_at_exit(closer)
+        closer.join(wait_s)
 
 
 @atexit.register

@@ -7,7 +7,6 @@ restores readiness.
 """
 
 from collections import Counter
-from collections.abc import Sequence
 
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import EventKind, History, Record
@@ -31,18 +30,13 @@ def given_up(history: History, version: str, since: float) -> Reason | None:
     return Reason(Cause.NEVER_READY, count=len(failed), because=(failed[-1].fault,))
 
 
-def within_an_hour(
-    history: History, now: float, since: float = 0.0, *, on_demand: bool
-) -> Sequence[Record]:
-    """Return the launches of one market within the last hour that got a machine.
-
-    Launches before `since` do not count: the user asked to go on.
-    """
+def within_an_hour(history: History, now: float, since: float, *, on_demand: bool) -> list[Record]:
+    """Return the launches of one market since then, within the last hour, that got a machine."""
     return [
         record
         for record in history.launches[on_demand]
-        if 0 <= now - record.launched_at < HOUR_S
-        and record.launched_at >= since
+        if since <= record.launched_at <= now
+        and now - record.launched_at < HOUR_S
         and not _was_refused(record)
     ]
 

@@ -30,7 +30,7 @@ class HistoryFile:
     def __init__(self, path: Path, clock: Callable[[], float]) -> None:
         self._path = path
         self._clock = clock
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
         self._known: History | None = None
         self._appended = 0
         self._unwritten = b""
@@ -53,19 +53,27 @@ class HistoryFile:
                 kept = compacted(_read_events(self._path), self._clock())
                 with contextlib.suppress(StateError):  # no space: it is not compacted
                     disk.write_whole(self._path, "".join(map(_line, kept)))
-            lines = self._unwritten + _line(event).encode()
-            try:
-                _append_durably(self._path, lines)
-                self._unwritten = b""
-            except OSError as error:
-                if event.kind is EventKind.LAUNCH:
-                    raise disk.not_done("written", self._path, error) from error
-                self._unwritten = lines  # a full disk is no reason to keep paying
+            before, self._unwritten = self._unwritten, self._unwritten + _line(event).encode()
+            error = self.flush()
+            if error is not None and event.kind is EventKind.LAUNCH:
+                self._unwritten = before
+                raise disk.not_done("written", self._path, error) from error
             history.add(event)
             self._appended += 1
             if self._appended >= COMPACT_AFTER and not self._unwritten:
                 self._known = self._load()
         self.heard(event)
+
+    def flush(self) -> OSError | None:
+        """Write the events that a full disk did not take; return what still prevents it."""
+        with self._lock:
+            try:
+                if self._unwritten:
+                    _append_durably(self._path, self._unwritten)
+                    self._unwritten = b""
+            except OSError as error:  # no reason to keep paying
+                return error
+        return None
 
     def recent(self, count: int = 20) -> list[Event]:
         """Return the last events, oldest first."""
@@ -88,10 +96,13 @@ def _append_durably(path: Path, line: bytes) -> None:
         size = os.fstat(descriptor).st_size
         if size and os.pread(descriptor, 1, size - 1) != b"\n":
             line = b"\n" + line  # a crash left a torn last line: it keeps a line of its own
-        if os.write(descriptor, line) != len(line):
+        try:
+            if os.write(descriptor, line) != len(line):
+                raise OSError(28, "No space left on device")
+            os.fsync(descriptor)
+        except OSError:
             os.ftruncate(descriptor, size)
-            raise OSError(28, "No space left on device")
-        os.fsync(descriptor)
+            raise
     finally:
         os.close(descriptor)
 

@@ -65,10 +65,11 @@ class ManagerRecords:
             return
         self._certify(datetime.datetime.now(datetime.timezone.utc))
         if self._client is None:
-            self._client = RendezvousClient(
+            client = RendezvousClient(
                 endpoints, self._files, self._pool_uid, cache=self._paths.manager_records
             )
-            self._client.start()
+            client.start()
+            self._client = client
         if membership is not None and membership != self._said:
             self._client.publish(
                 RecordKind.ADMISSION,

@@ -146,6 +146,7 @@ class Manager:
         log.info("manager_stopped pool=%s", self._identity.name)
 
     def _close(self) -> None:
+        self.store.flush()
         self._scrape.close()
         self._records.close()
         self._lease.release()
@@ -170,6 +171,7 @@ class Manager:
     def _work(self) -> bool:
         """Do one round; failed steps are retried in the next. Return whether the pool ended."""
         self._trouble = []
+        self.store.flush()
         for step in (self._lease.beat, self._step_back, self._bound_logs, self._keep_proxy):
             self._attempt(step)
         tick = self._attempt(self._reconciler.tick)

@@ -91,12 +91,12 @@ def test_what_was_given_up_outlives_the_compaction_of_days(what):
 def test_the_launches_of_the_last_hour_are_counted(times: list[float], now: float):
     times = sorted(t for t in times if t <= now)
     history = History([e for n, at in enumerate(times) for e in launched(at, 0, n + 1)])
-    found = [record.launched_at for record in within_an_hour(history, now, on_demand=False)]
+    found = [record.launched_at for record in within_an_hour(history, now, 0.0, on_demand=False)]
     assert found == [at for at in times if now - at < HOUR_S]
-    assert within_an_hour(history, now, on_demand=True) == []
+    assert within_an_hour(history, now, 0.0, on_demand=True) == []
     assert within_an_hour(history, now, now - 60.0, on_demand=False) == [
         record
-        for record in within_an_hour(history, now, on_demand=False)
+        for record in within_an_hour(history, now, 0.0, on_demand=False)
         if record.launched_at >= now - 60.0
     ]
     assert next_change(history, now) == min((at + HOUR_S for at in found), default=float("inf"))
@@ -108,4 +108,4 @@ def test_a_launch_that_came_to_no_machine_does_not_count():
     refused = launched(0.0, 0, 1, Event(0.1, EventKind.REFUSED, 0, 1, reason=full))
     late = failed(1.0, 0, 2, full)
     history = History(refused + late + failed(2.0, 0, 3, NOT_READY))
-    assert [r.generation for r in within_an_hour(history, 5.0, on_demand=False)] == [3]
+    assert [r.generation for r in within_an_hour(history, 5.0, 0.0, on_demand=False)] == [3]

@@ -79,8 +79,27 @@ def test_on_a_full_disk_nothing_is_launched_and_all_else_is_written_later(
     assert pool.store.history().generations[0] == 1
     assert pool.store.history().open() == []
     assert store_of(pool.home).recent() == [LAUNCH]
+    assert pool.store.flush() is None  # though nothing more happens
+    assert store_of(pool.home).recent() == [LAUNCH, *ended]
     pool.store.append(second)
     assert store_of(pool.home).recent() == [LAUNCH, *ended, second]
+
+
+def test_an_event_that_is_not_safe_on_the_disk_is_there_once(
+    pool: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pool.store.append(LAUNCH)
+
+    def unsafe(descriptor: int) -> None:
+        raise OSError(errno.EDQUOT, "Disk quota exceeded")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", unsafe)
+        pool.store.append(READY)
+    pool.store.append(Event(4.0, EventKind.UNREADY, 0, 1))
+    assert [event.kind for event in store_of(pool.home).recent()] == [
+        EventKind.LAUNCH, EventKind.READY, EventKind.UNREADY,
+    ]  # fmt: skip
 
 
 def test_half_written_event_is_taken_back(pool: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -216,7 +216,6 @@ class ZenohListener:
         # A robot sends in its own name, whatever the header says; a gateway in any robot's name.
         if holder.role is Role.ROBOT and holder.name != requests[0][0].robot:
             requests = [(one._replace(robot=holder.name), content) for one, content in requests]
-        peer = holder.common_name
         for header, payload in requests:
             # A topic's messages are checked on its own thread, and none may overtake another.
             large = len(payload) > ASIDE_BYTES and not service.startswith(topic.PREFIX)
@@ -224,6 +223,7 @@ class ZenohListener:
                 self._hand_over(service, header, stream, payload)
                 continue
             hand_over = partial(self._hand_over, service, header, stream)
+            peer = holder.common_name
             if not self._unpacker.put(peer, payload, hand_over, packed=header.packed):
                 self._refuse(stream, Refusal.OVERLOADED, (header, payload))
         stream.seen(requests[0][0].seen)
@@ -274,7 +274,7 @@ class ZenohListener:
         sockets.refuse(self._port)  # else aborted peers reconnect before the session is closed
         sockets.abort_all(self._port, _CLOSE_WAIT_S / 2)
         self._work_queue.close()
-        threads.close_aside(session, "fogft-close-listener").join(_CLOSE_WAIT_S / 2)
+        threads.close_aside(session, "fogft-close-listener", _CLOSE_WAIT_S / 2)
         if self._handshakes:  # discard those that Zenoh reports because of our shutdown
             self._handshakes.refusals()
 

@@ -112,20 +112,20 @@ class Connection:
                 )
                 for name, key in keys.items()
             }
+            self.attempts = Attempts(
+                self,
+                frozenset(keys),
+                frame.origin(shared.robot, self._token),
+                options=shared.options,
+                gate=shared.gate,
+                tell_losers=shared.tell_losers,
+                tell=tell,
+                ended=partial(threads.close_session, self._session),
+                name=f"fogft-send-{peer.id.short}",
+            )
         except BaseException:
             threads.close_aside(self._session, f"fogft-close-{peer.id.short}")
             raise
-        self.attempts = Attempts(
-            self,
-            frozenset(keys),
-            frame.origin(shared.robot, self._token),
-            options=shared.options,
-            gate=shared.gate,
-            tell_losers=shared.tell_losers,
-            tell=tell,
-            ended=partial(threads.close_session, self._session),
-            name=f"fogft-send-{peer.id.short}",
-        )
 
     def _check_peer(self, peer: Peer) -> FlowWatch:
         links = self._session.info.links()
