@@ -62,6 +62,20 @@ def test_a_launch_is_listed_at_once_and_becomes_a_running_machine(scene: Scene):
     assert (machine.usd_per_hour, machine.spec_hash, machine.placement) == (0.021, "abcd", EAST)
 
 
+def test_a_launch_that_no_thread_could_follow_is_followed_later(scene: Scene, monkeypatch):
+    def none(step: Callable[[], bool]) -> None:
+        raise OSError("can't start new thread")
+
+    with monkeypatch.context() as full:
+        full.setattr(scene.cloud, "repeat", none)
+        scene.cloud.launch(scene.order())
+        scene.machines()
+    scene.sky.finish(NAME)
+    scene.machines()
+    scene.work()
+    assert scene.machine(replica()).phase.value == "running"
+
+
 def test_repeating_a_launch_does_nothing(scene: Scene):
     scene.cloud.launch(scene.order())
     scene.cloud.launch(scene.order())

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +14,36 @@ import pytest
 
 from fogft.link.zenoh import diagnosis
 from fogft.link.zenoh.diagnosis import Opening
+from fogft.link.zenoh.robot import attempts
+from fogft.link.zenoh.robot.link import ZenohLink
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from tests.link.namespaces import Namespaces, inside
-from tests.link.wire_pool import Authority, peer
+from tests.link.wire_pool import Authority, ReplicaProcess, peer, wait_for
 
 SETTINGS = LinkSettings(open_timeout_s=1.0, long_open_timeout_s=4.0)
 CREDENTIALS = CredentialPaths(Path("ca"), Path("crt"), Path("key"))
+
+
+def test_a_connection_that_gets_no_thread_to_send_leaves_nothing_open(
+    start_replica: Callable[..., ReplicaProcess],
+    dial: Callable[..., ZenohLink],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else the replica would take this robot for one that opens connections without end."""
+    replica, open_files = start_replica(), list[int]()
+
+    def none(*_: object, **__: object) -> None:
+        open_files.append(len(os.listdir("/proc/self/fd")))
+        raise OSError("can't start new thread")
+
+    with monkeypatch.context() as full:
+        full.setattr(attempts, "on_thread", none)
+        link = dial(replica.endpoint)
+        wait_for(lambda: len(open_files) >= 8)
+    wait_for(lambda: link.usable)
+    assert max(open_files) <= open_files[0] + 3
+    assert replica.count("surplus_links") == 0
 
 
 def test_every_third_time_out_in_a_row_is_a_long_one() -> None:
