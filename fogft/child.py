@@ -19,9 +19,8 @@ os.execvp(sys.argv[2], sys.argv[2:])
 
 
 def python(*words: str) -> list[str]:
-    """Return a command of this Python that imports nothing from the current folder, if possible."""
-    # The folder can hold a `queue.py`, or the checkout that we run from. Python 3.10 has no `-P`.
-    checkout = str(Path(__file__).resolve().parents[1])
+    """Return a command of this Python without the current folder, from 3.11, on its path."""
+    checkout = str(Path(__file__).resolve().parents[1])  # may be imported from there
     safe = sys.version_info >= (3, 11) and (
         sys.flags.safe_path or os.path.abspath(sys.path[0]) != checkout
     )

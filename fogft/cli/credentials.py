@@ -71,8 +71,7 @@ def issue(
     holder, data = joining.issue(
         store, _role(role), name, passphrase, time.time(), open_for_s=hours * 3600
     )
-    if passphrase_file is None:
-        _show(passphrase)
+    _show(passphrase, passphrase_file)
     disk.write_whole(file, data)
     output.data(str(file))
     output.done(f"{holder.role.value} `{holder.short}` may join for {hours:g} hours")
@@ -218,8 +217,7 @@ def export(
 
     store = composition.store_of(pool)
     passphrase = _chosen_passphrase(passphrase_file)
-    if passphrase_file is None:
-        _show(passphrase)
+    _show(passphrase, passphrase_file)
     identity = moving.export(
         *(store, home(), file, passphrase, time.time()),
         open_for_s=hours * 3600,
@@ -289,8 +287,10 @@ def _chosen_passphrase(file: Path | None) -> str:
     return new_passphrase() if file is None else _read_passphrase(file)
 
 
-def _show(passphrase: str) -> None:
-    """Show a new passphrase, before there is a file that only it opens."""
+def _show(passphrase: str, file: Path | None) -> None:
+    """Show a passphrase that is in no file, before there is something that only it opens."""
+    if file is not None:
+        return
     with contextlib.suppress(OSError):
         print(f"passphrase: {passphrase}", file=sys.stderr, flush=True)
         if not os.path.samestat(os.fstat(2), os.stat(os.devnull)):

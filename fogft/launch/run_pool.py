@@ -1,10 +1,11 @@
 """``python -m fogft.launch.run_pool FILE``: the process that a launch file starts for a pool.
 
 Starts the pool, prints a line that the launch file waits for, then shows the replicas' logs. Exits
-on a signal; with `--down` it shuts the pool down first.
+on a signal, or when launch ends; with `--down` it shuts the pool down first.
 """
 
 import argparse
+import ctypes
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_LOGS_AGAIN_S = 5
+_LOGS_AGAIN_S, _PR_SET_PDEATHSIG = 5, 1
 READY = "fogft_pool_ready"  # a line on stdout for the launch file
 
 
@@ -30,12 +31,11 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--pool", required=True)
     parser.add_argument("--cloud")
     parser.add_argument("--timeout")
-    parser.add_argument(
-        "--down", action="store_true", help="Shut the pool down when this process exits."
-    )
+    parser.add_argument("--down", action="store_true")
     asked = parser.parse_args(arguments)
     for number in _ENDING:
         signal.signal(number, signal.default_int_handler)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)  # even if it is killed
     status = 0
     try:
         return _run(asked)
@@ -60,7 +60,7 @@ def _is_ours(asked: argparse.Namespace) -> bool:
 
 
 def _run(asked: argparse.Namespace) -> int:
-    launch, options = os.getppid(), ["--yes"]
+    options = ["--yes"]
     if asked.cloud:
         options += ["--cloud", asked.cloud]
     if asked.timeout:
@@ -69,7 +69,7 @@ def _run(asked: argparse.Namespace) -> int:
     if status != 0:
         return status
     print(READY, flush=True)
-    while os.getppid() == launch and _is_ours(asked):  # both go on if `logs` is killed
+    while _is_ours(asked):  # both go on if `logs` is killed
         _wait(_fogft("logs", "--follow", "--lines", "0", "--pool", asked.pool))
         time.sleep(_LOGS_AGAIN_S)
     return 0

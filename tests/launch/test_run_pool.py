@@ -27,7 +27,7 @@ if sys.argv[1] == "up":
     if os.environ["FAKE_UP"] == "orphaned":  # launch dies meanwhile
         os.kill(int(os.environ["LAUNCH"]), signal.SIGKILL)
         sys.exit(0)
-    sys.exit(int(os.environ["FAKE_UP"]))
+    sys.exit(0 if os.environ["FAKE_UP"] == "killed later" else int(os.environ["FAKE_UP"]))
 if sys.argv[1] == "logs":
     print(f"0.1 a line, pid {os.getpid()}", flush=True)
     signal.pause()
@@ -55,7 +55,7 @@ def run_pool(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
             "TRACE": str(tmp_path / "trace"), "FOGFT_HOME": str(tmp_path / "home"),
         }  # fmt: skip
         words = [sys.executable, "-m", "fogft.launch.run_pool", "f.yaml", "--pool", "p", *options]
-        if up == "orphaned":
+        if up in ("orphaned", "killed later"):
             program = "import os, subprocess, sys; os.environ['LAUNCH'] = str(os.getpid());"
             words = [sys.executable, "-c", f"{program} subprocess.call(sys.argv[1:])", *words]
         child = subprocess.Popen(
@@ -101,6 +101,15 @@ def test_the_pool_goes_on_without_its_logs(run_pool, tmp_path: Path) -> None:
 def test_a_pool_whose_launch_has_died_during_up_ends(run_pool, tmp_path: Path) -> None:
     run_pool("--down", up="orphaned").wait(20)
     wait_for(lambda: trace(tmp_path)[1:] == ["down p --yes"], 20)
+
+
+def test_a_pool_whose_launch_is_killed_ends_though_no_replica_says_anything(
+    run_pool, tmp_path: Path
+) -> None:
+    child = run_pool("--down", up="killed later")
+    wait_for(lambda: (tmp_path / "trace").exists() and len(trace(tmp_path)) == 2, 20)
+    child.kill()
+    wait_for(lambda: trace(tmp_path)[2:] == ["down p --yes"], 20)
 
 
 def test_a_pool_that_another_file_has_started_goes_on(run_pool, tmp_path: Path) -> None:
