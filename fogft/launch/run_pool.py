@@ -20,7 +20,8 @@ from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
 
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_LOGS_AGAIN_S, _PR_SET_PDEATHSIG = 5, 1
+_LOGS_AGAIN_S = 5
+_PR_SET_PDEATHSIG = 1
 READY = "fogft_pool_ready"  # a line on stdout for the launch file
 
 

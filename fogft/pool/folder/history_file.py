@@ -1,7 +1,7 @@
 """The history of a pool in a file: events are on disk before anything acts on them.
 
 A launch is written before the cloud is asked, so that its generation is never used twice. Other
-events that cannot be written count all the same, and are written with the next one.
+events that cannot be written count all the same, and are written once there is room.
 
 Owns: `history.jsonl`. Not here: what follows from events (`fogft.planning.observed.history`).
 """

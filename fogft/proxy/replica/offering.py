@@ -94,9 +94,8 @@ class Offering:
         for name, offered in self._mistyped(ready).items():
             return f"`run` offers {name} as {offered}, not as {listed[name]}"
         there = [name for name in missing if name in self._seen]
-        if (
-            there and self.clock() >= self._seen_since + SETTLED_S
-        ):  # discovery lists it before it can be called
+        # Discovery lists a service before it can be called.
+        if there and self.clock() >= self._seen_since + SETTLED_S:
             return f"`run` offers {there[0]}, but it cannot be called: has it another QoS?"
         others = [f"{n} ({t})" for n, t in sorted(self._seen.items()) if listed.get(n) != t]
         more = "; it offers " + ", ".join(others[:_TOLD]) if others else ""
