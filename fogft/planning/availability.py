@@ -1,6 +1,7 @@
 """The fraction of time that a replica, or a whole pool, is down. Pure arithmetic.
 
-docs/design/availability.md describes the model, which is exact for any replicas.
+docs/design/availability.md describes the model, which is exact for any replicas. All arguments come
+from a pool file, whose reader has checked their ranges.
 
 Source: FogROS2-FT, section III.C, which prints the fraction for N upside down.
 Not here: how many replicas are launched (`sizing`).
@@ -23,35 +24,17 @@ def unavailability(uptime_s: float, recovery_s: float) -> float:
     """Return the fraction of time, in [0, 1), that one replica does not answer.
 
     `uptime_s` is the mean time from ready to gone, `recovery_s` the mean time from gone to ready
-    again elsewhere. Raises ValueError: an argument is out of range or not finite.
+    again elsewhere.
     """
-    if not (math.isfinite(uptime_s) and uptime_s > 0):
-        raise ValueError(f"uptime_s must be finite and above 0, not {uptime_s}")
-    if not (math.isfinite(recovery_s) and recovery_s >= 0):
-        raise ValueError(f"recovery_s must be finite and 0 or more, not {recovery_s}")
     return recovery_s / (uptime_s + recovery_s)
-
-
-def system_unavailability(replicas: Iterable[float]) -> float:
-    """Return the product of unavailabilities. Raises ValueError: one is not in [0, 1]."""
-    product = 1.0
-    for value in replicas:
-        if not 0 <= value <= 1:
-            raise ValueError(f"an unavailability must be from 0 to 1, not {value}")
-        product *= value
-    return product
 
 
 def replicas_needed(availability: float, target: float, *, limit: int = 16) -> int:
     """Return the fewest replicas that together reach a target availability, if independent.
 
-    `availability` is one replica's, in (0, 1]; `target` is in (0, 1). Raises ValueError: an
-    argument is out of range, or `limit` is too low.
+    `availability` is one replica's, in (0, 1]; `target` is in (0, 1). Raises ValueError: `limit`
+    is too low.
     """
-    if not 0 < availability <= 1:
-        raise ValueError(f"availability must be above 0 and at most 1, not {availability}")
-    if not 0 < target < 1:
-        raise ValueError(f"target must be above 0 and below 1, not {target}")
     allowed = (1 - target) * _ROUNDING
     for count in range(1, limit + 1):
         if (1 - availability) ** count <= allowed:
@@ -89,7 +72,7 @@ def expected(
         stay = [(place, share) for place, share in each if not place.spot]
         without = joint_unavailability(stay, assumed.correlation)
         together = full * without + (1 - full) * together
-    return Expected(1.0 - together, 1.0 - system_unavailability(down))
+    return Expected(1.0 - together, 1.0 - math.prod(down))
 
 
 def full_together(sold: Collection[Placement], assumed: Assumption) -> float:
@@ -112,14 +95,11 @@ def joint_unavailability(
 ) -> float:
     """Return the fraction of time that all replicas are down together.
 
-    Each replica is given by its placement and the fraction of time that it is down. Raises
-    ValueError: a fraction is not in [0, 1].
+    Each replica is given by its placement and the fraction of time that it is down.
     """
     zones: dict[tuple[str, str, str], list[float]] = defaultdict(list)
     steps = {0.0, 1.0}
     for place, down in replicas:
-        if not 0 <= down <= 1:
-            raise ValueError(f"an unavailability must be from 0 to 1, not {down}")
         zones[place.cloud, place.region, place.zone].append(down)
         steps.add(down)
     grid = _Grid(sorted(steps))

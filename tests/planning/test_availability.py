@@ -16,7 +16,6 @@ from fogft.planning.availability import (
     expected,
     full_together,
     joint_unavailability,
-    system_unavailability,
 )
 
 A = Placement("aws", "us-west-1", "a", "m1")
@@ -80,7 +79,7 @@ def test_a_lone_replica_is_down_as_often_as_it_is(one, correlation):
 
 @given(pool=replicas)
 def test_without_correlation_it_is_the_product(pool):
-    product = system_unavailability(down for _, down in pool)
+    product = math.prod(down for _, down in pool)
     assert joint_unavailability(pool, INDEPENDENT) == pytest.approx(product, abs=1e-9)
 
 
@@ -88,7 +87,7 @@ def test_without_correlation_it_is_the_product(pool):
 def test_independence_is_the_best_case_and_the_best_replica_the_worst(pool, correlation):
     """Correlation never helps, and a pool is never worse than its best replica."""
     both = joint_unavailability(pool, correlation)
-    assert both >= system_unavailability(down for _, down in pool) - 1e-9
+    assert both >= math.prod(down for _, down in pool) - 1e-9
     assert both <= min(down for _, down in pool) + 1e-9
 
 
@@ -140,9 +139,3 @@ def test_another_location_never_hurts(places, another, share):
 def test_no_replica_never_answers():
     assert joint_unavailability([], Correlation()) == 1.0
     assert expected([], Assumption()).correlated == 0.0
-
-
-@pytest.mark.parametrize("down", [-0.1, 1.1, math.nan])
-def test_impossible_unavailability_is_an_error(down):
-    with pytest.raises(ValueError, match=r"^an unavailability must be"):
-        joint_unavailability([(A, down)], Correlation())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,7 +23,6 @@ from fogft.planning.availability import (
     expected,
     joint_unavailability,
     replicas_needed,
-    system_unavailability,
 )
 from fogft.poolfile import file
 from fogft.simulation import plot
@@ -131,7 +131,7 @@ def arithmetic_errors(*, quick: bool = False) -> Iterator[dict[str, Any]]:
             static = joint_unavailability([(place, one) for place in places], correlation)
             elsewhere = expected(places, assumed, [offer.placement for offer in offers])
             for policy, alone, together in (
-                (f"static, any of {replicas}", system_unavailability([one] * replicas), static),
+                (f"static, any of {replicas}", math.prod([one] * replicas), static),
                 ("fogft", 1 - elsewhere.independent, 1 - elsewhere.correlated),
             ):
                 down = [1 - available(scenario, policy, seed) for seed in scenario.seeds]

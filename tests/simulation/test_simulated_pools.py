@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
 
 from fogft.model.choices import OnDemandSpec, ScheduleSpec, WindowSpec
 from fogft.planning import planner
-from fogft.planning.availability import system_unavailability
 from fogft.planning.observed.history import EventKind
 from fogft.simulation.comparison import (
     SETTLE_S,
@@ -163,7 +163,7 @@ def test_without_correlation_the_product_of_unavailabilities_is_right(replicas):
     down = 1 - sum(o.available for o in rows) / len(rows)
     # A refused place is tried again after a minute, half of it lost on average.
     one = staying(INDEPENDENT, Timing(boot_s=30.0))
-    assert down == pytest.approx(system_unavailability([one] * replicas), rel=0.15)
+    assert down == pytest.approx(math.prod([one] * replicas), rel=0.15)
 
 
 def test_without_correlation_a_replica_that_moves_is_down_as_reckoned():
@@ -186,7 +186,7 @@ def test_with_correlation_independence_promises_too_much():
     rows = [run(wanted, "static, any of 2", seed=seed)[1].outcome() for seed in seeds]
     down = 1 - sum(o.available for o in rows) / len(rows)
     one = staying(model, Timing(boot_s=30.0))
-    assert down > 1.8 * (system_unavailability([one] * 2))
+    assert down > 1.8 * math.prod([one] * 2)
     assert down == pytest.approx(one * one + 0.4 * one * (1 - one), rel=0.2)
 
 

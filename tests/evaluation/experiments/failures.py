@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from fogft.planning.availability import replicas_needed, system_unavailability, unavailability
+from fogft.planning.availability import replicas_needed, unavailability
 from fogft.simulation.model import MarketModel, Timing
 from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting
@@ -84,7 +84,7 @@ class Failures(Defaults):
     def findings(self, samples: Samples) -> Sequence[Finding]:
         """Return the paper's numbers, by formula and by simulation."""
         one = unavailability(UPTIME_S, RECOVERY_S)
-        two = system_unavailability([one, one])
+        two = math.prod([one, one])
         alone, pair = (_down(samples, f"independent-{n}") for n in (1, 2))
         fate = _down(samples, "correlated-2")
         planned = {float(row["target"]): int(row["wanted"]) for row in samples["planned"]}

@@ -6,10 +6,10 @@ Owns: what is compared. Not here: pools in simulated markets (`simulated`).
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from fogft.planning.availability import system_unavailability
 from fogft.simulation.model import MarketModel, Timing
 from tests.estimates import Estimate, estimate, mean
 from tests.evaluation import plotting
@@ -60,7 +60,7 @@ class Markets(Defaults):
         """Return what independence promises, and what comes."""
         found = []
         for n in REPLICAS[1:]:
-            stays = 1 - system_unavailability([staying(_MODEL, _TIMING)] * n)
+            stays = 1 - math.prod([staying(_MODEL, _TIMING)] * n)
             for who, field in (("static", "static_down"), ("fogft", "fogft_down")):
                 found.append(
                     Finding(
@@ -79,7 +79,7 @@ class Markets(Defaults):
         """Return everything by N."""
         rows = []
         for n in REPLICAS:
-            independent = 1 - system_unavailability([staying(_MODEL, _TIMING)] * n)
+            independent = 1 - math.prod([staying(_MODEL, _TIMING)] * n)
             static, moving = (_up(samples, n, f) for f in ("static_down", "fogft_down"))
             rows.append([str(n), f"{100 * independent:.4g}", _percent(static), _percent(moving)])
         head = ["replicas", "static, if independent", "static", "fogft"]
@@ -90,7 +90,7 @@ class Markets(Defaults):
         figure, axes = plotting.figure(1, 1)
         axis = axes[0][0]
         one = staying(_MODEL, _TIMING)
-        independent = [100 * (1 - system_unavailability([one] * n)) for n in REPLICAS]
+        independent = [100 * (1 - math.prod([one] * n)) for n in REPLICAS]
         plotting.curve(axis, REPLICAS, independent, "#222222", "static, if independent")
         for colour, (label, field) in zip(
             plotting.COLOURS, (("static", "static_down"), ("fogft", "fogft_down")), strict=False
