@@ -43,10 +43,6 @@ class Intent:
         """Whether the user's number of replicas overrides the file's."""
         return self.target is not None and self.scaled_from == spec.replicas
 
-    def is_drained(self, slot: int, generation: int) -> bool:
-        """Whether the user asked to replace this launch."""
-        return generation <= self.drained.get(slot, 0)
-
     def is_excluded(self, location: str) -> bool:
         """Whether a ``cloud/region/zone`` lies in an excluded location."""
         return any((location + "/").startswith(place + "/") for place in self.excluded)

@@ -113,7 +113,7 @@ def _unwanted(
 ) -> Reason | None:
     """Return why a working replica is to be replaced; None if it is not."""
     machine, slot = replica.machine, replica.slot
-    if intent.drained and intent.is_drained(slot, replica.id.generation):
+    if replica.id.generation <= intent.drained.get(slot, 0):
         return Reason(Cause.DRAINED)
     if intent.excluded and intent.is_excluded(machine.placement.location):
         return Reason(Cause.EXCLUDED, location=machine.placement.location)
