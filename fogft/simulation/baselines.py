@@ -99,7 +99,7 @@ class Search:
         replicas: int,
         wanted: Target,
         *,
-        rule: Callable[[Sequence[Offer]], Rule],
+        rule: Callable[[Sequence[Offer]], Naive],
         extra: int = 0,
     ) -> None:
         self.wanted = wanted
@@ -163,7 +163,7 @@ class Search:
             self._spot_from = self._fleet.world.now + RETRY_S
 
 
-class Rule:
+class Naive:
     """Where to order the next spot machine: fewest replicas, then oldest failure, then price."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
@@ -185,13 +185,14 @@ class Rule:
         )
 
     def lost(self, offer: Offer) -> None:
-        """Note that a location preempted a machine or had no capacity."""
+        """Note that a location preempted a machine or had no capacity: it is tried last."""
+        self._failed[offer.placement.location] = 1 + max(self._failed.values(), default=0)
 
     def ready(self, offer: Offer) -> None:
         """Note that a machine became ready there."""
 
 
-class InTurn(Rule):
+class InTurn(Naive):
     """Round robin: the next location of a list, wherever other replicas are."""
 
     def __init__(self, spot: Sequence[Offer]) -> None:
@@ -203,15 +204,7 @@ class InTurn(Rule):
         return next(self._turns)
 
 
-class Naive(Rule):
-    """The cheapest location with the fewest replicas, avoiding recent failures."""
-
-    def lost(self, offer: Offer) -> None:
-        """Try that location last."""
-        self._failed[offer.placement.location] = 1 + max(self._failed.values(), default=0)
-
-
-class ActiveZones(Rule):
+class ActiveZones(Naive):
     """SkyServe's spot placer: the cheapest active location with the fewest replicas.
 
     A location is active until a replica is lost or refused there, and again once one becomes
