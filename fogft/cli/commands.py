@@ -101,13 +101,11 @@ def _elsewhere(name: str) -> Any:
 class Group(TyperGroup):
     """A group of commands whose descriptions wrap and are never cut."""
 
-    def sections(self) -> Iterable[tuple[str, Iterable[str]]]:
-        """Return the titles of the lists, with the names of the commands in each."""
-        return [("Commands", self.commands)]
+    sections: Mapping[str, Iterable[str]] = {}  # without any, all commands are in one list
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write one list for each section."""
-        for title, names in self.sections():
+        for title, names in (self.sections or {"Commands": self.commands}).items():
             with formatter.section(title):
                 formatter.write_dl(
                     [(n, self.commands[n].get_short_help_str(_WHOLE)) for n in names]
@@ -122,13 +120,11 @@ def group(help: str) -> typer.Typer:
 class Commands(Group):
     """The root of all commands, listed by section."""
 
+    sections = SECTIONS
+
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.commands: Any = _Loaded(_COMMANDS)
-
-    def sections(self) -> Iterable[tuple[str, Iterable[str]]]:
-        """Return the sections, one for each kind of task."""
-        return SECTIONS.items()
 
 
 class Command(TyperCommand):

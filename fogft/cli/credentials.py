@@ -1,14 +1,12 @@
 """``fogft credentials | join | export | import``: a pool's certificates, and moving a pool."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import os
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -18,11 +16,10 @@ from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolOption
 from fogft.cli.status_text import show_table, utc
 from fogft.errors import CredentialError, FogftError
+from fogft.model.credentials import Holder, Role
+from fogft.model.plain import to_plain
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
-
-if TYPE_CHECKING:
-    from fogft.model.credentials import Holder, Role
 
 Hours = Annotated[
     float, typer.Option(min=0.1, max=720, metavar="H", help="Hours until it expires.")
@@ -60,7 +57,6 @@ def issue(
     Without a passphrase of your own, one is generated and shown. Send it separately from the
     file.
     """
-    from fogft.model.credentials import Role
     from fogft.pool.commands import joining
 
     store = composition.store_of(pool)
@@ -83,7 +79,6 @@ def issue(
 @credentials.command("list", cls=Command, epilog="fogft credentials list")
 def list_(as_json: AsJson = False, pool: PoolOption = None) -> None:
     """List the certificates that the pool's CA has issued, without their keys."""
-    from fogft.model.plain import to_plain
     from fogft.pool.credentials.ledger import Ledger
 
     now = time.time()
@@ -138,7 +133,6 @@ def rotate(
     revoked. Replicas are replaced, the new one first. For a robot or gateway on another
     machine, issue a new bundle, join there, and revoke the old generation.
     """
-    from fogft.model.credentials import Role
     from fogft.pool.commands.change import rotate_replicas, rotate_robot
 
     store, which = composition.store_of(pool), _role(role)
@@ -248,7 +242,6 @@ def import_(
     Starts its manager here, and deletes the file. If copies are imported on several machines, all
     but one stop once a replica tells them, within a minute.
     """
-    from fogft.model.credentials import Role
     from fogft.pool.commands import joining, moving, startup
     from fogft.pool.credentials.bundle import read_label
 
@@ -272,8 +265,6 @@ def _alone(holder: Holder) -> str:
 
 
 def _role(text: str) -> Role:
-    from fogft.model.credentials import Role
-
     allowed = {one.value: one for one in (Role.ROBOT, Role.REPLICA, Role.GATEWAY, Role.RENDEZVOUS)}
     if text not in allowed:
         hint = "roles: " + ", ".join(f"`{name}`" for name in allowed)

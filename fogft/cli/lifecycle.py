@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fogft import __version__
-from fogft.cli import options, output
+from fogft import __version__, logfile
+from fogft.cli import options, output, progress, status_text
 from fogft.cli.options import DEFAULT_FILE, Cloud, PoolArgument, PoolFile, PoolOption, Yes
 from fogft.errors import FogftError
 from fogft.pool.commands import composition
@@ -75,7 +75,6 @@ def up(
     changed file replaces replicas, waits for the update, even one that is already in progress,
     and fails if it is rolled back.
     """
-    from fogft.cli import progress, status_text
     from fogft.planning.rollout import UpdateState
     from fogft.pool.commands import preview, startup, status
     from fogft.pool.commands.outcome import Awaited, Outcome
@@ -165,7 +164,6 @@ def _replica_at_fault(reasons: Iterable[Reason]) -> str:
 
 def _end_of_log(status: PoolStatus, of: str = "") -> list[str]:
     """Return the last lines of a replica's log; by default the last replica's or the proxy's."""
-    from fogft import logfile
     from fogft.pool.commands import logs
 
     store = composition.make_store(status.pool)

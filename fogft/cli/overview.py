@@ -14,6 +14,7 @@ from fogft.cli import options, output
 from fogft.cli.options import AsJson, PoolArgument, PoolOption
 from fogft.cli.status_text import age, price, readiness, show_table
 from fogft.errors import PoolBusy, PoolNotFound, StateError
+from fogft.model.plain import to_plain
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import PoolPaths, home
 
@@ -86,8 +87,6 @@ def events(
     Launches, losses, moves and updates, oldest first. Old events are dropped once no decision
     needs them.
     """
-    from fogft.model.plain import to_plain
-
     store = composition.store_of(options.one_pool(pool, named))
     if as_json:
         output.json_data([to_plain(one) for one in _last_events(store, count)])

@@ -3,8 +3,6 @@
 A late write by an old manager never replaces one by its successor: see `Membership.epoch`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Collection, Iterable
