@@ -69,7 +69,7 @@ class ClientProxyConfig(ProxyConfig):
     dial_in: EndpointOrEmpty = ""  # address given to replicas that cannot be reached
     dial_in_listen: EndpointOrEmpty = ""  # where to listen, if not on that port of all addresses
     uplinks: tuple[Interface, ...] = ()  # used at the same time, preferred first
-    listen: EndpointOrEmpty = ""  # where a gateway listens for robots
+    listen: Endpoint = "0.0.0.0:7470"  # where a gateway listens for robots
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,22 +12,12 @@ from fogft.model.choices import Speaks
 from fogft.model.proxy_config import ClientProxyConfig, ProxyConfig, ServerProxyConfig
 from fogft.poolfile import config_file
 
-DEFAULT_GATEWAY_LISTEN = "0.0.0.0:7470"
 
-
-def read_client(path: Path, metrics: str | None = None) -> ClientProxyConfig:
-    """Read a client proxy's configuration; `metrics` overrides it."""
-    config = config_file.read(ClientProxyConfig, path, {"metrics": metrics})
+def read_client(path: Path, **override: Any) -> ClientProxyConfig:
+    """Read the configuration of a client proxy or gateway; options that are not None override."""
+    config = config_file.read(ClientProxyConfig, path, override)
     _check(path, config)
     return config
-
-
-def read_gateway(
-    path: Path, listen: str | None = None, metrics: str | None = None
-) -> ClientProxyConfig:
-    """Read a gateway's configuration; `listen` and `metrics` override it."""
-    config = read_client(path, metrics)
-    return replace(config, listen=listen or config.listen or DEFAULT_GATEWAY_LISTEN)
 
 
 def read_server(path: Path, **override: Any) -> ServerProxyConfig:

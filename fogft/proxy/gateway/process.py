@@ -23,7 +23,7 @@ from fogft.model.replica import ReplicaId
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.model.type_definition import RESPONSE
 from fogft.process import Watchdog, notify, on_thread, start_log, stop_on_signal
-from fogft.proxy.config import read_gateway
+from fogft.proxy.config import read_client
 from fogft.proxy.gateway.gateway import Forwarder
 from fogft.proxy.middleware import fault_of
 from fogft.proxy.robot.client import ClientProxy
@@ -46,7 +46,7 @@ def run(config_path: Path, *, listen: str | None = None, metrics: str | None = N
     """
     start_log()
     stop = stop_on_signal()
-    config = read_gateway(config_path, listen, metrics)
+    config = read_client(config_path, listen=listen, metrics=metrics)
     lock = disk.Lock(config.lock)
     if not lock.acquire(wait=False):
         name, pool = config.robot, config.pool

@@ -78,7 +78,7 @@ def run(
     begin_start()
     start_log()
     stop = stop_on_signal()
-    config = read_client(config_path, metrics)
+    config = read_client(config_path, metrics=metrics)
     managing = ManagerRestart(config.lock.parent, os.environ)
     lock = disk.Lock(config.lock)
     middleware.prepare(config.rmw)
@@ -90,7 +90,7 @@ def run(
         early = in_line.wait(config, lock, stop, name, spare=spare)
         if stop.is_set():
             return
-        config = _same(config, read_client(config_path, metrics), config_path)
+        config = _same(config, read_client(config_path, metrics=metrics), config_path)
     _bury(config)
     running = _Running(
         config_path, config, metrics=metrics, lock=lock, managing=managing, early=early
@@ -317,7 +317,7 @@ class _Running:
 
     def _reconfigure(self) -> None:
         path = self.config_path
-        new = _same(self.config, read_client(path, self.metrics), path)
+        new = _same(self.config, read_client(path, metrics=self.metrics), path)
         if self.dialer.use(new.uplinks, new.services):
             self.proxy.redial()
         self.proxy.pass_topics(new.topics, cast("SerialisedNode", self.joined.node))

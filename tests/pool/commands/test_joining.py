@@ -25,7 +25,7 @@ from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, PoolStore, write_identity
 from fogft.poolfile import config_file
-from fogft.proxy.config import read_client, read_gateway, read_server
+from fogft.proxy.config import read_client, read_server
 from tests.nightly import by_day
 
 UID, NOW = "0123456789abcdef", 2e9
@@ -126,7 +126,7 @@ def test_a_gateway_joins_too(store: PoolStore, tmp_path: Path) -> None:
     path.write_bytes(issued(store, Role.GATEWAY, "edge"))
     joined = joining.join(path, PASSPHRASE, tmp_path / "home", NOW)
     assert (joined.command, joined.holder.role) == ("gateway", Role.GATEWAY)
-    config = read_gateway(joined.config)
+    config = read_client(joined.config)
     assert (config.robot, config.listen) == ("edge", "0.0.0.0:7470")
     assert from_dict(json.loads(config.membership.read_text())) == MEMBERSHIP
     said = authority.describe(config.credentials.certificate)

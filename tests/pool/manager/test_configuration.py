@@ -87,7 +87,7 @@ def test_where_each_process_answers_prometheus_is_passed_on(paths: PoolPaths) ->
     asked = dataclasses.replace(spec(), metrics=MetricsSpec("h:1", "h:2", "h:9470"))
     configuration.write_proxy_config(paths, identity(paths.folder), asked)
     assert read_client(paths.proxy_config).metrics == "h:1"
-    assert read_client(paths.proxy_config, "h:9").metrics == "h:9"
+    assert read_client(paths.proxy_config, metrics="h:9").metrics == "h:9"
     other = configuration.proxy_config(identity(paths.folder), asked, name="other")
     (paths.folder / "other.yaml").write_text(other)
     assert read_client(paths.folder / "other.yaml").metrics == ""
