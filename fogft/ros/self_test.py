@@ -50,16 +50,6 @@ def answer(name: str) -> int:
     return 0
 
 
-def ask(name: str) -> int:
-    """Call that service; print the seconds taken by discovery and by the call, or the error.
-
-    The result is printed before the node is destroyed: Fast DDS sometimes crashes there, which
-    says nothing about the test.
-    """
-    with contextlib.ExitStack() as until_told:
-        return _tell(lambda: _call(name, *until_told.enter_context(_node(f"{name}_ask"))))
-
-
 def segment() -> dict[str, int]:
     """Create a node; return the size in bytes of its middleware's shared memory."""
     with _node(f"fogft_doctor_{os.getpid()}"):
@@ -67,7 +57,10 @@ def segment() -> dict[str, int]:
 
 
 def _call(name: str, node: Any, executor: Any) -> dict[str, float]:
-    """Find the service and call it once. Raises TimeoutError: not found, or no answer."""
+    """Call the service once; return the seconds taken by discovery and by the call.
+
+    Raises TimeoutError: The service was not found, or did not answer.
+    """
     from rcl_interfaces.srv import ListParameters
 
     client: Any = node.create_client(ListParameters, f"/{name}/list_parameters")
@@ -103,7 +96,9 @@ def main(arguments: list[str]) -> int:
         case ["segment"]:
             return _tell(segment)
         case ["ask", name]:
-            return ask(name)
+            # Told before the node is destroyed: Fast DDS may crash there, which says nothing.
+            with contextlib.ExitStack() as until_told:
+                return _tell(lambda: _call(name, *until_told.enter_context(_node(f"{name}_ask"))))
         case ["answer", name]:
             return answer(name)
     print(__doc__, file=sys.stderr)
