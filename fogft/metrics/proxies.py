@@ -7,12 +7,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from fogft.metrics.outcomes import BUCKETS_S, Outcome
-from fogft.metrics.scrape import counter, gauge, histogram
+from fogft.metrics.scrape import family, histogram
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
-_COUNTS = {
+_OF_SERVICE = {
     "received": ("fogft_requests_total", "Requests that callers sent."),
     "sent": ("fogft_attempts_total", "Copies of requests that were sent to replicas."),
     "late": ("fogft_late_responses_total", "Responses that came too late to be used."),
@@ -21,18 +21,17 @@ _COUNTS = {
     "rejected": ("fogft_rejected_responses_total", "Responses whose ok_field was false."),
     "undelivered": ("fogft_undelivered_responses_total", "Responses that ROS did not accept."),
     "fallback_failed": ("fogft_fallback_failures_total", "Fallback calls without a response."),
+    "pending": ("fogft_pending_requests", "Requests without a response yet."),
 }
 LEASE = (
     "fogft_replica_lease_seconds",
     "Time until a replica shuts down if it hears from no manager.",
 )
-_LINK_GAUGES = {
+_OF_LINK = {
     "silent_for_s": ("fogft_link_silent_seconds", "Time since the oldest unanswered probe."),
     "rtt_s": ("fogft_link_round_trip_seconds", "Round trip of the last probe."),
     "in_flight": ("fogft_link_requests_in_flight", "Requests sent to a replica and not answered."),
     "lease_left_s": LEASE,
-}
-_LINK_COUNTS = {
     "reopened": (
         "fogft_link_reconnects_total",
         "Times that the connection to a replica was reopened.",
@@ -59,21 +58,20 @@ def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a client proxy or a gateway from its report."""
     services, links = report["services"], _newest(report["links"])
     yield from _requests(services)
-    for kind, table in ((gauge, _LINK_GAUGES), (counter, _LINK_COUNTS)):
-        for key, (name, help) in table.items():
-            known = (link for link in links if link.get(key) is not None)
-            yield kind(name, help, ((link[key], _slot(link)) for link in known))
-    yield gauge(
+    for key, (name, help) in _OF_LINK.items():
+        known = (link for link in links if link.get(key) is not None)
+        yield family(name, help, ((link[key], _slot(link)) for link in known))
+    yield family(
         "fogft_link_up",
         "Whether a replica answers probes.",
         ((link["state"] == "up", _slot(link)) for link in links),
     )
-    yield gauge(
+    yield family(
         "fogft_link_ready_services",
         "Services that a replica can answer.",
         ((len(link["ready"]), _slot(link)) for link in links),
     )
-    yield counter(
+    yield family(
         "fogft_topic_messages_total",
         "Messages of topics, by outcome.",
         (
@@ -83,7 +81,7 @@ def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
             if event not in ("trouble", "rate_hz")
         ),
     )
-    yield gauge(
+    yield family(
         "fogft_uplink_suspected",
         "Whether all links have fallen silent together.",
         [(report["uplink_suspected"], {})],
@@ -91,10 +89,10 @@ def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
 
 
 def _requests(services: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
-    for key, (name, help) in _COUNTS.items():
+    for key, (name, help) in _OF_SERVICE.items():
         known = {s: count[key] for s, count in services.items() if key in count}
-        yield counter(name, help, ((value, {"service": s}) for s, value in known.items()))
-    yield counter(
+        yield family(name, help, ((value, {"service": s}) for s, value in known.items()))
+    yield family(
         "fogft_outcomes_total",
         "How requests ended.",
         (
@@ -104,7 +102,7 @@ def _requests(services: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
             if outcome in count
         ),
     )
-    yield counter(
+    yield family(
         "fogft_first_responses_total",
         "Requests that a replica answered first.",
         (
@@ -117,11 +115,6 @@ def _requests(services: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
         (refused, {"service": s, "reason": reason})
         for s, count in services.items()
         for reason, refused in count.get("refused", {}).items()
-    )
-    yield gauge(
-        "fogft_pending_requests",
-        "Requests without a response yet.",
-        ((c["pending"], {"service": s}) for s, c in services.items() if "pending" in c),
     )
     yield histogram(
         "fogft_request_duration_seconds",
@@ -136,7 +129,7 @@ def _requests(services: Mapping[str, Mapping[str, Any]]) -> Iterator[Metric]:
 
 
 def _refusals(values: Iterator[tuple[float, dict[str, str]]]) -> Metric:
-    return counter("fogft_refusals_total", "Copies of requests that were refused.", values)
+    return family("fogft_refusals_total", "Copies of requests that were refused.", values)
 
 
 def _by_slot(by_replica: Mapping[str, int]) -> Counter[str]:
@@ -159,30 +152,30 @@ def _slot(link: Mapping[str, Any]) -> dict[str, str]:
 def of_server(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a server proxy from its report."""
     work: Mapping[str, float] = report["work"]
-    yield gauge("fogft_requests_held", "Requests held and not yet answered.", [(work["held"], {})])
+    yield family("fogft_requests_held", "Requests held and not yet answered.", [(work["held"], {})])
     for key, (name, help) in _WORK_COUNTS.items():
-        yield counter(name, help, [(work[key], {})])
+        yield family(name, help, [(work[key], {})])
     yield _refusals((count, {"reason": reason}) for reason, count in report["refused"].items())
-    yield gauge(
+    yield family(
         "fogft_concurrency_limit",
         "Requests that a service is given at the same time.",
         ((limit, {"service": name}) for name, limit in report["limits"].items()),
     )
-    yield gauge(
+    yield family(
         "fogft_service_ready",
         "Whether a service can answer.",
         ((ready, {"service": name}) for name, ready in report["services"].items()),
     )
-    yield gauge(
+    yield family(
         "fogft_replica_draining",
         "Whether this machine received a preemption notice.",
         [(report["draining"], {})],
     )
-    yield counter(
+    yield family(
         "fogft_replica_restarts_total", "Restarts of the command.", [(report["restarts"], {})]
     )
     if report["lease_left_s"] is not None:
-        yield gauge(*LEASE, [(report["lease_left_s"], {})])
+        yield family(*LEASE, [(report["lease_left_s"], {})])
     yield _listener(report["wire"])
 
 
@@ -190,7 +183,7 @@ def of_gateway(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a gateway from its report."""
     forwarded = report["forwarded"]
     yield from of_client(report)
-    yield gauge(
+    yield family(
         "fogft_gateway_requests_in_flight",
         "Robots' requests being forwarded.",
         [(forwarded["in_flight"], {})],
@@ -200,7 +193,7 @@ def of_gateway(report: Mapping[str, Any]) -> Iterator[Metric]:
         "Robots' requests.",
         {key: forwarded[key] for key in ("passed", "joined")},
     )
-    yield counter(
+    yield family(
         "fogft_gateway_refusals_total",
         "Robots' requests refused, by reason.",
         ((count, {"reason": reason}) for reason, count in forwarded["refused"].items()),
@@ -214,4 +207,4 @@ def _listener(counts: Mapping[str, float]) -> Metric:
 
 def by_event(name: str, help: str, counts: Mapping[str, float]) -> Metric:
     """Return counters of one name, by event."""
-    return counter(name, help, ((n, {"event": str(event)}) for event, n in counts.items()))
+    return family(name, help, ((n, {"event": str(event)}) for event, n in counts.items()))

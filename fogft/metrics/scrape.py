@@ -29,14 +29,15 @@ Values = Iterable[tuple[float, Labels]]
 Measure = Callable[[], "Iterable[Metric]"]
 
 
-def counter(name: str, help: str, values: Values) -> Metric:
-    """Return counters of one name, which ends in ``_total``, by their labels."""
-    return _family(name.removesuffix("_total"), "counter", help, values, "_total")
+def family(name: str, help: str, values: Values) -> Metric:
+    """Return what has one name, by labels: counters if it ends in ``_total``, else gauges."""
+    from prometheus_client import Metric
 
-
-def gauge(name: str, help: str, values: Values) -> Metric:
-    """Return gauges of one name by their labels; a name ends in its unit."""
-    return _family(name, "gauge", help, values)
+    known = name.removesuffix("_total")
+    made = Metric(known, help, "gauge" if known == name else "counter")
+    for value, labels in values:
+        made.add_sample(name, _printable(labels), float(value))
+    return made
 
 
 def histogram(
@@ -49,25 +50,18 @@ def histogram(
 
     `bounds` ascend; one more bucket has none. `counted`: counts by bucket, sum of values, labels.
     """
-    family = _family(name, "histogram", help, ())
+    from prometheus_client import Metric
+
+    made = Metric(name, help, "histogram")
     for counts, total, labels in counted:
         known, so_far = _printable(labels), 0
         for bound, count in zip((*bounds, math.inf), counts, strict=True):
             so_far += count
             within = "+Inf" if bound == math.inf else str(float(bound))
-            family.add_sample(f"{name}_bucket", {**known, "le": within}, so_far)
-        family.add_sample(f"{name}_count", known, so_far)
-        family.add_sample(f"{name}_sum", known, total)
-    return family
-
-
-def _family(name: str, kind: str, help: str, values: Values, suffix: str = "") -> Metric:
-    from prometheus_client import Metric
-
-    family = Metric(name, help, kind)
-    for value, labels in values:
-        family.add_sample(f"{name}{suffix}", _printable(labels), float(value))
-    return family
+            made.add_sample(f"{name}_bucket", {**known, "le": within}, so_far)
+        made.add_sample(f"{name}_count", known, so_far)
+        made.add_sample(f"{name}_sum", known, total)
+    return made
 
 
 def _printable(labels: Labels) -> dict[str, str]:
@@ -89,14 +83,13 @@ class Scrape:
         from prometheus_client import ProcessCollector
 
         version = {"version": fogft.__version__, "python": platform.python_version()}
-        yield gauge("fogft_build_info", "Version of fogft and of Python.", [(1, version)])
-        for family in chain(self._measure(), ProcessCollector(registry=None).collect()):
-            family.samples = [
-                sample._replace(labels={**self._labels, **sample.labels})
-                for sample in family.samples
+        yield family("fogft_build_info", "Version of fogft and of Python.", [(1, version)])
+        for one in chain(self._measure(), ProcessCollector(registry=None).collect()):
+            one.samples = [
+                sample._replace(labels={**self._labels, **sample.labels}) for sample in one.samples
             ]
-            if family.samples:
-                yield family
+            if one.samples:
+                yield one
 
     @property
     def endpoint(self) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from fogft.link.dial_out.replica import DialOut
 from fogft.link.dial_out.robot import GREETINGS_LIMIT, DialIn
-from fogft.metrics.scrape import Scrape, gauge
+from fogft.metrics.scrape import Scrape, family
 from fogft.model.replica import ReplicaId
 from fogft.records.accepting import oldest_of_most
 from fogft.records.exchange import OF_ONE_LIMIT
@@ -88,7 +88,7 @@ def test_silent_strangers_keep_no_replica_from_a_door(authority: Authority) -> N
 
 
 def test_scrapers_that_say_nothing_keep_no_other_out_and_few_threads() -> None:
-    scrape = Scrape(lambda: [gauge("fogft_x", "x", [(1, {})])], {})
+    scrape = Scrape(lambda: [family("fogft_x", "x", [(1, {})])], {})
     scrape.at("127.0.0.1:0")
     host, _, port = scrape.endpoint.rpartition(":")
     try:

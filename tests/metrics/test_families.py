@@ -14,7 +14,7 @@ from prometheus_client.parser import text_string_to_metric_families as parsed
 
 import fogft
 from fogft.metrics import proxies
-from fogft.metrics.scrape import counter, gauge, histogram
+from fogft.metrics.scrape import family, histogram
 from fogft.pool.manager.tally import of_pool
 from tests.fakes.pools import STATUS
 from tests.metrics.samples import CLIENT, LINK, POOL, PROCESSES, tally, text
@@ -47,9 +47,9 @@ def test_prometheus_finds_nothing_to_mend(process: str) -> None:
 
 @pytest.mark.parametrize("process", PROCESSES)
 def test_every_sample_says_whose_it_is(process: str) -> None:
-    for family in parsed(PROCESSES[process]()):
-        for sample in family.samples:
-            assert {"pool", "pool_uid"} & sample.labels.keys() or family.name == "fogft_build_info"
+    for one in parsed(PROCESSES[process]()):
+        for sample in one.samples:
+            assert {"pool", "pool_uid"} & sample.labels.keys() or one.name == "fogft_build_info"
 
 
 def test_a_version_is_told_by_every_process() -> None:
@@ -95,12 +95,12 @@ def one(families: Iterable[Metric]) -> str:
 
 @given(label=st.text(st.characters(exclude_categories=["Cs"])), number=st.floats(allow_nan=False))
 def test_a_label_and_a_value_come_back(label: str, number: float) -> None:
-    said = text([gauge("m", "help", [(number, {"service": label})])], {})
+    said = text([family("m", "help", [(number, {"service": label})])], {})
     assert value(said, "m", service=label) == number
 
 
 def test_a_lone_surrogate_can_be_sent() -> None:
-    assert "m{" in text([gauge("m", "help", [(1, {"service": "\ud800"})])], {})
+    assert "m{" in text([family("m", "help", [(1, {"service": "\ud800"})])], {})
 
 
 @given(counts=st.lists(st.integers(0, 1000), min_size=3, max_size=3))
@@ -135,4 +135,4 @@ def test_every_process_tells_its_processor_time_and_memory() -> None:
 
 
 def test_a_family_without_samples_is_left_out() -> None:
-    assert one([counter("m_total", "nothing", [])]) == ""
+    assert one([family("m_total", "nothing", [])]) == ""

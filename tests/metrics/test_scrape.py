@@ -9,12 +9,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from fogft.metrics.scrape import Scrape, gauge
+from fogft.metrics.scrape import Scrape, family
 from tests.fakes.threads import no_more
 
 
 def one():
-    return [gauge("fogft_x", "x", [(1, {})])]
+    return [family("fogft_x", "x", [(1, {})])]
 
 
 @pytest.fixture

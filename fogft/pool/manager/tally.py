@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from fogft.metrics.proxies import by_event
-from fogft.metrics.scrape import counter, gauge, histogram
+from fogft.metrics.scrape import family, histogram
 from fogft.model.reason import NOTICES, Cause
 from fogft.model.replica import Phase
 from fogft.planning.observed.history import Event, EventKind
@@ -101,7 +101,7 @@ class Tally:
             ("lost_replicas", "Machines lost without being ended by fogft.", "kind", self._lost),
         ):
             told = [(n, {label: key}) for key, n in list(counts.items())]  # others may be added
-            yield counter(f"fogft_pool_{name}_total", help, told)
+            yield family(f"fogft_pool_{name}_total", help, told)
         yield histogram(
             "fogft_pool_launch_duration_seconds",
             "Time from the order to a running machine, from there to ready, and in total.",
@@ -119,7 +119,7 @@ def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
     yield from tally.metrics()
     if status is None:
         return
-    gauges = {
+    known = {
         "fogft_pool_target_replicas": ("Replicas to keep ready.", status.target),
         "fogft_pool_ready_replicas": ("Replicas that answer and are to be kept.", status.ready),
         "fogft_pool_usd_per_hour": ("Price of all machines together.", status.usd_per_hour),
@@ -137,27 +137,24 @@ def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
             "When the manager last observed the pool, in Unix time.",
             status.observed_at,
         ),
-        "fogft_manager_epoch": (
-            "Number of the manager, higher for each new one.",
-            status.epoch,
-        ),
+        "fogft_manager_epoch": ("Number of the manager, higher for each new one.", status.epoch),
+        "fogft_pool_usd_total": ("Cost of the pool so far.", status.usd_to_date),
     }
-    for name, (help, value) in gauges.items():
-        yield gauge(name, help, [(value, {})])
+    for name, (help, value) in known.items():
+        yield family(name, help, [(value, {})])
     ends_at = status.credentials_end_at
-    yield gauge(
+    yield family(
         "fogft_credentials_left_seconds",
         "Time until the cloud's credentials expire, where known.",
         [] if ends_at is None else [(ends_at - status.observed_at, {})],
     )
-    yield counter("fogft_pool_usd_total", "Cost of the pool so far.", [(status.usd_to_date, {})])
     phases = Counter(replica.phase for replica in status.replicas)
-    yield gauge(
+    yield family(
         "fogft_pool_replicas",
         "Replicas by phase.",
         ((phases[one.value], {"phase": one.value}) for one in Phase),
     )
-    yield gauge(
+    yield family(
         "fogft_replica_info",
         "Which machine fills a slot.",
         (
@@ -179,8 +176,8 @@ def of_pool(status: PoolStatus | None, tally: Tally) -> Iterator[Metric]:
 def of_rendezvous(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a rendezvous from its report."""
     help = "Members that are connected."
-    yield gauge("fogft_rendezvous_callers", help, [(report["callers"], {})])
-    yield gauge("fogft_rendezvous_records", "Records held.", [(report["records"], {})])
+    yield family("fogft_rendezvous_callers", help, [(report["callers"], {})])
+    yield family("fogft_rendezvous_records", "Records held.", [(report["records"], {})])
     yield by_event("fogft_rendezvous_port_events_total", "Events at its port.", report["port"])
     yield by_event("fogft_rendezvous_messages_total", "Messages by kind.", report["messages"])
     yield by_event(
