@@ -313,14 +313,6 @@ class ScheduleSpec:
     prelaunch_s: float = 600.0
 
 
-@dataclass(frozen=True)
-class MigrationSpec:
-    """When a replica moves: for a score lower by `gain`, at least `stay_s` after it was ready."""
-
-    gain: float = 0.3
-    stay_s: float = 600.0
-
-
 def _robot_at(written: Any) -> tuple[float, float]:
     is_pair = isinstance(written, list) and len(written) == 2
     if not is_pair or any(isinstance(n, bool) or not isinstance(n, (int, float)) for n in written):

@@ -90,7 +90,6 @@ class Map(NamedTuple):
     of: type
     hint: str = ""
     short: tuple[str, ...] = ()  # keys that a plain value in place of the map sets
-    off: bool = False  # whether `false` in its place means None
 
 
 class Maps(NamedTuple):
@@ -136,8 +135,8 @@ def words(form: Form) -> str:  # noqa: PLR0911
             return f"list of at most {most}, each {of.what}"
         case Table(of, name):
             return f"map from {name.what} to a {words(of)}"
-        case Map(_, _, short, off):
-            return "map" + (", or one value" if short else "") + (", or `false`" if off else "")
+        case Map(_, _, short):
+            return "map" + (", or one value" if short else "")
         case Maps():
             return "list of maps"
         case Free():

@@ -22,7 +22,6 @@ from fogft.model.choices import (
     GroupSpec,
     MetricsSpec,
     Middleware,
-    MigrationSpec,
     OnDemandSpec,
     PlacementSpec,
     ScheduleSpec,
@@ -345,10 +344,10 @@ class PoolSpec:
         "Replicas and cap by time of the week.",
         default=None,
     )
-    migration: MigrationSpec | None = key(
-        Map(MigrationSpec, "write `migration: false`, or remove it", off=True),
+    migration: bool = key(
+        Flag(),
         "`false`: never move a replica to a cheaper or nearer location.",
-        default_factory=MigrationSpec,
+        default=True,
         advanced=True,
         usual="moves if 30 % better",
     )

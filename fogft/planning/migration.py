@@ -1,7 +1,7 @@
 """Move a replica to the location where it would be launched today, if that is much better. Pure.
 
 Only a pool that is complete and quiet moves replicas, one at a time, new before old, for the
-reasons in docs/design/planner.md. To move back, prices must swing by twice `gain`: so with steady
+reasons in docs/design/planner.md. To move back, prices must swing by twice `GAIN`: so with steady
 offers every move lowers the crowding or the sum of the scores, and moves come to an end.
 
 Not here: carrying out a move, which is a replacement like any other (`needs`, `buying`).
@@ -11,7 +11,6 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 
-from fogft.model.choices import MigrationSpec
 from fogft.model.groups import group_of
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import ReplicaId
@@ -20,6 +19,9 @@ from fogft.planning.classification import Classification
 from fogft.planning.observed.hazard import UNKNOWN
 from fogft.planning.observed.health import Assessment, Health
 from fogft.planning.placement import crowding
+
+GAIN = 0.3
+STAY_S = 600.0  # a replica that has just become ready stays for this long
 
 
 def is_quiet(machines: Classification, health: Health) -> bool:
@@ -47,8 +49,8 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
     considered here, too. Time and events do not matter, so the last answer is cached: a quiet pool
     asks the same question at every tick.
     """
-    spec, observed, rules = buyer.spec, buyer.observed, buyer.spec.migration
-    if rules is None:
+    spec, observed = buyer.spec, buyer.observed
+    if not spec.migration:
         return frozenset()
     running = [replica.machine for replica in buyer.machines.good]
     question = (
@@ -62,7 +64,7 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
     offers, asked, answer = spec.derived.get("restless", ((), None, frozenset()))
     if offers is not observed.offers or asked != question:
         good = buyer.machines.good
-        answer = frozenset(s.id for s in good if _move(buyer, rules, s, at_most=True))
+        answer = frozenset(s.id for s in good if _move(buyer, s, at_most=True))
         spec.derived["restless"] = observed.offers, question, answer
     found: frozenset[ReplicaId] = answer
     return found
@@ -70,19 +72,16 @@ def restless(buyer: Buyer) -> frozenset[ReplicaId]:
 
 def mover(buyer: Buyer, now: float, restless: Collection[ReplicaId]) -> Move | None:
     """Return the move of a quiet pool's replica that gains most; None if none should move."""
-    rules = buyer.spec.migration
-    if rules is None:
-        return None
     found = [
-        _move(buyer, rules, replica, at_most=False)
+        _move(buyer, replica, at_most=False)
         for replica in buyer.machines.good
-        if replica.id in restless and replica.was_ready_for(rules.stay_s, now)
+        if replica.id in restless and replica.was_ready_for(STAY_S, now)
     ]
     moves = [move for move in found if move is not None]
     return min(moves, key=lambda move: (move.urgency, move.replica.id), default=None)
 
 
-def _move(buyer: Buyer, rules: MigrationSpec, replica: Assessment, *, at_most: bool) -> Move | None:
+def _move(buyer: Buyer, replica: Assessment, *, at_most: bool) -> Move | None:
     """Return the move to the best location if the gain is large enough.
 
     With `at_most`: could this move, or a lesser one, be worth it if no location backed off?
@@ -107,7 +106,7 @@ def _move(buyer: Buyer, rules: MigrationSpec, replica: Assessment, *, at_most: b
         return Move(replica, why, (0.0, *there))
     score = buyer.score(placement, buyer.price(replica))
     better = 1.0 - math.exp(buyer.score(offer.placement, offer.usd_per_hour) - score)
-    if there == here and better >= rules.gain:
+    if there == here and better >= GAIN:
         why = Reason(Cause.BETTER_SCORE, location=offer.placement.location, share=better)
         return Move(replica, why, (1.0, -better))
     return None

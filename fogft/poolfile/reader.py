@@ -100,8 +100,6 @@ class Reader:
 
     def _map(self, form: keys.Map, section: Section, key: str) -> Any:
         node = section.children[key]
-        if form.off and node.value is False:
-            return None
         if form.short and not isinstance(node.value, (Mapping, tuple)) and node.value is not None:
             children = {name: Node(node.value, node.line, node.key_line) for name in form.short}
             meant = Section(section.file, key, Node(children, node.line, node.key_line))

@@ -73,10 +73,9 @@ def _form(form: Form, definitions: dict[str, Any]) -> dict[str, Any]:  # noqa: P
             return {"type": "array", "items": items, "minItems": least, "maxItems": most}
         case keys.Table(of):
             return {"type": "object", "additionalProperties": _form(of, definitions)}
-        case keys.Map(of, _, short, off):
+        case keys.Map(of, _, short):
             forms = [entry.key.form for entry in keys_of(of) if entry.name in short[:1]]
             choices = [_map(of, definitions), *(_form(one, definitions) for one in forms)]
-            choices += [{"const": False}] if off else []
             return choices[0] if len(choices) == 1 else {"anyOf": choices}
         case keys.Maps(of, _, most):
             items = _map(of, definitions)

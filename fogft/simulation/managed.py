@@ -15,6 +15,7 @@ from fogft.model.replica import LinkReport, LinkState, MachinePhase, Membership,
 from fogft.model.spec import PoolSpec
 from fogft.planning.endings import DRAIN_LIMIT_S, DRAIN_SETTLE_S
 from fogft.planning.fallback import OFTEN_S, SETTLED_S, STAYS_S, losses_of_late
+from fogft.planning.migration import STAY_S
 from fogft.planning.observed import backoff, launches
 from fogft.planning.observed.clock_jumps import Reading
 from fogft.planning.observed.hazard import EVERY_S, as_of
@@ -129,9 +130,8 @@ class Managed:
             times.append(launches.next_change(history, now))
         if tick.spec.schedule is not None:
             times.append(schedule.next_change(tick.spec.schedule, now))
-        if tick.spec.migration is not None:
+        if tick.spec.migration:
             times.append(as_of(now) + EVERY_S)
-        stay_s = tick.spec.migration.stay_s if tick.spec.migration else NEVER
         stands_in = any(is_stand_in(record.slot) for record in history.open())
         for record in history.open():
             if record.draining_since is not None:
@@ -141,7 +141,7 @@ class Managed:
                 times.append(record.launched_at + health.start_limit_s + TICK_S)
                 continue
             if (record.slot, record.generation) in restless:
-                times.append(record.first_ready_at + stay_s)
+                times.append(record.first_ready_at + STAY_S)
             if stands_in:
                 times += [at + OFTEN_S for at in losses_of_late(history, now)]
                 times += [record.first_ready_at + after_s for after_s in (SETTLED_S, STAYS_S)]

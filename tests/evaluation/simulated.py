@@ -25,7 +25,7 @@ def unavailable(
         "sim",
         (ServiceSpec("/plan", "nav_msgs/srv/GetPlan"),),
         replicas=replicas,
-        migration=None,
+        migration=False,
         health=HealthSpec(start_limit_s=3600.0),  # a boot of 20 min is none that failed
         task={"run": "plan", "resources": {"use_spot": True}},
     )

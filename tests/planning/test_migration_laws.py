@@ -7,7 +7,7 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.model.choices import MigrationSpec, OnDemandSpec
+from fogft.model.choices import OnDemandSpec
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer
 from fogft.planning import migration
@@ -20,7 +20,6 @@ from tests.planning.pool_worlds import NOW, PLACES, UID, World, applied, replica
 
 PRICES = st.sampled_from([0.02, 0.1, 0.2, 0.5])
 WANTED = st.integers(1, 4)
-RULES = st.builds(MigrationSpec, st.sampled_from([0.1, 0.3]), st.sampled_from([60.0, 3600.0]))
 ON_DEMAND = st.sampled_from([OnDemandSpec(), OnDemandSpec(1, False), OnDemandSpec(0, True)])
 
 
@@ -31,7 +30,6 @@ def quiet(draw: st.DrawFn) -> World:
         draw(WANTED),
         max_surge=draw(st.integers(0, 2)),
         max_usd_per_hour=draw(st.sampled_from([None, None, 0.5])),
-        migration=draw(RULES),
         on_demand=draw(ON_DEMAND),
     )
     sold = [
@@ -106,7 +104,7 @@ def test_what_was_planned_before_changes_no_plan(
 
 def test_calmer_places_are_moved_to_and_restless_ones_are_not_for_spread_alone() -> None:
     """Both replicas are in one zone. Ten losses in a day speak against another region."""
-    one = spec(2, migration=MigrationSpec(0.3, 60.0))
+    one = spec(2)
     here, elsewhere = PLACES[0], PLACES[-1]
     offers = tuple(Offer(place, 0.1) for place in (here, elsewhere))
     world = World(one, offers=offers).having(

@@ -14,7 +14,6 @@ from fogft.model.choices import (
     MAX_REPLICAS,
     AvailabilitySpec,
     GroupSpec,
-    MigrationSpec,
     OnDemandSpec,
     PlacementSpec,
     ScheduleSpec,
@@ -24,6 +23,7 @@ from fogft.model.groups import BLOCK
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.model.spec import PoolSpec
+from fogft.planning import migration
 from fogft.planning.availability import Assumption, Correlation, expected
 from fogft.planning.observed.history import Event, EventKind
 from tests.nightly import by_day
@@ -350,7 +350,7 @@ def test_a_lower_cap_ends_the_dearest_and_keeps_one():
 
 # -- migration -------------------------------------------------------------------------------
 
-OLD = 4000.0  # older than `stay_s`
+OLD = 4000.0  # older than `STAY_S`
 
 
 def settled(*sold: Offer, count: int = 1, **others: object) -> World:
@@ -437,7 +437,7 @@ def test_where_all_rest_the_one_resting_longest_is_tried_once_a_minute():
 
 
 def test_migration_can_be_switched_off():
-    world = settled(offer("a/r/1", 0.2), migration=None)
+    world = settled(offer("a/r/1", 0.2), migration=False)
     world = replace(world, offers=(offer("a/r/1", 0.2), offer("b/r/2", 0.01)))
     assert not world.plan().launches
 
@@ -463,7 +463,7 @@ def test_prices_that_waver_take_nobody_back(sold, count, wavers):
 
     No two offers swing apart by more than 22 %: a move that needs 30 % lowers the steady price.
     """
-    world = settled(*sold, count=count, migration=MigrationSpec(0.3, 60.0))
+    world = settled(*sold, count=count)
     world, _ = lived(world, 20, OLD)
     layouts = [sorted(ours(world))]
     for factors in wavers:
@@ -478,7 +478,7 @@ def test_prices_that_waver_take_nobody_back(sold, count, wavers):
 
 
 def test_a_waver_smaller_than_the_gain_moves_nothing():
-    world = settled(offer("a/r/1", 0.1), offer("a/r/2", 0.1), migration=MigrationSpec(0.3, 60.0))
+    world = settled(offer("a/r/1", 0.1), offer("a/r/2", 0.1))
     for cheap in (0.085, 0.115) * 10:
         sold = (offer("a/r/1", 0.2 - cheap), offer("a/r/2", cheap))
         world, launched = lived(replace(world, offers=sold), 2, OLD)
@@ -488,7 +488,7 @@ def test_a_waver_smaller_than_the_gain_moves_nothing():
 @some
 @given(st.lists(st.booleans(), min_size=4, max_size=20))
 def test_no_replica_moves_twice_within_its_stay(flips):
-    """Whatever prices do, a replica that has just moved stays for `stay_s`."""
+    """Whatever prices do, a replica that has just moved stays for `STAY_S`."""
     a, b = offer("a/r/1", 0.1), offer("a/r/2", 0.1)
     world = settled(a, b)
     moves = []
@@ -500,6 +500,4 @@ def test_no_replica_moves_twice_within_its_stay(flips):
             planned = world.plan()
             moves += [world.now] * len(planned.launches)
             world = elapsed(applied(world, planned), 100.0)
-    assert all(
-        later - before >= MigrationSpec().stay_s for before, later in itertools.pairwise(moves)
-    )
+    assert all(later - before >= migration.STAY_S for before, later in itertools.pairwise(moves))

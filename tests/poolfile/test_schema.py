@@ -46,7 +46,7 @@ def test_every_example_names_the_schema(path) -> None:
         "health: {suspect_after_s: -1}",
         "on_demand: {base: 1.5}",
         "availability: 1.5",
-        "advanced: {migration: true}",
+        "advanced: {migration: {gain: 0.1}}",
         "topics: [{name: /t, type: p/msg/T}]",
         "rmw: dds",
         "metrics: {proxy: 9464}",

@@ -7,7 +7,7 @@ from typing import Any
 
 from fogft.cloud.local.catalogue import BUILT_IN
 from fogft.cloud.local.resources import offers_for
-from fogft.model.choices import MigrationSpec, OnDemandSpec, ScheduleSpec, WindowSpec
+from fogft.model.choices import OnDemandSpec, ScheduleSpec, WindowSpec
 from fogft.model.spec import HealthSpec, PoolSpec, ServiceSpec
 from fogft.simulation.comparison import Scenario
 from fogft.simulation.market import remembered
@@ -67,7 +67,7 @@ def any_scenario(seed: int, days: float = 0.02) -> Scenario:
         schedule=among([None, ScheduleSpec("UTC", (window,), prelaunch_s=among([0.0, 600.0]))]),
         max_usd_per_hour=among([None, None, 0.25, 0.5]),
         max_surge=among([0, 1, 2]),
-        migration=among([None, MigrationSpec(among([0.1, 0.3]), stay_s=among([300.0, 3600.0]))]),
+        migration=among([False, True]),
         health=HealthSpec(start_limit_s=among([900.0, 200.0])),
     )
     timing = Timing(

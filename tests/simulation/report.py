@@ -114,7 +114,7 @@ def arithmetic_errors(*, quick: bool = False) -> Iterator[dict[str, Any]]:
                 "sim",
                 (service,),
                 replicas=replicas,
-                migration=None,
+                migration=False,
                 health=HealthSpec(start_limit_s=3600.0),  # a boot of 20 min is none that failed
                 task=task,
             )

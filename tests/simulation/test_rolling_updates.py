@@ -26,7 +26,7 @@ def make_world(seed: int, *, replicas: int | None = None, tight: bool = False) -
         max_usd_per_hour=0.1 * count + 0.05 if tight else None,
         health=HealthSpec(start_limit_s=60.0),
         task={"run": "good"},
-        migration=None,
+        migration=False,
     )
     world = World(seed, spec, PLACES[:3])
     for zone in world.cloud.zones.values():

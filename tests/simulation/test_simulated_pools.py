@@ -169,7 +169,7 @@ def test_without_correlation_the_product_of_unavailabilities_is_right(replicas):
 def test_without_correlation_a_replica_that_moves_is_down_as_reckoned():
     """P = recovery / (uptime + recovery), as long as some place has room."""
     timing = Timing(boot_s=600.0, notice_s=0.0)
-    wanted = scenario(spec(1, migration=None), model=INDEPENDENT, timing=timing, days=60.0)
+    wanted = scenario(spec(1, migration=False), model=INDEPENDENT, timing=timing, days=60.0)
     rows = [run(wanted, seed=seed)[1].outcome() for seed in range(4)]
     down = 1 - sum(o.available for o in rows) / len(rows)
     assert down == pytest.approx(moving(INDEPENDENT, timing), rel=0.15)
@@ -284,7 +284,7 @@ def test_no_region_has_more_spot_machines_than_the_quota():
 
 def test_machines_cost_what_the_hour_costs():
     """From hour 13 on all spot prices are the double: so is the bill."""
-    steady = always(scenario(spec(2, migration=None), days=1.0))
+    steady = always(scenario(spec(2, migration=False), days=1.0))
     offers = steady.find({"use_spot": True})
     prices = {
         offer.placement.location: of_changes(
