@@ -75,8 +75,7 @@ class RendezvousClient:
             self._cached = True
             self._refresh()
         self._loop = asyncio.new_event_loop()
-        self._main: asyncio.Task[None] | None = None
-        self._closing = False
+        self._main: asyncio.Task[None]
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
@@ -85,11 +84,9 @@ class RendezvousClient:
 
     def close(self) -> None:
         """End all connections and write the cache. Repeatable."""
-        if self._closing or self._thread is None or not self._thread.is_alive():
-            return
-        self._closing = True
-        self._loop.call_soon_threadsafe(self._end)
-        self._thread.join(_END_WAIT_S)
+        if self._thread is not None and self._thread.is_alive():
+            self._loop.call_soon_threadsafe(lambda: self._main.cancel())  # noqa: PLW0108 - set by then
+            self._thread.join(_END_WAIT_S)
 
     def publish(
         self,
@@ -120,8 +117,6 @@ class RendezvousClient:
     def _run(self) -> None:
         asyncio.set_event_loop(self._loop)
         self._main = self._loop.create_task(self._live())
-        if self._closing:
-            self._main.cancel()
         try:
             self._loop.run_until_complete(self._main)
         except asyncio.CancelledError:
@@ -131,10 +126,6 @@ class RendezvousClient:
         finally:
             self._save()
             self._loop.close()
-
-    def _end(self) -> None:
-        if self._main is not None:
-            self._main.cancel()
 
     async def _live(self) -> None:
         steps = [*map(self._call, self.endpoints), self._keep_cache(), self._keep_own()]
