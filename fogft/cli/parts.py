@@ -190,7 +190,7 @@ def install(
 
     Units get the current environment, so source ROS 2 first. Running processes hand over.
     """
-    where = units.services(system=system)
+    where = units.Services(system)
     wanted = _units(pool, gateway, rendezvous, system=system)
     paths = None if gateway or rendezvous else composition.paths_of(pool)
     refused = units.install(where, wanted, paths)
@@ -214,7 +214,7 @@ def install(
 @service.command(cls=Command, epilog="fogft service status")
 def status(*, system: System = False) -> None:
     """Show the units and their state."""
-    where = units.services(system=system)
+    where = units.Services(system)
     found = units.installed(where)
     for name, state in units.states(where, found).items():
         output.data(f"{name}  {state}")
@@ -231,7 +231,7 @@ def remove(
     system: System = False,
 ) -> None:
     """Stop and delete the units. Replicas keep running; `fogft up` starts a manager."""
-    where = units.services(system=system)
+    where = units.Services(system)
     if pool is not None:  # the pool may have ended
         names = list(units.names_of(pool).values())
     else:

@@ -50,10 +50,15 @@ class Unit:
 
 @dataclass(frozen=True)
 class Services:
-    """The folder of unit files and their owner: the system, or this user."""
+    """The units of the `system`, or of this user."""
 
     system: bool
-    folder: Path
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the unit files."""
+        ours = own_folder("XDG_CONFIG_HOME", "~/.config") / "systemd" / "user"
+        return SYSTEM_FOLDER if self.system else ours
 
     def systemctl(self, *words: str) -> subprocess.CompletedProcess[str]:
         """Call systemctl."""
@@ -64,13 +69,6 @@ class Services:
             )
         except FileNotFoundError:
             raise FogftError("this machine has no systemd", "start each process yourself") from None
-
-
-def services(*, system: bool) -> Services:
-    """Return where this user's units go or, with `system`, the machine's."""
-    if system:
-        return Services(True, SYSTEM_FOLDER)
-    return Services(False, own_folder("XDG_CONFIG_HOME", "~/.config") / "systemd" / "user")
 
 
 def names_of(pool: str) -> dict[str, str]:
