@@ -16,7 +16,7 @@ from fogft.model.intent import Intent
 from fogft.model.keys import only
 from fogft.model.membership import from_dict, to_dict
 from fogft.model.names import POOL_NAME_PATTERN, PoolUid
-from fogft.model.plain import Count, to_plain
+from fogft.model.plain import Count, from_plain, to_plain
 from fogft.model.replica import Membership
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.services import Discovered
@@ -193,25 +193,16 @@ def read_identity(paths: PoolPaths) -> Identity:
     return found
 
 
-@dataclass(frozen=True)
-class _Told:
-    pool: _Name
-    uid: PoolUid
-    cloud: _Name
-    file: str
-    epoch: Count
-
-
 def _told_identity(paths: PoolPaths) -> Identity | None:
     """Return the identity that the manager last wrote to its status; None for none."""
     try:
-        told = disk.read_as(_Told, paths.status)
+        told = disk.read_json(paths.status)
         created_at = (paths.credentials / "ca.crt").stat().st_mtime
-    except (StateError, OSError):
+        also = {"name": told["pool"], "created_at": created_at, "first_epoch": told["epoch"]}
+        found = from_plain(Identity, {**told, **also})
+    except (StateError, OSError, LookupError, TypeError, ValueError):  # it is missing or damaged
         return None
-    if told is None or told.pool != paths.folder.name:
-        return None
-    return Identity(told.pool, told.uid, told.cloud, told.file, created_at, told.epoch)
+    return found if found.name == paths.folder.name else None
 
 
 def write_identity(paths: PoolPaths, identity: Identity) -> None:
