@@ -78,6 +78,7 @@ def up(
     from fogft.planning.rollout import UpdateState
     from fogft.pool.commands import preview, startup, status
     from fogft.pool.commands.outcome import Awaited, Outcome
+    from fogft.pool.folder.store import digest
 
     order = preview.order(file, cloud, told=output.say)
     paths = PoolPaths.of(order.spec.name)
@@ -102,7 +103,7 @@ def up(
         awaited = Awaited(
             frozenset(service.name for service in order.spec.services),
             applied_at,
-            order.digest if replaces else "",
+            digest(order.source.encode()) if replaces else "",
         )
         seen, outcome = progress.wait(paths, awaited, limit_s)
     except KeyboardInterrupt:

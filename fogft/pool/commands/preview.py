@@ -68,11 +68,6 @@ class Preview:
         """The total price of the launches."""
         return sum(launch.offer.usd_per_hour for launch in self.launches)
 
-    @property
-    def digest(self) -> str:
-        """The digest that identifies the file's text in a pool's status."""
-        return digest(self.source.encode())
-
 
 def order(
     file: Path, cloud: str | None = None, *, told: Callable[[str], None] = lambda _: None
