@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 
 from fogft import __version__
 from fogft.model.groups import GATEWAY_SLOT
-from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import Machine, MachinePhase, Observed, Offer, ReplicaId
+from fogft.model.replica import Machine, MachinePhase, Offer, ReplicaId
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.history import History
 from fogft.planning.observed.launches import given_up
-from fogft.planning.sizing import cap_usd
+from fogft.planning.sizing import Inputs, cap_usd
 
 LOST_S = 60.0
 """A gateway is replaced when the robot's link to it was down for this many seconds."""
@@ -56,21 +55,14 @@ def resources(spec: PoolSpec) -> dict[str, Any]:
     return {**out, **spec.gateway.resources, "use_spot": False}
 
 
-def plan_gateway(
-    spec: PoolSpec,
-    intent: Intent,
-    observed: Observed,
-    history: History,
-    offers: Sequence[Offer],
-    *,
-    heard_at: float,
-) -> GatewayPlan:
+def plan_gateway(inputs: Inputs, offers: Sequence[Offer], *, heard_at: float) -> GatewayPlan:
     """Return the next step; the cloud must have answered.
 
     Args:
         offers: Suitable on-demand machines, the cheapest first.
         heard_at: When the robot's link to it was last up, or last not observed.
     """
+    spec, intent, observed, history = inputs
     here = [m for m in observed.gateway if m.id not in observed.ending]
     newest = max((m.id for m in here), default=None)
     ends, failed, host = [], set(), ""
@@ -90,7 +82,7 @@ def plan_gateway(
     step = GatewayPlan(host, tuple(ends), frozenset(failed), note=awaited)
     if observed.gateway or not spec.gateway.launch or intent.stopping:
         return step
-    offer, note = _chosen(spec, intent, observed, history, offers)
+    offer, note = _chosen(inputs, offers)
     return step._replace(launch=offer, note=note or awaited)
 
 
@@ -114,10 +106,9 @@ def _fault(
     return Reason(Cause.TIMEOUT, because=(awaited,))
 
 
-def _chosen(
-    spec: PoolSpec, intent: Intent, observed: Observed, history: History, offers: Sequence[Offer]
-) -> tuple[Offer | None, Reason | None]:
+def _chosen(inputs: Inputs, offers: Sequence[Offer]) -> tuple[Offer | None, Reason | None]:
     """Return what to buy, or why nothing is bought now."""
+    spec, intent, observed, history = inputs
     hopeless = given_up(history, version(spec), history.by_clock(intent.retried_at))
     if hopeless is not None:
         return None, hopeless

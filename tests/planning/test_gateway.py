@@ -14,6 +14,7 @@ from fogft.model.replica import Machine, MachinePhase, Observed, Offer, Placemen
 from fogft.model.topology import LaunchedGateway
 from fogft.planning.gateway import GatewayPlan, plan_gateway, resources, version
 from fogft.planning.observed.history import Event, EventKind, History
+from fogft.planning.sizing import Inputs
 from tests.planning.pool_worlds import NOW, UID, spec
 
 POOL = spec(gateway=LaunchedGateway(launch=True))
@@ -56,7 +57,8 @@ def step(
     replicas: tuple[Machine, ...] = (),
 ) -> GatewayPlan:
     observed = Observed(NOW, replicas, gateway=machines)
-    return plan_gateway(pool, intent, observed, past or History(), (CHEAP, DEAR), heard_at=heard_at)
+    inputs = Inputs(pool, intent, observed, past or History())
+    return plan_gateway(inputs, (CHEAP, DEAR), heard_at=heard_at)
 
 
 def test_the_cheapest_is_bought_and_replicas_wait_for_its_address():

@@ -10,13 +10,12 @@ from dataclasses import dataclass, field
 from fogft.cloud.port import Cloud, Launch, Seller
 from fogft.errors import FogftError, told
 from fogft.model.groups import GATEWAY_SLOT
-from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
-from fogft.model.replica import Observed, Offer
+from fogft.model.replica import Offer
 from fogft.model.spec import PoolSpec
 from fogft.planning.buying import PlannedLaunch
 from fogft.planning.gateway import LOST_S, GatewayPlan, plan_gateway, resources
-from fogft.planning.observed.history import History
+from fogft.planning.sizing import Inputs
 
 ASK_EVERY_S = 10.0
 
@@ -34,10 +33,9 @@ class LaunchedGateway:
     _looked_at: float = field(default=-math.inf, init=False)
     _watched_since: float = field(default=0.0, init=False)  # not observed before
 
-    def look(
-        self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
-    ) -> GatewayPlan:
+    def look(self, inputs: Inputs) -> GatewayPlan:
         """Return the next step. The cloud must have answered."""
+        spec, intent, observed, _ = inputs
         if observed.links is None or not 0 <= observed.now - self._looked_at < LOST_S / 2:
             self._watched_since = observed.now
         self._looked_at = observed.now
@@ -49,7 +47,7 @@ class LaunchedGateway:
         except FogftError as error:
             return GatewayPlan(note=Reason(Cause.NO_PRICES, words=told(error)))
         heard_at = max(self.up_at or 0.0, self._watched_since)
-        step = plan_gateway(spec, intent, observed, history, sold, heard_at=heard_at)
+        step = plan_gateway(inputs, sold, heard_at=heard_at)
         if step.host and spec.dial_in != spec.gateway.endpoints(step.host)[2]:
             self.place(step.host)
         return step

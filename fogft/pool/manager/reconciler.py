@@ -179,7 +179,7 @@ class Reconciler:
         trouble += [update.reason] if update is not None else []
         decided = decided._replace(notes=(*map(self._with_log, decided.notes), *trouble))
         if observed.machines is not None:
-            awaited = self._tend_gateway(spec, intent, observed, history)
+            awaited = self._tend_gateway(inputs)
             if awaited is not None:
                 decided = decided._replace(launches=(), notes=(awaited, *decided.notes))
             self._apply(identity, inputs, decided)
@@ -263,13 +263,12 @@ class Reconciler:
                     return ()
         return self._offers
 
-    def _tend_gateway(
-        self, spec: PoolSpec, intent: Intent, observed: Observed, history: History
-    ) -> Reason | None:
+    def _tend_gateway(self, inputs: Inputs) -> Reason | None:
         """Manage the gateway that the pool launches; return why replicas must wait, if so."""
+        spec, _, observed, history = inputs
         if self.gateway is None or not (spec.gateway.launch or observed.gateway):
             return None
-        step = self.gateway.look(spec, intent, observed, history)
+        step = self.gateway.look(inputs)
         cloud = self._refreshing
         is_seen = self.gateway.up_at == observed.now
         is_doubted = cloud is not None and self.gateway.is_doubted(observed.now)
