@@ -5,6 +5,7 @@ Not here: what events mean (`planning.observed.history`), and clock events (`tim
 
 import logging
 from collections.abc import Callable
+from typing import Any
 
 from fogft.model.reason import NOTICES, Cause, Reason, because
 from fogft.model.replica import Observed, ReplicaId
@@ -28,21 +29,9 @@ class EventRecorder:
         self._clock = clock
         self._faults: dict[ReplicaId, Reason] = {}  # by the last `health`
 
-    def add(
-        self,
-        kind: EventKind,
-        id: ReplicaId,
-        *,
-        location: str = "",
-        reason: Reason | None = None,
-        on_demand: bool = False,
-        version: str = "",
-    ) -> None:
-        """Add one event."""
-        at = self._clock()
-        self._store.append(
-            Event(at, kind, id.slot, id.generation, location, reason, on_demand, version=version)
-        )
+    def add(self, kind: EventKind, id: ReplicaId, **more: Any) -> None:
+        """Add one event; `more` as for `Event`."""
+        self._store.append(Event(self._clock(), kind, id.slot, id.generation, **more))
 
     def losses(self, observed: Observed) -> None:
         """Record replicas that are no longer listed. The cloud's list must be known."""
