@@ -6,6 +6,7 @@ A late write by an old manager never replaces one by its successor: see `Members
 import hashlib
 import json
 from collections.abc import Collection, Iterable
+from dataclasses import replace
 from typing import Any
 
 from fogft.errors import StateError
@@ -13,7 +14,7 @@ from fogft.model.credentials import holder_of
 from fogft.model.plain import stored, to_plain
 from fogft.model.replica import Machine, MachinePhase, Member, Membership, ReplicaId
 from fogft.model.spec import PoolSpec
-from fogft.model.topology import Topology, trouble
+from fogft.model.topology import trouble
 
 
 def members_of(
@@ -59,28 +60,20 @@ def is_newer(candidate: Membership, current: Membership | None) -> bool:
     return (candidate.epoch, candidate.version) > (current.epoch, current.version)
 
 
-def successor(
-    current: Membership | None,
-    *,
-    pool: str,
-    pool_uid: str,
-    epoch: int,
-    members: tuple[Member, ...],
-    revoked: Collection[str] = (),
-    topology: Topology | None = None,
-) -> Membership | None:
-    """Return the next membership to write; None if nothing changes or a newer manager wrote."""
-    topology = topology or Topology()
-    if current is None or current.pool_uid != pool_uid:
-        return Membership(pool, pool_uid, epoch, 1, members, frozenset(revoked), topology)
-    if epoch < current.epoch:
+def successor(current: Membership | None, wanted: Membership) -> Membership | None:
+    """Return `wanted`, or a later version of it, to write after `current`.
+
+    None if nothing changes, or a newer manager wrote.
+    """
+    if current is None or current.pool_uid != wanted.pool_uid:
+        return wanted
+    if wanted.epoch < current.epoch:
         return None  # a manager that was replaced writes nothing
-    all_revoked = current.revoked | frozenset(revoked)
-    now = (current.members, current.revoked, current.topology)
-    if epoch == current.epoch and (members, all_revoked, topology) == now:
-        return None
-    version = current.version + 1 if epoch == current.epoch else 1
-    return Membership(pool, pool_uid, epoch, version, members, all_revoked, topology)
+    wanted = replace(wanted, revoked=current.revoked | wanted.revoked)
+    if wanted.epoch > current.epoch:
+        return wanted
+    same = replace(wanted, version=current.version) == current
+    return None if same else replace(wanted, version=current.version + 1)
 
 
 def to_dict(membership: Membership) -> dict[str, Any]:

@@ -96,7 +96,7 @@ def test_successor_is_newer_or_nothing(
     current: Membership, epoch: int, new: tuple[Member, ...]
 ) -> None:
     """A manager in office writes only what is newer; one out of office writes nothing."""
-    after = memberships.successor(current, pool="pool", pool_uid=UID, epoch=epoch, members=new)
+    after = memberships.successor(current, Membership("pool", UID, epoch, 1, new))
     if epoch < current.epoch:
         assert after is None
     elif after is None:
@@ -109,7 +109,7 @@ def test_successor_is_newer_or_nothing(
 def test_a_new_manager_shows_itself_even_if_nothing_changed() -> None:
     """A higher epoch is written once, so that proxies fence off the old manager."""
     current = Membership("pool", UID, 1, 5, ())
-    after = memberships.successor(current, pool="pool", pool_uid=UID, epoch=2, members=())
+    after = memberships.successor(current, Membership("pool", UID, 2, 1, ()))
     assert after == Membership("pool", UID, 2, 1, ())
 
 
@@ -144,9 +144,7 @@ def test_a_revocation_is_never_taken_back(
     current: Membership, epoch: int, new: tuple[Member, ...], more: frozenset[str]
 ) -> None:
     """Whoever writes next, with whatever in mind: what was revoked stays revoked."""
-    after = memberships.successor(
-        current, pool="pool", pool_uid=UID, epoch=epoch, members=new, revoked=more
-    )
+    after = memberships.successor(current, Membership("pool", UID, epoch, 1, new, more))
     if after is not None:
         assert after.revoked == current.revoked | more
     else:

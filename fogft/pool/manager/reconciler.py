@@ -348,15 +348,11 @@ class Reconciler:
             revoked=revoked,
             by_hand=by_hand,
         )
-        membership = successor(
-            self._membership,
-            pool=identity.name,
-            pool_uid=identity.uid,
-            epoch=self.epoch,
-            members=members,
-            revoked=revoked,
-            topology=certified(spec.topology, gateways) if spec.topology else None,
+        topology = certified(spec.topology, gateways)
+        wanted = Membership(
+            identity.name, identity.uid, self.epoch, 1, members, revoked, topology=topology
         )
+        membership = successor(self._membership, wanted)
         if membership is not None:
             self.store.write_membership(membership)
             self._membership = membership
