@@ -159,7 +159,8 @@ class PendingRequests:
                 return (), pending.alone_until
             room = 1
         elif now < self._cautious_until and pending.open:
-            waited = now >= max(pending.open.values()) + _SPREADS_AFTER_S
+            last = max(pending.open.values())
+            waited = now >= min(last + _SPREADS_AFTER_S, (last + pending.deadline) / 2)
             room = (room if waited else self._most_at_once(able)) - len(pending.open)
             candidates = candidates[: max(0, room)]
         elif not candidates:

@@ -454,6 +454,16 @@ def test_after_a_death_two_replicas_are_left_out_of_each_request_for_a_while():
     assert list(requests.begin(b"d" * 16, b"x", (1,), deadline=999.0, now=1.0)) == [1], "the only"
 
 
+def test_one_replica_keeps_a_request_from_the_others_for_half_its_time_at_most():
+    """After a death, too: a short time-out must not depend on the only replica that was asked."""
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests.begin(A, b"x", (1, 2, 3), deadline=999.0, now=0.0)
+    requests.refused(A, 1, Refusal.CRASHED, 0.0)
+    assert list(requests.begin(B, b"x", (1, 2, 3), deadline=2.0, now=1.0)) == [1]
+    assert (B, 3) not in requests.more((1, 2, 3), 1.4, newest_first=False)
+    assert (B, 3) in requests.more((1, 2, 3), 1.5, newest_first=False)
+
+
 def test_a_restarted_subject_voids_what_was_said_of_its_requests_only():
     requests, _ = made((1,))
     requests.begin(B, b"other", (1,), deadline=10.0, now=0.0)
