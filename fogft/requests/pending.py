@@ -241,10 +241,12 @@ class PendingRequests:
             means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
             return means, None, (), Verdict.LATE
+        if pending is not None and (died := pending.died_at - {replica}):
+            # If only one died, it is rather the cause: another has survived the request.
+            pending.deaths = min(pending.deaths, len(died) - 1)
+            for other in died:
+                self._alarms.was_false(other, now)
         if means is Means.SUCCESS and pending is not None and now < pending.deadline:
-            if pending.died_at:
-                for other in pending.died_at - {replica}:
-                    self._alarms.was_false(other, now)
             open = pending.open
             self.choose.answered(request, open, replica, load, now)
             losers = [other for other in open if other != replica] if len(open) > 1 else ()

@@ -464,6 +464,30 @@ def test_one_replica_keeps_a_request_from_the_others_for_half_its_time_at_most()
     assert (B, 3) in requests.more((1, 2, 3), 1.5, newest_first=False)
 
 
+def test_any_answer_of_another_replica_clears_a_request_and_disproves_a_crash():
+    """An answer that decides nothing shows it, too: of a quorum, no single one does."""
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
+    deaths = []
+    for number in range(FALSE_ALARMS + 1):
+        id, now = bytes([number]) * 16, number * ALARM_S
+        requests.begin(id, b"x", (1, 2, 3), deadline=999.0, now=now)
+        requests.refused(id, 1, Refusal.CRASHED, now)
+        deaths.append(requests.get(id).deaths)
+        requests.attempt(id, 2, now)
+        requests.answered(id, id, 2, NO, False, None, now)
+        assert not requests.get(id).deaths, "it need not run alone any more"
+    assert deaths == [1] * FALSE_ALARMS + [0], "at last, it is not believed"
+
+
+def test_what_several_died_over_stays_suspect_though_another_answers():
+    requests = PendingRequests(All(), Spy(), counts_deaths=True)
+    requests.begin(A, b"x", (1, 2, 3), deadline=999.0, now=0.0)
+    for replica in (1, 2):
+        requests.refused(A, replica, Refusal.CRASHED, 0.0)
+    answer(requests, 3, NO)
+    assert requests.get(A).deaths == 1
+
+
 def test_a_restarted_subject_voids_what_was_said_of_its_requests_only():
     requests, _ = made((1,))
     requests.begin(B, b"other", (1,), deadline=10.0, now=0.0)
