@@ -137,9 +137,9 @@ def up(
 
 
 def services_at_fault(status: PoolStatus) -> list[str]:
-    """Return the services without a ready replica; if types differ, only those that differ."""
+    """Return the services that do not answer; if types differ, only those that differ."""
     differing = {name for one in status.replicas for name in one.differing}
-    return sorted(differing) or [one.name for one in status.services if not one.ready_replicas]
+    return sorted(differing) or [one.name for one in status.services if not one.answers]
 
 
 def _not_updated(status: PoolStatus) -> FogftError:

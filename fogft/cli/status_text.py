@@ -131,6 +131,9 @@ def notes(status: PoolStatus) -> list[Text]:
         order = row.counters.get("order") or {}
         if order.get("trouble"):
             found.append(f"`{row.name}` is unavailable: {order['trouble']}")
+        if row.ready_replicas and not row.answers:
+            quorum = row.counters["quorum"]
+            found.append(f"`{row.name}`: its `quorum` is {quorum}, and fewer replicas are ready")
         needed = row.counters.get("needed_replicas")
         if needed:
             found.append(
@@ -225,7 +228,7 @@ def _of_service(row: ServiceStatus, links_known: bool) -> list[str | Text]:
     unanswered = sum(count.get(key, 0) for key in ("silent", "empty", "turned_away", "poison"))
     return [
         row.name,
-        cell(ready, "" if row.ready_replicas else "bold red"),
+        cell(ready, "" if row.answers else "bold red"),
         number(count.get("received", 0)),
         number(count.get("answered", 0)),
         number(count.get("fallback", 0)),

@@ -398,8 +398,8 @@ class FallbackSpec:
     )
     while_none_ready: bool = key(
         Flag(),
-        "Call it at once while no replica is ready. The robot then sees the service from the "
-        "start.",
+        "Call it at once while too few replicas are ready. The robot then sees the service from "
+        "the start.",
         default=False,
     )
     limit_s: float = 1.0  # how long past the deadline its answer is awaited

@@ -86,6 +86,7 @@ class Decide:
     """
 
     flagged: Collection[int] = ()  # replicas whose answers do not count any more
+    quorum = 1  # replicas that must agree on an answer
     # `replicates`: replicas get more than single requests, so `request_of`, `reach`, `take` and
     # `declined` are called. `sends_requests`: requests are sent by `take` too, not by the policy.
     replicates = False

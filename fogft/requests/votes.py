@@ -33,7 +33,7 @@ class Quorum(Decide):
         super().__init__()
         self.flagged: set[int] = set()
         self.disagreed: dict[int, int] = {}
-        self._quorum = quorum
+        self.quorum = quorum
         self._agree = agree
         self._read = read
         self._newly_flagged = newly_flagged
@@ -62,7 +62,7 @@ class Quorum(Decide):
             return Means.UNDECIDED
         # Compare only once: comparing large answers blocks the receiving thread.
         agreeing = {r for r, it in ballots.items() if it is reading or self._agree(it, reading)}
-        if len(agreeing - self.flagged) < self._quorum:
+        if len(agreeing - self.flagged) < self.quorum:
             return Means.UNDECIDED
         del self._open[id]
         self._final[id] = reading
@@ -91,5 +91,6 @@ class Quorum(Decide):
         return request in self._final
 
     def report(self) -> dict[str, Any]:
-        """Return how often each replica disagreed, by ``slot.generation``."""
-        return {"disagreed": {short(key): n for key, n in self.disagreed.items()}}
+        """Return the quorum, and how often each replica disagreed, by ``slot.generation``."""
+        disagreed = {short(key): n for key, n in self.disagreed.items()}
+        return {"quorum": self.quorum, "disagreed": disagreed}

@@ -64,6 +64,17 @@ def test_a_client_that_gets_no_answers_is_told():
     assert troubles(replace(STATUS, services=(service,))) == ["a client runs on another"]
 
 
+def test_a_service_with_fewer_ready_replicas_than_its_quorum_does_not_answer():
+    link = LinkReport(ReplicaId(UID, 0, 1), LinkState.UP, frozenset({"/plan"}))
+    for quorum, answers in ((1, True), (2, False)):
+        report = ProxyReport(1, 5.0, links=(link,), services={"/plan": {"quorum": quorum}})
+        status = replace(STATUS, observed_at=5.0)
+        seen = current(status, report, manager_alive=True, proxy_alive=True, now=5.0)
+        assert seen.answers is answers
+        assert ("its `quorum` is 2, and fewer" in str(notes(seen.status))) is not answers
+        assert services_at_fault(seen.status) == ([] if answers else ["/plan"])
+
+
 def test_only_services_whose_type_differs_are_named():
     """The others wait for the same replicas, and nothing is wrong with them."""
     replica = replace(REPLICA, differs=True, differing=("/odd",), detail="`a/srv/B` differs")

@@ -68,14 +68,14 @@ class Awaited:
         )
 
     def is_answering(self, seen: Seen) -> bool:
-        """Whether every service has a ready replica and a client proxy."""
+        """Whether every service has enough ready replicas and a client proxy."""
         status = seen.status
         if status.observed_at < self.since:
             return False
         if status.cloud_reachable and not status.target:  # its schedule wants no replica now
             return True
         names = {service.name for service in status.services}
-        ready = {service.name for service in status.services if service.ready_replicas}
+        ready = {service.name for service in status.services if service.answers}
         return status.proxy_alive and bool(ready) and names == (self.services or ready) == ready
 
 

@@ -101,7 +101,7 @@ def current(
     found = status.joined(report, proxy_alive=proxy_alive, links=links, stale=seen.stale)
     found = replace(found, uplink_suspected=fresh is not None and fresh.uplink_suspected)
     services = found.services
-    silent = [one.name for one in services if not one.ready_replicas]
+    silent = [one.name for one in services if not one.answers]
     hangs = proxy_alive and fresh is None
     answers = None if hangs or not services else proxy_alive and not silent
     return replace(seen, status=found, answers=answers, unanswered=() if hangs else silent)

@@ -51,6 +51,7 @@ class Counted:
     response_bytes: Count = 0
     pending: Count = 0
     needed_replicas: Count = 0
+    quorum: Count = 1
     poisoned_at: Moment | None = None
     p50_s: Seconds | None = None
     p99_s: Seconds | None = None

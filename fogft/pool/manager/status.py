@@ -143,6 +143,11 @@ class ServiceStatus:
     ready_replicas: int = 0
     counters: Counters = field(default_factory=dict)
 
+    @property
+    def answers(self) -> bool:
+        """Whether enough replicas answer: one, or its `quorum`."""
+        return self.ready_replicas >= int(self.counters.get("quorum", 1))
+
 
 @dataclass(frozen=True)
 class TopicStatus:

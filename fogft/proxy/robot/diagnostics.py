@@ -109,6 +109,8 @@ class Diagnosis:
         troubles = [f"{n} {_TROUBLES[key]}" for key, n in lately.items()]
         if not ready:
             level, message = Level.ERROR, "no replica can answer"
+        elif ready < (quorum := report.get("quorum", 1)):
+            level, message = Level.ERROR, f"{ready} of {quorum} replicas that must agree can answer"
         elif report.get("trouble"):
             level, message = Level.ERROR, str(report["trouble"])
         elif troubles:

@@ -120,7 +120,8 @@ class Dispatcher:
     def able(self) -> bool:
         """Whether a request that arrives now can be answered."""
         if not self._decide.sends_requests:
-            return bool(self._sender.able)
+            counted = set(self._sender.able).difference(self._decide.flagged)
+            return len(counted) >= self._decide.quorum
         with self._lock:  # a thread taking a request may start a term and claim replicas
             return self._decide.ready
 
@@ -159,7 +160,7 @@ class Dispatcher:
             soon = min(requests.choose.look_at, deadline)
             if requests.fallback is not None and self._ledger.spec.fallback is not None:
                 requests.fallback.submitted(request, now)
-                soon = min(soon, requests.fallback.look_at(able=bool(able)))
+                soon = min(soon, requests.fallback.look_at(able=self.able))
             if requests.size() == 1:
                 self._next_look, self._usual_s = soon, soon - now
             self._next_look, self._asked_at = min(self._next_look, soon), now

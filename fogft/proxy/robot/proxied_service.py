@@ -67,7 +67,7 @@ class ProxiedService:
         elif not self._wanted and self.server is not None:
             server, self.server = self.server, None
             server.close()
-            log.warning("service_withdrawn service=%s reason='no replica can answer'",
+            log.warning("service_withdrawn service=%s reason='too few replicas can answer'",
                         self.spec.name)  # fmt: skip
         elif self.server is not None and now > self._looked_at + _LOOK_EVERY_S:
             self._looked_at = now

@@ -56,6 +56,7 @@ def test_a_whole_pool_is_ok_and_says_who_answers_and_how_fast():
         (report(link(0, state="connecting", ready=[])), "service /plan", Level.ERROR),
         (report(), "service /plan", Level.ERROR),
         (report(link(0), link(1), uplink=True), "pool", Level.ERROR),
+        (report(link(0), link(1), quorum=3), "service /plan", Level.ERROR),
     ],
 )
 def test_what_is_down_is_an_error_and_the_pool_is_as_bad_as_its_services(told, worst, pool):

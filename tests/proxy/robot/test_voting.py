@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 
 from fogft.errors import RosError
+from fogft.model.choices import FallbackSpec
 from fogft.model.refusal import Refusal
 from fogft.model.spec import OnTimeout, ServiceSpec
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.sending import key_of
 from fogft.requests.votes import Quorum
 from fogft.ros import environment
-from tests.fakes.proxy import Clock, FakeLink
+from tests.fakes.proxy import Clock, FakeClient, FakeLink
 from tests.proxy.by_hand import LIMIT_S, ROOT, Parts, wait_for
 
 pytestmark = pytest.mark.timeout(180)
@@ -32,12 +33,13 @@ def number(payload: bytes) -> float:
 class Scene:
     def __init__(self, links: int = 3, **spec: object) -> None:
         self.clock, self.responses = Clock(), []
+        self.votes = Quorum(2, number, operator.eq)
         self.dispatcher = Dispatcher(
             ServiceSpec("/s", "std_srvs/srv/SetBool", timeout_s=5.0, quorum=2, **spec),
             lambda handle, payload: self.responses.append((handle, payload)),
             empty_response=b"empty",
             clock=self.clock,
-            decide=Quorum(2, number, operator.eq),
+            decide=self.votes,
         )
         self.links = [FakeLink(slot) for slot in range(links)]
         self.dispatcher.route(self.links)
@@ -71,6 +73,24 @@ def test_a_slow_liar_is_heard_out_and_flagged():
         False,
         True,
     ]
+
+
+def test_fewer_replicas_than_must_agree_are_as_good_as_none():
+    """The service is withdrawn, or its fallback asked at once. A flagged one does not count."""
+    scene = Scene(1, fallback=FallbackSpec("/local", while_none_ready=True))
+    local = FakeClient()
+    scene.dispatcher.adopt(scene.dispatcher.spec, local)
+    assert not scene.dispatcher.able
+    scene.dispatcher.submit(b"q", "h")
+    scene.dispatcher.tick()
+    assert len(local.calls) == 1
+    scene.links += [FakeLink(1), FakeLink(2)]
+    for links, able in ((scene.links[:2], True), (scene.links[1:], True), (scene.links[2:], False)):
+        scene.dispatcher.route(links)
+        assert scene.dispatcher.able is able
+    scene.votes.flagged.add(key_of(scene.links[2]))
+    scene.dispatcher.route(scene.links[1:])
+    assert not scene.dispatcher.able
 
 
 @pytest.mark.parametrize("on_timeout", [OnTimeout.SILENT, OnTimeout.EMPTY])
