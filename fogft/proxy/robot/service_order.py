@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 
 # An order is not abandoned at its caller's deadline: it must still be applied.
 _ATTEMPT_S = 60.0
+_DEPOSED_LIMIT = 3  # terms ended by others without an answer: they will go on
 
 
 class ServiceOrder(Decide):
@@ -51,6 +52,7 @@ class ServiceOrder(Decide):
         self._numbers: dict[bytes, int] = {}
         self._waiting: dict[bytes, bytes] = {}  # not numbered yet; oldest first
         self._told = ""
+        self._deposed = 0  # terms ended by others since the last answer
         self._term = self._begin_term()
 
     def _begin_term(self, above: int = 0, begin: Handover | None = None) -> Sequencer:
@@ -91,6 +93,11 @@ class ServiceOrder(Decide):
             )
         if self._term.stranded:
             return "no reachable replica has the state; see docs/design/state.md"
+        if self._deposed >= _DEPOSED_LIMIT:
+            return (
+                "another client proxy keeps ordering its requests with this robot's certificate; "
+                "end it, or give that robot its own: see docs/how-to/several-robots.md"
+            )
         return ""
 
     # -- callers' requests ----------------------------------------------------------------
@@ -144,6 +151,7 @@ class ServiceOrder(Decide):
             self.refused(id, replica, Refusal.MALFORMED, "", pending)
             return Refusal.MALFORMED
         if answers:
+            self._deposed = 0
             self._mark.write(term.mark, term.active.version or "")
         self._wake_if_due()
         if answers:
@@ -219,6 +227,7 @@ class ServiceOrder(Decide):
     def _tick(self, now: float) -> None:
         if self._term.deposed_by is not None:  # by a term of ours that is not in the mark's file
             above = self._term.deposed_by
+            self._deposed += 1
             log.warning("term_ended service=%s obeyed=%x", self._name, above)
             self._term = self._begin_term(above)
             self._reach(now)

@@ -513,6 +513,26 @@ def test_an_order_of_another_robot_is_refused(scene):
     assert scene.dispatcher.able
 
 
+def test_two_proxies_with_one_certificate_say_why_they_answer_nothing(tmp_path):
+    scene, twin = Scene(tmp_path, replicas=1), Scene(tmp_path / "twin", replicas=1)
+    twin.responders, twin.clients = scene.responders, scene.clients
+    scene.rounds = twin.rounds = 5
+    for _ in range(20):
+        scene.run()
+        twin.run()
+    for one in (scene, twin):
+        assert "this robot's certificate" in one.dispatcher.report()["order"]["trouble"]
+    while calls := scene.clients[0].snapshot.calls:
+        calls.pop()[1](b"state")
+        scene.run()
+    scene.dispatcher.submit(b"q", "h")
+    scene.run()
+    scene.serve(0, b"a")
+    scene.run()
+    assert scene.responses == [("h", b"a")]
+    assert not scene.dispatcher.report()["order"]["trouble"], "the other one has ended"
+
+
 @pytest.mark.parametrize("op", [op for op in Op if op is not Op.CLAIM])
 def test_who_knows_the_term_of_another_robot_can_neither_order_nor_read(scene, op):
     scene.run()
