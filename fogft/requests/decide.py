@@ -85,7 +85,7 @@ class Decide:
     override the rest.
     """
 
-    flagged: Collection[int] = ()  # replicas whose answers do not count any more
+    flagged: Collection[int] = ()  # replicas whose answers do not count, nor are read, any more
     quorum = 1  # replicas that must agree on an answer
     # `replicates`: replicas get more than single requests, so `request_of`, `reach`, `take` and
     # `declined` are called. `sends_requests`: requests are sent by `take` too, not by the policy.

@@ -49,6 +49,8 @@ class Quorum(Decide):
         self, id: bytes, replica: int, payload: bytes, reading: Any, pending: Pending | None
     ) -> Judgement:
         """Take a vote: SUCCESS if it completes a quorum. Flagged replicas do not count."""
+        if replica in self.flagged:  # its answer was not read
+            return Means.UNDECIDED
         if id in self._final:
             self._judge(replica, agrees=self._agree(reading, self._final[id]))
             return Means.UNDECIDED
@@ -58,8 +60,6 @@ class Quorum(Decide):
         if replica in ballots:
             return Means.UNDECIDED  # a duplicate: each replica has one vote
         ballots[replica] = reading
-        if replica in self.flagged:
-            return Means.UNDECIDED
         # Compare only once: comparing large answers blocks the receiving thread.
         agreeing = {r for r, it in ballots.items() if it is reading or self._agree(it, reading)}
         if len(agreeing - self.flagged) < self.quorum:

@@ -219,7 +219,8 @@ class Dispatcher:
         request = decide.request_of(attempt) if decide.replicates else attempt
         try:
             fault = "" if request is None else self._fault_of(payload)
-            reading = None if fault else decide.takes_any or decide.read(payload)
+            unread = fault or replica in decide.flagged
+            reading = None if unread else decide.takes_any or decide.read(payload)
         except RosError as error:
             fault = error.message
         if fault:  # no response of this type

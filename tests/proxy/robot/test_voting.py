@@ -93,6 +93,18 @@ def test_fewer_replicas_than_must_agree_are_as_good_as_none():
     assert not scene.dispatcher.able
 
 
+def test_what_a_flagged_replica_answers_is_not_read():
+    """It may be large, and take seconds."""
+    scene = Scene()
+    scene.votes.flagged.add(key_of(scene.links[2]))
+    scene.dispatcher.submit(b"q", "h")
+    scene.answer(2, b"noise")
+    scene.answer(0, b"7")
+    scene.answer(1, b"7")
+    assert scene.responses == [("h", b"7")]
+    assert not scene.dispatcher.report()["refused"]
+
+
 @pytest.mark.parametrize("on_timeout", [OnTimeout.SILENT, OnTimeout.EMPTY])
 def test_without_agreement_the_deadline_decides(on_timeout):
     scene = Scene(2, on_timeout=on_timeout)
