@@ -14,7 +14,6 @@ from collections.abc import Callable
 from typing import Any
 
 _STEP_S = 2.0
-ENDING_SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 
 def start_log() -> None:
@@ -104,10 +103,16 @@ def on_thread(run: Callable[..., object], *arguments: Any, name: str = "") -> th
     return thread
 
 
+def ending_signals() -> list[signal.Signals]:
+    """Return the signals that end this process: SIGTERM, SIGINT and, except under nohup, SIGHUP."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [signal.SIGTERM, signal.SIGINT, *([] if ignored else [signal.SIGHUP])]
+
+
 def stop_on_signal() -> threading.Event:
-    """Return an event that SIGTERM, SIGINT and SIGHUP set."""
+    """Return an event that `ending_signals` set."""
     stop = threading.Event()
-    for number in ENDING_SIGNALS:
+    for number in ending_signals():
         signal.signal(number, lambda *_: stop.set())
     return stop
 

@@ -184,6 +184,25 @@ def test_what_a_start_made_is_not_looked_through_again():
         gc.enable()
 
 
+_SURVIVES = """
+import os, signal
+from fogft.process import stop_on_signal
+
+stop = stop_on_signal()
+os.kill(os.getpid(), signal.SIGHUP)
+print(stop.is_set())
+os.kill(os.getpid(), signal.SIGTERM)
+print(stop.is_set())
+"""
+
+
+@pytest.mark.parametrize("nohup", [False, True])
+def test_a_closed_terminal_ends_a_process_except_under_nohup(nohup: bool) -> None:
+    words = [*(["nohup"] if nohup else []), sys.executable, "-c", _SURVIVES]
+    ended = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
+    assert ended.stdout.split() == [str(not nohup), "True"]
+
+
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 imports from there first")
 def test_our_processes_import_nothing_from_the_current_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

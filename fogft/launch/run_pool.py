@@ -18,8 +18,8 @@ from fogft.child import python, tied
 from fogft.errors import FogftError, StateError
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
+from fogft.process import ending_signals
 
-_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _LOGS_AGAIN_S = 5
 _PR_SET_PDEATHSIG = 1
 READY = "fogft_pool_ready"  # a line on stdout for the launch file
@@ -34,7 +34,8 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--timeout")
     parser.add_argument("--down", action="store_true")
     asked = parser.parse_args(arguments)
-    for number in _ENDING:
+    ending = ending_signals()
+    for number in ending:
         signal.signal(number, signal.default_int_handler)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)  # even if it is killed
     status = 0
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str]) -> int:
     except KeyboardInterrupt:
         pass
     finally:
-        for number in _ENDING:
+        for number in ending:
             signal.signal(number, signal.SIG_IGN)  # launch resends it while `down` runs
         if asked.down and _is_ours(asked):
             status = _fogft("down", asked.pool, "--yes").wait()

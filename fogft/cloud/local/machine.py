@@ -24,7 +24,7 @@ from fogft.errors import FogftError, StateError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
-from fogft.process import ENDING_SIGNALS, start_log
+from fogft.process import ending_signals, start_log
 from fogft.reason_words import words
 from fogft.ros.reservations import Reservation, own_domain, reserve_domain, reserve_port
 
@@ -88,7 +88,7 @@ class Machine:
         """Run the machine to its end. Leaves a FAILED state if it could not run."""
         self._say(State(MachinePhase.PROVISIONING, progress="booting"))
         self._guard = processes.start(lambda: self._end_the_rest(set()))
-        for number in ENDING_SIGNALS:
+        for number in ending_signals():
             signal.signal(number, self._on_signal)
         try:
             workdir = self._boot()

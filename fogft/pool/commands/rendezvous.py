@@ -16,7 +16,7 @@ from fogft.metrics.scrape import Scrape
 from fogft.model.proxy_config import RendezvousConfig
 from fogft.pool.manager.tally import of_rendezvous
 from fogft.poolfile import config_file
-from fogft.process import ENDING_SIGNALS, Watchdog, notify, start_log
+from fogft.process import Watchdog, ending_signals, notify, start_log
 from fogft.records import cache
 from fogft.records.exchange import Exchange
 from fogft.records.record_set import RecordSet
@@ -52,7 +52,7 @@ class _Rendezvous:
     async def live(self) -> None:
         loop = asyncio.get_running_loop()
         stop = asyncio.Event()
-        for number in ENDING_SIGNALS:
+        for number in ending_signals():
             loop.add_signal_handler(number, stop.set)
         self._server.bind()
         log.info("rendezvous_listening endpoint=%s pid=%d", self._server.endpoint, os.getpid())
