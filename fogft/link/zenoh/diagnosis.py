@@ -2,8 +2,8 @@
 
 After a failure only, connects to the endpoint again with plain TCP and TLS.
 
-A certificate is valid from 24 hours before it was issued. So if one is "not yet valid", the
-issuer's clock is over a day ahead of the verifier's, which TLS's own message does not say.
+If a certificate is "not yet valid", the issuer's clock was ahead of the verifier's, which TLS's
+own message does not say.
 """
 
 import contextlib

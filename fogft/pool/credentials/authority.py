@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 AUTHORITY_CERTIFICATE = "ca.crt"
 AUTHORITY_KEY = "ca.key"
-AUTHORITY_DAYS = 3650.0
 # A dead manager renews nothing, and must not stop traffic: a leaf outlasts any repair.
 LEAF_DAYS = 365.0
 RENEW_BEFORE = datetime.timedelta(days=60)
-# Robots' clocks may be slow, and a certificate that is not valid yet by their clock is refused.
-BACKDATE = datetime.timedelta(hours=24)
+# Clocks may be wrong, and set later: no certificate is "not valid yet", and the CA never expires.
+BEGIN = datetime.datetime(1970, 1, 1, tzinfo=datetime.timezone.utc)
+NEVER = datetime.datetime(9999, 12, 31, 23, 59, 59, tzinfo=datetime.timezone.utc)
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def create_authority(folder: Path, pool_uid: str) -> None:
         _load_authority(folder)
         return
     disk.make_folder(folder)
-    certificate, key = _made(f"fogft.{pool_uid}", role=None, days=AUTHORITY_DAYS, issuer=None)
+    certificate, key = _made(f"fogft.{pool_uid}", role=None, not_after=NEVER, issuer=None)
     # The key first: a crash in between leaves no certificate, so the next call begins again.
     disk.write_whole(folder / AUTHORITY_KEY, key)
     disk.write_whole(folder / AUTHORITY_CERTIFICATE, certificate)
@@ -80,7 +80,9 @@ def create_authority(folder: Path, pool_uid: str) -> None:
 
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
     """Certify a new key under a name of 1 to 64 characters, for `days` or until the CA expires."""
-    certificate, key = _made(common_name, role=role, days=days, issuer=_load_authority(folder))
+    issuer, now = _load_authority(folder), datetime.datetime.now(datetime.timezone.utc)
+    not_after = min(now + datetime.timedelta(days=days), issuer[0].not_valid_after_utc)
+    certificate, key = _made(common_name, role=role, not_after=not_after, issuer=issuer)
     return Credential(certificate, key, (folder / AUTHORITY_CERTIFICATE).read_bytes())
 
 
@@ -128,7 +130,7 @@ def _made(
     common_name: str,
     *,
     role: Role | None,
-    days: float,
+    not_after: datetime.datetime,
     issuer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None,
 ) -> tuple[bytes, bytes]:
     """Make a certificate and its key, both PEM; the CA's own if role and issuer are None."""
@@ -144,12 +146,9 @@ def _made(
             x509.NameAttribute(x509.NameOID.COMMON_NAME, common_name),
         ]
     )
-    now = datetime.datetime.now(datetime.timezone.utc)
-    not_after = now + datetime.timedelta(days=days)
     signer, issued_by = key, subject
     if issuer is not None:
         signer, issued_by = issuer[1], issuer[0].subject
-        not_after = min(not_after, issuer[0].not_valid_after_utc)
     identifier = x509.SubjectKeyIdentifier.from_public_key(signer.public_key())
     usage = x509.KeyUsage(
         digital_signature=role is not None,
@@ -168,7 +167,7 @@ def _made(
         .issuer_name(issued_by)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - BACKDATE)
+        .not_valid_before(BEGIN)
         .not_valid_after(not_after)
         .add_extension(x509.BasicConstraints(ca=role is None, path_length=None), critical=True)
         .add_extension(

@@ -132,6 +132,10 @@ def test_no_certificate_is_refused(
     assert _heard_nothing(replica)
 
 
+def _in_days(count: int) -> datetime.datetime:
+    return datetime.datetime.now(datetime.timezone.utc) + datetime.timedelta(days=count)
+
+
 @pytest.mark.parametrize(
     ("begin", "end", "words"), [(1, 2, "not valid before"), (-2, -1, "expired at")]
 )
@@ -145,8 +149,7 @@ def test_a_replica_out_of_its_time_is_refused(
     words: str,
 ) -> None:
     """The words tell which of both it is: the robot's clock may be the one that is wrong."""
-    day = datetime.timedelta(days=1)
-    monkeypatch.setattr(credentials, "BACKDATE", -begin * day)
+    monkeypatch.setattr(credentials, "BEGIN", _in_days(begin))
     name = peer("").id.certificate_name
     replica = start_replica(files=authority.issue(name, Role.REPLICA, days=end))
     link = dial(replica.endpoint)
@@ -170,7 +173,7 @@ def test_a_robot_out_of_its_time_is_told_whose_clock_it_is(
 ) -> None:
     """The replica refuses it; by our own clock we see why."""
     replica = start_replica()
-    monkeypatch.setattr(credentials, "BACKDATE", -begin * datetime.timedelta(days=1))
+    monkeypatch.setattr(credentials, "BEGIN", _in_days(begin))
     name = certificate_names.robot(POOL_UID, "robot")
     link = dial(replica.endpoint, files=authority.issue(name, Role.ROBOT, days=end))
     _refused(link, words)
