@@ -10,6 +10,7 @@ import sys
 import zipfile
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,17 @@ def test_the_alternative_that_sells_the_placement_gives_its_own_fields():
     west = built(asked, WEST)["resources"]
     assert (west["image_id"], west["disk_size"], west["labels"]["team"]) == ("ami-west", 50, "b")
     assert built(asked, EAST)["resources"]["image_id"] == "ami-east"
+
+
+def test_an_on_demand_stand_in_keeps_what_its_spot_alternative_asks_for():
+    east, west = ({"infra": f"aws/{region}"} for region in ("us-east-1", "us-west-2"))
+    spot = {"image_id": "ami-west", "disk_size": 50, "use_spot": True}
+    asked = {"resources": {"any_of": [east, {**west, **spot}]}}
+    stand_in = built(asked, replace(WEST, spot=False))["resources"]
+    assert {key: stand_in[key] for key in spot} == {**spot, "use_spot": False}
+    asked["resources"]["any_of"].append({**west, "image_id": "ami-on-demand"})
+    assert built(asked, replace(WEST, spot=False))["resources"]["image_id"] == "ami-on-demand"
+    assert built(asked, WEST)["resources"]["image_id"] == "ami-west"
 
 
 def test_accelerators_that_the_instance_type_does_not_imply_are_named():

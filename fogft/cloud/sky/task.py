@@ -63,16 +63,20 @@ def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[str, Any]:
-    """Return the alternative in `resources` that a placement was offered for."""
+    """Return the alternative in `resources` that a placement was offered for.
+
+    A stand-in's market is not its alternative's: one of the same market is preferred.
+    """
     machine = placement.instance.partition("+")[0]
-    for _, entry in alternatives(resources):
-        if (
-            sells(entry, placement.cloud, placement.region, placement.zone)
-            and entry.get("instance_type") in (None, machine)
-            and entry.get("use_spot") in (None, placement.spot)
-        ):
-            return entry
-    return resources
+    fitting = (
+        entry
+        for _, entry in alternatives(resources)
+        if sells(entry, placement.cloud, placement.region, placement.zone)
+        and entry.get("instance_type") in (None, machine)
+    )
+    return min(
+        fitting, key=lambda one: bool(one.get("use_spot")) != placement.spot, default=resources
+    )
 
 
 def build(
