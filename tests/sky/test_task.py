@@ -52,7 +52,7 @@ def test_one_location_one_port_our_labels_and_an_end_by_itself():
     assert resources["use_spot"] is True
     assert resources["ports"] == ["7448"]
     assert resources["autostop"]["down"] is True
-    assert resources["cpus"] == "4+"
+    assert "cpus" not in resources  # the type says it, and may be of another alternative
     assert "any_of" not in resources
     assert naming.replica_of_labels(resources["labels"]) == replica(3, 7)
     assert resources["labels"][naming.OWNER] == "ann_lee_robot"
@@ -114,6 +114,17 @@ def test_an_on_demand_stand_in_keeps_what_its_spot_alternative_asks_for():
     asked["resources"]["any_of"].append({**west, "image_id": "ami-on-demand"})
     assert built(asked, replace(WEST, spot=False))["resources"]["image_id"] == "ami-on-demand"
     assert built(asked, WEST)["resources"]["image_id"] == "ami-west"
+
+
+def test_alternatives_in_one_place_may_differ_by_the_machine_only():
+    there, big = {"infra": "aws/us-east-1", "cpus": "2+"}, {"cpus": "8+", "accelerators": "L4"}
+    both = {"resources": {"any_of": [there, {**there, **big}]}}
+    task.refuse_what_cannot_be_honoured(both)
+    both["resources"]["any_of"][1]["image_id"] = "ami-gpu"
+    with pytest.raises(SpecError, match=r"resources.any_of\[1\]: differs .* same place"):
+        task.refuse_what_cannot_be_honoured(both)
+    both["resources"]["any_of"][1]["instance_type"] = "g6.2xlarge"
+    task.refuse_what_cannot_be_honoured(both)
 
 
 def test_accelerators_that_the_instance_type_does_not_imply_are_named():

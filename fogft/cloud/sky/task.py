@@ -21,7 +21,7 @@ OURS = "~/.fogft"
 DISK_GB = 64  # default if the pool file sets none; SkyPilot's default is 256
 _CHOICES = (
     *("infra", "cloud", "region", "zone", "any_of", "ordered"),
-    *("instance_type", "use_spot", "accelerators"),
+    *("instance_type", "use_spot", "accelerators", "cpus", "memory"),
 )
 FEATURES = ("use_spot", "ports", "autostop")  # a cloud may lack these for all its machines
 _REFUSED_RESOURCES = {
@@ -36,7 +36,16 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
     for target in task.get("file_mounts") or {}:
         if os.path.normpath(str(target)).startswith(OURS):
             raise SpecError.of_key(f"file_mounts.{target}", f"`{OURS}` is fogft's own folder")
+    of_machine: dict[tuple[object, ...], Mapping[str, Any]] = {}
     for where, entry in alternatives(task.get("resources") or {}):
+        machine = *place(entry), entry.get("instance_type"), bool(entry.get("use_spot"))
+        kept = {key: value for key, value in entry.items() if key not in _CHOICES}
+        if of_machine.setdefault(machine, kept) != kept:  # `alternative` cannot tell them apart
+            raise SpecError.of_key(
+                where,
+                "differs from an earlier alternative in the same place by more than the machine",
+                "name the `instance_type` of each, or put them into `fogft.groups`",
+            )
         for key, reason in _REFUSED_RESOURCES.items():
             if entry.get(key, []) != []:
                 raise SpecError.of_key(f"{where}.{key}", "is not supported in a pool", reason)
