@@ -111,12 +111,12 @@ def test_disk_and_address_are_part_of_the_price_and_named(market: Market):
     assert here.extras_usd_per_hour == pytest.approx(5.12 / 730 + 0.005)
     assert here.usd_per_hour == pytest.approx(0.02 + here.extras_usd_per_hour)
     [_, large] = market.prices.offers({"infra": "aws", "disk_size": "1TB"})
-    assert large.extras_usd_per_hour == pytest.approx(80 / 730 + 0.005)
+    assert large.extras_usd_per_hour == pytest.approx(1024 * 0.08 / 730 + 0.005)
 
 
 @pytest.mark.parametrize(
     ("asked", "gb"),
-    [(64, 64), ("100", 100), ("2t", 2000), ("512 MB", 0.512), ("much", 0), (None, 0)],
+    [(64, 64), ("100", 100), ("2TB", 2048), ("512 MB", 0.5), ("much", 0), (None, 0)],
 )
 def test_a_disk_size_is_read_as_skypilot_reads_it(asked: object, gb: float):
     assert prices.disk_gb(asked) == pytest.approx(gb)
@@ -130,6 +130,9 @@ def test_skypilot_is_asked_with_all_that_a_launch_adds(market: Market):
     market.prices.offers({"infra": "aws", "ports": [], "disk_size": 30})
     assert "ports" not in market.sky.asked_for, "a replica that dials out opens none"
     assert market.sky.asked_for["disk_size"] == 30
+    [empty, _] = market.prices.offers({"infra": "aws", "disk_size": None})
+    assert market.sky.asked_for["disk_size"] == 64
+    assert empty.extras_usd_per_hour == pytest.approx(MORE)
 
 
 def test_what_cannot_be_launched_is_left_out_with_the_reason(market: Market):

@@ -44,9 +44,9 @@ def built(
 
 
 def test_one_location_one_port_our_labels_and_an_end_by_itself():
-    resources = built({"resources": {"cpus": "4+", "any_of": [{"infra": "aws/us-east-1"}]}})[
-        "resources"
-    ]
+    asked = {"cpus": "4+", "disk_size": None, "any_of": [{"infra": "aws/us-east-1"}]}
+    resources = built({"resources": asked})["resources"]
+    assert resources["disk_size"] == 64
     assert resources["infra"] == "aws/us-east-1/us-east-1a"
     assert resources["instance_type"] == "m6i.large"
     assert resources["use_spot"] is True

@@ -36,7 +36,7 @@ DISK_USD_PER_GB_MONTH = {"aws": 0.08, "azure": 0.15, "gcp": 0.10}
 ADDRESS_USD_PER_HOUR = {"aws": 0.005, "azure": 0.005, "gcp": 0.005}
 SPOT_ADDRESS_USD_PER_HOUR = {"gcp": 0.0025}
 _SIZE = re.compile(r"(\d+(?:\.\d+)?)\s*([kmgtp]?)i?b?\+?", re.IGNORECASE)
-_GB = {"k": 1e-6, "m": 1e-3, "": 1.0, "g": 1.0, "t": 1e3, "p": 1e6}
+_GB = {"k": 2**-20, "m": 2**-10, "": 1.0, "g": 1.0, "t": 2**10, "p": 2**20}
 
 
 class _Sold(NamedTuple):
@@ -217,7 +217,7 @@ def extras_usd_per_hour(placement: Placement, resources: Mapping[str, Any]) -> f
 
 def disk_usd_per_hour(placement: Placement, resources: Mapping[str, Any]) -> float:
     """Return what a machine's disk costs, in US dollars per hour."""
-    size_gb = disk_gb(alternative(resources, placement).get("disk_size", DISK_GB))
+    size_gb = disk_gb(alternative(resources, placement).get("disk_size") or DISK_GB)
     return size_gb * DISK_USD_PER_GB_MONTH.get(placement.cloud, 0.0) / HOURS_A_MONTH
 
 

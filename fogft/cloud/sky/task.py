@@ -68,7 +68,7 @@ def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
     if not ours["ports"]:
         del ours["ports"]
     kept = {key: value for key, value in resources.items() if key != "ports"}
-    return {"disk_size": DISK_GB, **kept, **ours}
+    return {**kept, "disk_size": kept.get("disk_size") or DISK_GB, **ours}
 
 
 def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[str, Any]:
@@ -143,7 +143,7 @@ def _kind(placement: Placement) -> dict[str, str]:
 def _resources(order: Launch, owner: str) -> dict[str, Any]:
     chosen = alternative(order.task.get("resources") or {}, order.placement)
     out = {k: copy.deepcopy(v) for k, v in chosen.items() if k not in _CHOICES}
-    out.setdefault("disk_size", DISK_GB)
+    out["disk_size"] = out.get("disk_size") or DISK_GB
     out["infra"] = naming.infra(order.placement)
     out["use_spot"] = order.placement.spot
     out |= _kind(order.placement)
