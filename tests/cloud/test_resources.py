@@ -104,6 +104,8 @@ def test_alternatives_add_up_on_what_they_share(key):
         ({"memory": "16+"}, "large"),
         ({"memory": 32}, "gpu"),
         ({"memory": "8x"}, "large"),
+        ({"memory": "16GB+"}, "large"),
+        ({"memory": "32Gi"}, "gpu"),
         ({"instance_type": "gpu"}, "gpu"),
         ({"accelerators": "L4"}, "gpu"),
         ({"accelerators": "L4:1"}, "gpu"),

@@ -13,6 +13,7 @@ from fogft.poolfile.tree import nearest, shown
 
 CLOUDS = (CLOUD, "*", *VM_CLOUDS)
 _AMOUNT = re.compile(r"(\d+(?:\.\d+)?)(\+?)")
+_GB = re.compile(r"(?<=\d)\s*g[bi]", re.IGNORECASE)  # SkyPilot's unit of `memory`
 _PER_CPU = re.compile(r"(\d+(?:\.\d+)?)x")
 _ACCELERATOR = re.compile(r"([A-Za-z][\w.-]*)(?::(\d+(?:\.\d+)?))?")
 
@@ -91,6 +92,8 @@ def suffices(where: str, key: str, wanted: Any, instance: Instance) -> bool:
         )
     has = instance.cpus if key == "cpus" else instance.memory_gb
     text = str(wanted).strip()
+    if key == "memory":
+        text = _GB.sub("", text)
     per_cpu = _PER_CPU.fullmatch(text) if key == "memory" else None
     if per_cpu:
         return has >= float(per_cpu[1]) * instance.cpus
