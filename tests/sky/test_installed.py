@@ -486,6 +486,11 @@ def test_a_cloud_that_refuses_the_launch_is_left_out_with_the_reason(
         "hyperbolic": "machines cannot terminate themselves; cannot open ports (not needed with "
         "`fogft.dial_in`); no spot machines"
     }
+    for cloud, labels in {"aws": {"team": "Robots A"}, "gcp": {"Team": "a"}}.items():
+        asked = task.as_launched({"infra": cloud, "labels": {"ours": "1", **labels}})
+        ((_, why),) = installed.offers(asked).left_out.items()
+        ((label, value),) = labels.items()
+        assert why.startswith(f"refuses the label `{label}: {value}` (")
 
 
 @needs("skypilot")

@@ -59,7 +59,7 @@ def sale(asked: Iterable[Any], enabled: Sequence[Any]) -> Sale:
 
 
 def missing(cloud: Any, resources: Any) -> str:
-    """Return the features of a launch that a cloud lacks; empty if it has all."""
+    """Return what a cloud lacks for a launch, or refuses of it; empty if nothing."""
     features = importlib.import_module("sky.clouds").CloudImplementationFeatures
     no = importlib.import_module("sky.exceptions").NotSupportedError
     lacking = []
@@ -69,6 +69,10 @@ def missing(cloud: Any, resources: Any) -> str:
             cloud.check_features_are_supported(resources, {feature})
         except no:
             lacking.append(_MISSING.get(feature.value, f"no `{feature.value}`"))
+    for label, value in (resources.labels or {}).items():
+        accepted, why = cloud.is_label_valid(label, value)
+        if not accepted:
+            lacking.append(f"refuses the label `{label}: {value}` ({why})")
     return "; ".join(lacking)
 
 
