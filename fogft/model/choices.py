@@ -215,7 +215,7 @@ class GroupSpec:
     )
     resources: Mapping[str, Any] = key(
         Free("write resources as at the top level"),
-        "Merged into the file's `resources`, overriding them key by key.",
+        "Override keys of the file's `resources`; a place replaces all of its places.",
         default_factory=dict,
     )
     on_demand: OnDemandSpec = key(

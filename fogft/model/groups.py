@@ -20,6 +20,7 @@ STAND_INS = BLOCK // 2
 FIRST_BY_HAND = 2000
 GATEWAY_SLOT = FIRST_BY_HAND - 1  # the machine of the gateway that a pool launches for itself
 LAST_BY_HAND = 999_999
+PLACE_KEYS = ("infra", "cloud", "region", "zone")  # of `resources` and each of its alternatives
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,17 @@ def sales(spec: PoolSpec) -> tuple[tuple[str, Mapping[str, Any]], ...]:
         else:
             found.append((group.name, group.resources))
     return tuple(found)
+
+
+def overridden(resources: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `resources` with the keys of `own`; a place in `own` replaces every other place."""
+    out = dict(resources)
+    if any(key in own for key in PLACE_KEYS):
+        out = {key: value for key, value in out.items() if key not in PLACE_KEYS}
+        for key in ("any_of", "ordered"):
+            if out.get(key):
+                out[key] = [{k: one[k] for k in one if k not in PLACE_KEYS} for one in out[key]]
+    return {**out, **own}
 
 
 def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:

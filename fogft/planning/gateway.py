@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fogft import __version__
-from fogft.model.groups import GATEWAY_SLOT
+from fogft.model.groups import GATEWAY_SLOT, PLACE_KEYS, overridden
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Machine, MachinePhase, Offer, ReplicaId
 from fogft.model.spec import PoolSpec
@@ -22,7 +22,6 @@ from fogft.planning.sizing import Inputs, cap_usd
 LOST_S = 60.0
 """A gateway is replaced when the robot's link to it was down for this many seconds."""
 PAUSE_S, LONGEST_PAUSE_S = 10.0, 600.0
-_WHEREABOUTS = ("infra", "cloud", "region", "zone")
 
 
 class GatewayPlan(NamedTuple):
@@ -46,13 +45,13 @@ def resources(spec: PoolSpec) -> dict[str, Any]:
     shared = spec.task.get("resources") or {}
 
     def where(section: Mapping[str, Any]) -> dict[str, Any]:
-        return {key: section[key] for key in _WHEREABOUTS if key in section}
+        return {key: section[key] for key in PLACE_KEYS if key in section}
 
     out = {**where(shared), "cpus": "2+"}
     for key in ("any_of", "ordered"):
         if shared.get(key):
             out[key] = [where(one) for one in shared[key]]
-    return {**out, **spec.gateway.resources, "use_spot": False}
+    return {**overridden(out, spec.gateway.resources), "use_spot": False}
 
 
 def plan_gateway(inputs: Inputs, offers: Sequence[Offer], *, heard_at: float) -> GatewayPlan:

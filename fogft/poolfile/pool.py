@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from fogft.errors import FogftError
 from fogft.model.choices import MAX_REPLICAS, GroupSpec, Speaks
-from fogft.model.groups import MAX_GROUPS
+from fogft.model.groups import MAX_GROUPS, overridden
 from fogft.model.names import NAMES_BYTES_LIMIT, POOL_NAME_PATTERN
 from fogft.model.spec import CONCURRENCY_LIMIT, Part, PoolSpec, ServiceSpec
 from fogft.model.state import StateSpec
@@ -60,7 +60,9 @@ def pool_spec(
             spec: PoolSpec = reader.map(PoolSpec, ours)
         with mistakes.step():
             name = _name(top)
-    spec = replace(spec, name=name)
+    shared: Any = task.get("resources") or {}  # known to be a map only here
+    groups = tuple(replace(g, resources=overridden(shared, g.resources)) for g in spec.groups)
+    spec = replace(spec, name=name, groups=groups)
     _judge_here(top, ours, spec, checks, mistakes)
     return spec
 
@@ -129,7 +131,6 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
         if key in ours.children:
             instead = f"each group has its own `{key}`"
             raise ours.error(key, "cannot be combined with `groups`", instead, at_key=True)
-    shared: Any = made.task.get("resources") or {}
     for section, group in zip(ours.sections("groups", ""), made.groups, strict=True):
         rules.on_demand(section.section("on_demand"), group.on_demand, group.replicas)
         check_resources(section.section("resources"))
@@ -138,7 +139,7 @@ def _groups(ours: Section, made: PoolSpec) -> tuple[GroupSpec, ...]:
     total = sum(group.replicas for group in made.groups)
     if total > MAX_REPLICAS:
         raise ours.error("groups", f"ask for {total} replicas; the maximum is {MAX_REPLICAS}")
-    return tuple(replace(g, resources={**shared, **g.resources}) for g in made.groups)
+    return made.groups
 
 
 def _check_topology(ours: Section, services: tuple[ServiceSpec, ...], spec: PoolSpec) -> None:

@@ -15,6 +15,7 @@ from fogft.model.topology import LaunchedGateway
 from fogft.planning.gateway import GatewayPlan, plan_gateway, resources, version
 from fogft.planning.observed.history import Event, EventKind, History
 from fogft.planning.sizing import Inputs
+from fogft.poolfile.named_clouds import alternatives, place
 from tests.planning.pool_worlds import NOW, UID, spec
 
 POOL = spec(gateway=LaunchedGateway(launch=True))
@@ -87,6 +88,9 @@ def test_its_machine_is_small_and_where_the_replicas_may_be():
     asked = {"accelerators": "A100", "use_spot": True, "any_of": where}
     pool = spec(task={"run": "serve", "resources": asked}, gateway=LaunchedGateway(launch=True))
     assert resources(pool) == {"any_of": where, "cpus": "2+", "use_spot": False}
+    asked = {"infra": "aws/eu-west-1"}
+    elsewhere = resources(replace(pool, gateway=LaunchedGateway(launch=True, resources=asked)))
+    assert {place(one) for _, one in alternatives(elsewhere)} == {("aws", "eu-west-1", "")}
 
 
 LAUNCHED, UP, GONE = EventKind.LAUNCH, EventKind.READY, EventKind.GONE

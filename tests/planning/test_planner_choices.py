@@ -19,7 +19,7 @@ from fogft.model.choices import (
     ScheduleSpec,
     WindowSpec,
 )
-from fogft.model.groups import BLOCK
+from fogft.model.groups import BLOCK, overridden
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import Offer, Placement
 from fogft.model.spec import PoolSpec
@@ -224,6 +224,14 @@ GROUPS = (
     GroupSpec("anchor", 1, {"cpus": 4}),
     GroupSpec("fast", 2, {"cpus": 16, "use_spot": True}, MIXED),
 )
+
+
+def test_a_groups_own_place_replaces_every_place_of_the_file():
+    shared = {"use_spot": True, "any_of": [{"infra": "aws", "cpus": 2}, {"cloud": "gcp"}]}
+    kept = {"use_spot": True, "any_of": [{"cpus": 2}, {}]}
+    assert overridden(shared, {"infra": "oci"}) == {**kept, "infra": "oci"}
+    assert overridden({"infra": "aws"}, {"cloud": "gcp"}) == {"cloud": "gcp"}
+    assert overridden(shared, {"cpus": 4}) == {**shared, "cpus": 4}
 
 
 def test_each_group_gets_its_own_kind_in_its_own_slots():

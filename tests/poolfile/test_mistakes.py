@@ -123,6 +123,7 @@ NO_MAP = "any_of[0]: must be a map"
         ("resources: {labels: [team-a]}", "", 2, "resources.labels: must be a map"),
         ("", "gateway: {launch: true, resources: {any_of: [aws]}}", 5, NO_MAP),
         ("", "groups: [{name: a, replicas: 1, resources: {labels: [b]}}]", 5, "must be a map"),
+        ("resources: 5", "groups: [{name: a, replicas: 1}]", 2, "resources: must be a map"),
     ],
 )
 def test_what_skypilot_would_take_for_something_else_is_told(task, keys, line, message):
