@@ -248,6 +248,27 @@ def test_down_finds_a_launch_that_skypilot_hears_of_late(pool: PoolOnSky):
     assert pool.sky.asked("cancel")
 
 
+def test_down_in_mid_launch_waits_until_a_cloud_must_list_what_was_just_made(pool: PoolOnSky):
+    """Clouds list a machine seconds after it was made: SkyPilot's own `down` misses it as well."""
+    scene = pool.scene
+    scene.cloud.launch(scene.order())
+    scene.sky.boot(FIRST)
+    (key, made), begun_at = pool.sky.provider.found.popitem(), scene.now
+    scene.sky.down_forgets = True
+    passing = scene.pass_s
+
+    def listed_after_8_s(seconds: float) -> None:
+        passing(seconds)
+        if scene.now >= begun_at + 8 and not pool.sky.provider.terminated:
+            pool.sky.provider.found[key] = made
+
+    scene.pass_s = listed_after_8_s  # type: ignore[method-assign]
+    scene.cloud = scene.another_process()
+    end(pool, [])
+    assert pool.sky.provider.terminated == [key]
+    assert pool.running() == []
+
+
 def test_down_without_an_answer_says_what_may_still_run_and_how_to_look(pool: PoolOnSky):
     pool.until(pool.ready)
     pool.scene.cloud = pool.scene.another_process()

@@ -47,6 +47,10 @@ class Census:
         vouched = id in self._seen and self.vouches(provider.cloud)
         return [i for i in mine if i.id == id] if vouched else None
 
+    def has_listed(self, id: ReplicaId) -> bool:
+        """Whether a provider has ever listed a replica's machine."""
+        return id in self._seen
+
     def terminate(self, instance: Instance) -> None:
         """Request the termination of an instance. Raises CloudUnreachable: it may still run."""
         try:

@@ -5,6 +5,7 @@ if possible. Machines that SkyPilot has forgotten are terminated through the pro
 """
 
 import contextlib
+import itertools
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ log = logging.getLogger(__name__)
 _TRIES = 5
 _PAUSE_S = 3.0
 _LIMIT_S = 300.0  # no further attempt after this
+_ABORTED_CHECKS = 4  # in some 20 s: what a launch has just made may not be listed yet
 _HEARD_WITHIN_S = 180.0  # as `following.ASK_LIMIT_S`
 
 
@@ -45,15 +47,16 @@ class Ending:
         heard = entry is None or entry.request or begun_at - entry.launched_at >= _HEARD_WITHIN_S
         enough = 1 if heard else 2
         quiet = 0
-        for attempt in range(_TRIES + enough - 1):
+        for attempt in itertools.count():
             if attempt:
-                if self.clock() - begun_at > _LIMIT_S:
+                if attempt >= _TRIES + enough - 1 or self.clock() - begun_at > _LIMIT_S:
                     break
                 self.sleep(_PAUSE_S)
             try:
                 for request in self.sky.launches(name):
                     if request.active:
                         self.sky.cancel(request.id)
+                        enough = _ABORTED_CHECKS
                 self.sky.down(name)
                 left = self._left(id, name)
             except (CloudUnreachable, RefusedError) as error:
@@ -63,7 +66,8 @@ class Ending:
                     self._left(id, name)  # the provider may succeed where SkyPilot fails
                 continue
             quiet = 0 if left else quiet + 1
-            if quiet >= enough:
+            late = self.clock() - begun_at > _LIMIT_S
+            if quiet >= (1 if late or self.census.has_listed(id) else enough):
                 return
             trouble = CloudError(f"still there: {', '.join(left)}")
         raise CloudUnreachable(

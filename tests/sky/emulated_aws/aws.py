@@ -10,6 +10,7 @@ Three servers, all inside a network namespace of the test's own:
     POST /capacity?place=P&has=0|1      P: a region or a zone; without capacity for spot
     POST /notice?id=I&in_s=S            a preemption notice: taken in S seconds (AWS: 120)
     POST /rebalance?id=I                a rebalance recommendation
+    POST /late?s=S                      new instances are listed only S seconds after they are made
     POST /preempt?id=I                  taken now
     POST /quota?region=R&code=C&vcpus=N  a quota of the account
     POST /deny?action=A                 A is not allowed any more; without A all is again
@@ -69,6 +70,8 @@ class World:
     def __init__(self) -> None:
         self.lock = threading.RLock()
         self.full: set[str] = set()
+        self.late_s = 0.0
+        self.made_at: dict[str, float] = {}
         self.quotas: dict[tuple[str, str], float] = {}
         self.vms: dict[str, subprocess.Popen[bytes]] = {}
         self.notices: dict[str, str] = {}
@@ -203,6 +206,12 @@ def all_instances() -> Iterator[tuple[str, Any, Any]]:
 def patch_moto() -> None:
     elastic_network_interfaces.random_public_ip = WORLD.address
     run = instances.InstanceBackend.run_instances
+    describe = instances.InstanceBackend.describe_instances
+
+    def describe_instances(self: Any, filters: Any = None) -> Any:
+        since = time.time() - WORLD.late_s
+        found = describe(self, filters)
+        return [one for one in found if WORLD.made_at[one.instances[0].id] <= since]
 
     def run_instances(self: Any, image: str, count: int, data: Any, groups: Any, **kw: Any) -> Any:
         zone = kw.get("placement") or ""
@@ -220,10 +229,12 @@ def patch_moto() -> None:
         for instance in made.instances:
             # moto keeps these with the network interface only.
             instance.security_groups = list(map(self.get_security_group_from_id, named))
+            WORLD.made_at[instance.id] = time.time()
             WORLD.boot(instance)
         return made
 
     instances.InstanceBackend.run_instances = run_instances
+    instances.InstanceBackend.describe_instances = describe_instances
     spot_instances.SpotInstances.describe_spot_price_history = price_history
     ServiceQuotasBackend.get_service_quota = quota_of
     for name in ("terminate", "stop"):
@@ -375,6 +386,8 @@ class Control(Answers, BaseHTTPRequestHandler):
             WORLD.quotas[asked["region"], asked["code"]] = float(asked["vcpus"])
         elif url.path == "/deny":
             LAUNCHER.taken = {asked["action"]} if "action" in asked else set()
+        elif url.path == "/late":
+            WORLD.late_s = float(asked["s"])
         elif url.path == "/rebalance":
             WORLD.rebalance[asked["id"]] = f"{now:%Y-%m-%dT%H:%M:%SZ}"
         else:

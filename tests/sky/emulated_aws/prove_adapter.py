@@ -199,10 +199,12 @@ class Proof:
         with step("another process takes a launch over, until it runs"):
             self.runs(e)
         assert {m.id for m in self.cloud.machines(UID)} == {b, e}
+        control("/late?s=8")
         f = self.launch(2, 1, "eu-west-1")
         until("f's VM exists", lambda: len(running()) == 3)
-        with step("terminate in mid launch"):
+        with step("terminate in mid launch, before AWS lists the VM"):
             self.cloud.terminate(f)
+        control("/late?s=0")
         assert len(running()) == 2
         with step("terminate a running replica"):
             self.cloud.terminate(e)
