@@ -33,7 +33,7 @@ class Census:
         self._found: dict[str, Sequence[Instance]] = {}
         self._begun_at: dict[str, float] = {}
         self._refused: dict[str, str] = {}
-        self._seen: set[ReplicaId] = set()
+        self.listed: set[ReplicaId] = set()  # replicas whose machine a provider has ever listed
 
     def of(self, id: ReplicaId, entry: Entry | None) -> list[Instance] | None:
         """Query a replica's instances now; None if only SkyPilot can tell."""
@@ -44,12 +44,8 @@ class Census:
         if provider is None:
             return None
         mine = self._ask(provider, [entry.placement.region], id.pool_uid)
-        vouched = id in self._seen and self.vouches(provider.cloud)
+        vouched = id in self.listed and self.vouches(provider.cloud)
         return [i for i in mine if i.id == id] if vouched else None
-
-    def has_listed(self, id: ReplicaId) -> bool:
-        """Whether a provider has ever listed a replica's machine."""
-        return id in self._seen
 
     def terminate(self, instance: Instance) -> None:
         """Request the termination of an instance. Raises CloudUnreachable: it may still run."""
@@ -134,5 +130,5 @@ class Census:
             self._refused[provider.cloud] = reason
             return []
         self._refused.pop(provider.cloud, None)
-        self._seen.update(instance.id for instance in found)
+        self.listed.update(instance.id for instance in found)
         return found

@@ -67,7 +67,7 @@ class Ending:
                 continue
             quiet = 0 if left else quiet + 1
             late = self.clock() - begun_at > _LIMIT_S
-            if quiet >= (1 if late or self.census.has_listed(id) else enough):
+            if quiet >= (1 if late or id in self.census.listed else enough):
                 return
             trouble = CloudError(f"still there: {', '.join(left)}")
         raise CloudUnreachable(
