@@ -180,6 +180,13 @@ def test_no_mark_of_the_template_is_left():
     assert "@" not in made["setup"].replace("colcon build", "") + made["run"]
 
 
+def test_only_fogfts_own_folder_cannot_be_mounted():
+    task.refuse_what_cannot_be_honoured({"file_mounts": {"~/.fogft-data": "/d"}})
+    for target in ("~/.fogft", "~/.fogft/", "~/x/../.fogft/replica"):
+        with pytest.raises(SpecError, match="own folder"):
+            task.refuse_what_cannot_be_honoured({"file_mounts": {target: "/d"}})
+
+
 def test_the_order_is_not_changed_by_building_it():
     asked = {"resources": {"labels": {"a": "b"}}, "file_mounts": {"/m": "m"}}
     before = repr(asked)

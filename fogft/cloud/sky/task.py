@@ -34,7 +34,7 @@ _REFUSED_RESOURCES = {
 def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
     """Raise `SpecError` if a checked pool file's task sets a field that the pool controls."""
     for target in task.get("file_mounts") or {}:
-        if os.path.normpath(str(target)).startswith(OURS):
+        if f"{os.path.normpath(str(target))}/".startswith(f"{OURS}/"):
             raise SpecError.of_key(f"file_mounts.{target}", f"`{OURS}` is fogft's own folder")
     of_machine: dict[tuple[object, ...], Mapping[str, Any]] = {}
     for where, entry in alternatives(task.get("resources") or {}):
@@ -72,10 +72,7 @@ def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[str, Any]:
-    """Return the alternative in `resources` that a placement was offered for.
-
-    A stand-in's market is not its alternative's: one of the same market is preferred.
-    """
+    """Return the alternative that a placement was offered for; a stand-in's market is another."""
     machine = placement.instance.partition("+")[0]
     fitting = (
         entry

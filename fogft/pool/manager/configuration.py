@@ -267,11 +267,17 @@ def absolute(task: Mapping[str, Any], base: Path) -> dict[str, Any]:
         out["workdir"] = _absolute(out["workdir"], base)
     mounts = out.get("file_mounts")
     if isinstance(mounts, Mapping):
-        out["file_mounts"] = {
-            target: _absolute(source, base) if isinstance(source, str) else source
-            for target, source in mounts.items()
-        }
+        out["file_mounts"] = {target: _mounted(source, base) for target, source in mounts.items()}
     return out
+
+
+def _mounted(source: Any, base: Path) -> Any:
+    """Return what is mounted, a path or a bucket with one `source` or several, as absolute."""
+    if isinstance(source, Mapping) and "source" in source:
+        return {**source, "source": _mounted(source["source"], base)}
+    if isinstance(source, (list, tuple)):
+        return [_mounted(one, base) for one in source]
+    return _absolute(source, base) if isinstance(source, str) else source
 
 
 def _absolute(path: str, base: Path) -> str:

@@ -128,14 +128,25 @@ def test_relative_paths_are_relative_to_the_pool_file() -> None:
     """Wherever the manager runs, `workdir: .` is the file's own folder; URLs are left alone."""
     task = {
         "workdir": ".",
-        "file_mounts": {"/data": "data", "/s3": "s3://bucket/x", "/t": {"source": "x"}},
+        "file_mounts": {
+            "/data": "data",
+            "/s3": "s3://bucket/x",
+            "/t": {"source": "x", "name": "t"},
+        },
     }
     assert configuration.absolute(task, Path("/src/robot")) == {
         "workdir": "/src/robot",
-        "file_mounts": {"/data": "/src/robot/data", "/s3": "s3://bucket/x", "/t": {"source": "x"}},
+        "file_mounts": {
+            "/data": "/src/robot/data",
+            "/s3": "s3://bucket/x",
+            "/t": {"source": "/src/robot/x", "name": "t"},
+        },
     }
     git = {"workdir": {"url": "https://example.org/x.git"}}
     assert configuration.absolute(git, Path("/src")) == git
+    buckets = {"/l": {"source": ["a", "/b"]}, "/u": {"source": "gs://x"}, "/n": {"name": "n"}}
+    several = configuration.absolute({"file_mounts": buckets}, Path("/src"))["file_mounts"]
+    assert several == {**buckets, "/l": {"source": ["/src/a", "/b"]}}
     nobody = configuration.absolute({"file_mounts": {"/data": "~no-such-user/d"}}, Path("/src"))
     assert nobody == {"file_mounts": {"/data": "/src/~no-such-user/d"}}
 
