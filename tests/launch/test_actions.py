@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import textwrap
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -180,7 +179,7 @@ def test_local_nodes_have_the_configurations_of_the_groups_around_the_pool(
     ready = tmp_path / "ready"
     ready.write_text(f"#!/bin/sh\necho '{READY}'\n")
     ready.chmod(0o755)
-    monkeypatch.setattr("fogft.launch.actions.sys", SimpleNamespace(executable=str(ready)))
+    monkeypatch.setattr("fogft.launch.actions.python", lambda *words: [str(ready), *words])
     seen: list[str] = []
     look = launch.actions.OpaqueFunction(
         function=lambda then: seen.append(then.launch_configurations.get("speed", "none"))
