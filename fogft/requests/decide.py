@@ -98,8 +98,12 @@ class Decide:
     def accept(self, accepts: Accepts | None) -> None:
         """Set which responses are ok; None for all."""
         self.accepts = accepts
-        # If so, any response is a success: `began`, `read`, `judge` and `closed` need no call.
+        # If so, any response is a success: the methods about one request need no call.
         self.takes_any = accepts is None and type(self) is Decide
+
+    def answer_to(self, request: bytes, payload: bytes) -> bytes | None:
+        """Return the answer to a new request that no replica may get; None for any other."""
+        return None
 
     def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         """Note a new request, and the replicas that can answer it."""

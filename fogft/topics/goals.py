@@ -19,6 +19,7 @@ _SUCCEEDED = 4
 _UNKNOWN = 0
 _CDR_HEADER = b"\x00\x01\x00\x00"
 _NO_TIME = bytes(8)
+REJECTED = _CDR_HEADER + bytes(12)  # the response to a goal: not accepted, at no time
 RESULT_OF_NONE = _CDR_HEADER + bytes(16)  # a result request that is answered at once
 GOALS_KEPT = 4096
 BYTES_KEPT = 64 << 20
@@ -96,6 +97,7 @@ class Goals:
         self._of_id: dict[bytes, bytes] = {}  # request id -> goal
         self._awaited: dict[bytes, _Goal] = {}
         self.over: OrderedDict[bytes, bytes] = OrderedDict()  # the same, for goals that ended
+        self._past: OrderedDict[bytes, bytes] = OrderedDict()  # goal that ended -> its `id`
         self._bytes = 0
 
     # -- sending --------------------------------------------------------------------------
@@ -200,6 +202,10 @@ class Goals:
     def ended(self, goal: bytes) -> None:
         """Note that a goal has ended, or its client gave up. Unknown goals are ignored."""
         known = self._drop(goal)
+        if known is not None and known.takers:
+            self._past[goal] = known.id
+            if len(self._past) > GOALS_KEPT:
+                self._past.popitem(last=False)
         if known is not None and any(word.since == math.inf for word in known.words.values()):
             self.over.update(dict.fromkeys(known.ids, goal))
             while len(self.over) > GOALS_KEPT:
@@ -238,6 +244,10 @@ class Goals:
         """Whether a goal is under way: accepted, and without a result."""
         known = self._goals.get(goal)
         return known is not None and bool(known.takers)
+
+    def made_by(self, goal: bytes) -> bytes | None:
+        """Return the id of the request that made an accepted goal; None for any other."""
+        return self._goals[goal].id if goal in self else self._past.get(goal)
 
     def lacked(self, goal: bytes, replica: int, asked_at: float) -> Refusal | None:
         """Return why a replica asked for the result does not know the goal; None if it had it.

@@ -141,6 +141,12 @@ class _GoalPart(Decide):
         self._action = action
         self._name = name
 
+    def answer_to(self, request: bytes, payload: bytes) -> bytes | None:
+        """Reject a goal with the id of another one, as action servers do."""
+        with self._action.lock:
+            id = self._action.goals.made_by(goals.goal_of(payload))
+        return None if id in (None, request) else goals.REJECTED
+
     def began(self, request: bytes, pending: Pending, able: Collection[int]) -> None:
         with self._action.lock:
             self._action.goals.made(pending.payload, request, able, pending.deadline)

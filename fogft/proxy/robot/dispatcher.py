@@ -127,8 +127,19 @@ class Dispatcher:
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to the replicas that the policy chooses."""
-        spec = self._ledger.spec
-        self.forward(self._id_of(spec.name, handle), payload, handle, spec.timeout_s)
+        spec, now = self._ledger.spec, self._clock()
+        request = self._id_of(spec.name, handle)
+        if not (self._decide.takes_any or self.takes_no_more):
+            with self._lock:
+                answer = self._decide.answer_to(request, payload)
+                if answer is not None:
+                    self.outcomes.count["received"] += 1
+                    pending = Pending(now, payload, handle, now)
+                    self._ledger.end(request, pending, Outcome.ANSWERED)
+            if answer is not None:
+                self._delivery.give(pending, answer)
+                return
+        self.forward(request, payload, handle, spec.timeout_s)
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Like `submit`, for a request with an id and a time-out; return whether it was taken.

@@ -6,10 +6,11 @@ from typing import Any
 
 import pytest
 
+from fogft.model.spec import Part
 from fogft.model.topic import ActionSpec
 from fogft.poolfile.pool import action_services
 from fogft.proxy.robot.actions import Actions
-from fogft.topics.goals import cancel_request, goal_of
+from fogft.topics.goals import REJECTED, cancel_request, goal_of, is_success
 from tests.fakes.proxy import Clock, FakeLink
 
 GOAL, CANCEL, RESULT = action_services(ActionSpec("/count", "p/action/T", 5.0, 60.0))
@@ -78,6 +79,21 @@ def test_a_goal_reaches_every_replica_and_the_first_acceptance_counts():
     scene.say(0, ACCEPTED, "goal")
     assert scene.answers == [("goal", ACCEPTED)]
     assert all(link.forgotten == [] for link in scene.links)  # nobody is told to drop it
+
+
+@pytest.mark.parametrize("is_over", [False, True])
+def test_another_goal_with_the_same_id_is_rejected_and_reaches_nobody(is_over: bool):
+    """Its client would get the other one's result."""
+    scene = Scene()
+    scene.accept()
+    if is_over:
+        scene.say(0, SUCCEEDED, "result")
+    scene.ask("goal", HEADER + ID + b"6")
+    assert scene.answers[-1] == ("goal", REJECTED)
+    assert not is_success(Part.GOAL, REJECTED)
+    assert [scene.given(link, "goal") for link in scene.links] == [[HEADER + ID + b"5"]] * 2
+    counts = scene.parts["goal"].report()
+    assert (counts["received"], counts["answered"], counts["pending"]) == (2, 2, 0)
 
 
 def test_of_all_that_are_cancelled_none_goes_to_a_replica_that_comes_later():
