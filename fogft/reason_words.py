@@ -131,6 +131,7 @@ _WORDS: dict[Cause, str | Callable[[Reason], str]] = {
     Cause.SERVICE_AWAY: "its service has been unavailable for {r.seconds:.0f} s",
     Cause.NOT_LISTED: "no longer listed by the cloud{after}",
     Cause.DRAINED: "drained by the user",
+    Cause.CERTIFICATE_DUE: "its certificate is due for renewal",
     Cause.EXCLUDED: lambda r: (
         f"excluded location {r.location}" if r.location else "excluded by `fogft exclude`"
     ),

@@ -38,6 +38,7 @@ class Cause(str, Enum):
     # Why a working replica is replaced.
     DRAINED = "drained"
     EXCLUDED = "excluded"
+    CERTIFICATE_DUE = "certificate_due"  # its certificate expires soon
     NO_GROUP = "no_group"
     OUTDATED = "outdated"
     SUPERSEDED = "superseded"

@@ -220,6 +220,7 @@ class Observed:
     doubt_s: float = 0.0  # how far the clock was just set; `wall_clock` leaves that out
     gateway: tuple[Machine, ...] = ()  # the launched one; several while it is replaced
     standbys: tuple[Machine, ...] = ()  # machines that are stopped
+    certificates_due: frozenset[ReplicaId] = frozenset()  # whose certificates expire soon
 
     @property
     def wall_clock(self) -> float:

@@ -10,10 +10,8 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 from fogft.model.groups import BLOCK, Group, group_of, is_current
-from fogft.model.intent import Intent
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
-from fogft.model.spec import PoolSpec
 from fogft.planning.observed.health import Assessment, Health, Verdict
 from fogft.planning.sizing import Inputs, Size
 
@@ -70,7 +68,7 @@ class Classification:
 
 def classify(inputs: Inputs, health: Health, size: Size) -> Classification:
     """Classify every machine of the pool."""
-    spec, intent, observed, _ = inputs
+    observed = inputs.observed
     machines = Classification()
     blocks = {group.block for group in size.groups}
     for replica in health.replicas:
@@ -80,7 +78,7 @@ def classify(inputs: Inputs, health: Health, size: Size) -> Classification:
             machines.failed.append(replica)
         elif replica.verdict in _LOST:
             machines.lost.append(replica)
-        elif why := _unwanted(spec, intent, replica, blocks):
+        elif why := _unwanted(inputs, replica, blocks):
             goes = replica._replace(unwanted=why)
             (machines.aborted if _never_served(goes, health) else machines.replaced).append(goes)
         else:
@@ -108,22 +106,21 @@ def _supersede(machines: Classification, health: Health, size: Size) -> None:
             kind.append(replica._replace(unwanted=why))
 
 
-def _unwanted(
-    spec: PoolSpec, intent: Intent, replica: Assessment, blocks: Collection[int]
-) -> Reason | None:
+def _unwanted(inputs: Inputs, replica: Assessment, blocks: Collection[int]) -> Reason | None:
     """Return why a working replica is to be replaced; None if it is not."""
+    spec, intent, observed, _ = inputs
     machine, slot = replica.machine, replica.slot
     if replica.id.generation <= intent.drained.get(slot, 0):
         return Reason(Cause.DRAINED)
     if intent.excluded and intent.is_excluded(machine.placement.location):
         return Reason(Cause.EXCLUDED, location=machine.placement.location)
+    if replica.id in observed.certificates_due:
+        return Reason(Cause.CERTIFICATE_DUE)
     if replica.verdict in _DOUBTED:
         return replica.why
     if slot // BLOCK not in blocks:
         return Reason(Cause.NO_GROUP)
-    if not is_current(spec, machine):
-        return _OUTDATED
-    return None
+    return None if is_current(spec, machine) else _OUTDATED
 
 
 def _never_served(replica: Assessment, health: Health) -> bool:

@@ -52,6 +52,10 @@ class _Issued:
     issued: tuple[Entry, ...]
 
 
+def _replica(holder: Holder) -> ReplicaId:
+    return ReplicaId(holder.pool_uid, int(holder.name), holder.generation)
+
+
 class Ledger:
     """A pool's list of certificates. Safe to use from several processes."""
 
@@ -60,11 +64,16 @@ class Ledger:
         self._folder = folder
         self._lock = folder / "issued.lock"
         self._clock = clock
+        self._read: tuple[object, tuple[Entry, ...]] = None, ()  # version and content of the file
 
     def entries(self) -> tuple[Entry, ...]:
         """Return all certificates, oldest first."""
-        found = disk.read_as(_Issued, self.path, _WAY_OUT)
-        return () if found is None else found.issued
+        version, (known, entries) = disk.version(self.path), self._read
+        if version is None or version != known:
+            found = disk.read_as(_Issued, self.path, _WAY_OUT)
+            entries = () if found is None else found.issued
+            self._read = version, entries
+        return entries
 
     def revoked(self) -> frozenset[str]:
         """Return the revoked common names."""
@@ -72,11 +81,14 @@ class Ledger:
 
     def by_hand(self) -> frozenset[ReplicaId]:
         """Return the manually started replicas with valid certificates."""
-        return frozenset(
-            ReplicaId(h.pool_uid, int(h.name), h.generation)
-            for h in self._good(Role.REPLICA)
-            if int(h.name) >= FIRST_BY_HAND
-        )
+        good = map(_replica, self._good(Role.REPLICA))
+        return frozenset(id for id in good if id.slot >= FIRST_BY_HAND)
+
+    def due(self, now: float) -> frozenset[ReplicaId]:
+        """Return the replicas whose certificates expire soon, or have expired."""
+        soon = now + authority.RENEW_BEFORE.total_seconds()
+        due = (e.holder for e in self.entries() if e.state(soon) == "expired")
+        return frozenset(_replica(holder) for holder in due if holder.role is Role.REPLICA)
 
     def gateways(self) -> dict[str, tuple[int, ...]]:
         """Return the generations of each gateway's valid certificates, by name."""

@@ -117,6 +117,7 @@ class Manager:
             epoch=self._lease.epoch,
             revoked=self._ledger.revoked,
             by_hand=self._ledger.by_hand,
+            certificates_due=self._ledger.due,
             gateways=self._ledger.gateways,
             gateway=LaunchedGateway(
                 self.cloud, self._gateway_up, self._gateway_order, self.store.place_gateway

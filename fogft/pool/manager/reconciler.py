@@ -102,6 +102,7 @@ class Reconciler:
 
     `by_hand` returns the manually started replicas with valid certificates; `gateways` returns the
     generations of each gateway's valid certificates, by name; `gateway` is the one to launch.
+    `certificates_due` returns the replicas whose certificates expire soon.
     """
 
     cloud: Cloud
@@ -114,6 +115,7 @@ class Reconciler:
     epoch: int = 1
     revoked: Callable[[], frozenset[str]] = frozenset
     by_hand: Callable[[], frozenset[ReplicaId]] = frozenset
+    certificates_due: Callable[[float], frozenset[ReplicaId]] = lambda now: frozenset()
     gateways: Callable[[], Mapping[str, tuple[int, ...]]] = dict
     gateway: LaunchedGateway | None = None
     on_done: Callable[[], None] = lambda: None
@@ -229,7 +231,10 @@ class Reconciler:
         if machines is not None and (gateway or stopped):
             machines = tuple(m for m in machines if m not in (*gateway, *stopped))
         doubt_s = self.timekeeping.watch.doubt_s
-        seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway, stopped)
+        due: frozenset[ReplicaId] = frozenset()
+        with contextlib.suppress(FogftError):  # `_publish` reports it; machines must still end
+            due = self.certificates_due(now - doubt_s)
+        seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway, stopped, due)
         return seen, trouble
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:

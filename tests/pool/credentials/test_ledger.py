@@ -11,6 +11,7 @@ import pytest
 
 from fogft.errors import CredentialError, StateError
 from fogft.model.credentials import Holder, Role
+from fogft.model.replica import ReplicaId
 from fogft.pool.credentials import authority
 from fogft.pool.credentials.ledger import Ledger
 
@@ -94,6 +95,14 @@ def test_what_expired_is_forgotten_but_never_a_names_last_generation(
     clock.now = max(e.not_after for e in ledger.entries()) + 2 * DAY_S
     assert ledger.issue_next(Role.ROBOT, "ada", UID, days=1)[0].generation == 4
     assert [e.holder.short for e in ledger.entries()] == ["ada.3", "0.1", "ada.4"]
+
+
+def test_replicas_are_due_two_months_before_their_certificates_expire(ledger: Ledger) -> None:
+    for slot, days in enumerate((59, 61)):
+        ledger.issue(Holder(Role.REPLICA, str(slot), 1, UID), days=days)
+    ledger.issue_next(Role.ROBOT, "ada", UID, days=1)
+    assert ledger.due(time.time()) == {ReplicaId(UID, 0, 1)}
+    assert ledger.due(time.time() - 3 * DAY_S) == frozenset()
 
 
 def test_a_clock_that_is_years_ahead_lets_nobody_in_again(ledger: Ledger, clock: Clock) -> None:

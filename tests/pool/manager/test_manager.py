@@ -153,6 +153,36 @@ def test_a_notice_is_answered_with_a_replacement_while_the_old_one_lives(scene: 
     assert after != lost_in
 
 
+def test_a_certificate_that_expires_soon_is_replaced_with_its_machine_new_before_old(
+    scene: Scene,
+) -> None:
+    """An expired one would leave the replica out when its link is opened next; all at once."""
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    path = scene.paths.credentials / "issued.json"
+    told = disk.read_json(path)
+    for entry in told["issued"]:
+        if entry["common_name"].startswith("replica.0.1."):
+            entry["not_after"] -= 310 * 86_400
+    disk.write_json(path, told)
+    scene.wait(lambda: scene.running() == ["0.2", "1.1"] and scene.whole(2))
+    events = [(e["event"], e["replica"]) for e in scene.status()["events"]]
+    assert events.index(("ready", "0.2")) < events.index(("ending", "0.1"))
+    [why] = [e["reason"] for e in scene.status()["events"] if e["event"] == "ending"]
+    assert why == {"cause": "replaced", "because": [{"cause": "certificate_due"}]}
+
+
+def test_a_damaged_list_of_certificates_keeps_no_machine(scene: Scene) -> None:
+    """Nothing is launched without it; what has to end does."""
+    scene.write(replicas=2)
+    scene.start_manager()
+    scene.wait(lambda: scene.whole(2))
+    (scene.paths.credentials / "issued.json").write_text("damaged")
+    scene.let_hours_pass(200)
+    scene.wait(lambda: scene.running() == [])
+
+
 def test_a_pool_ends_by_itself_when_its_hours_are_over(scene: Scene) -> None:
     """Machines, client proxy and manager go; the folder says why; `up` gives the hours again."""
     scene.write(replicas=2, max_hours=2)
