@@ -18,6 +18,7 @@ UNAVAILABLE = "ResourcesUnavailableError"
         ("ZONE_RESOURCE_POOL_EXHAUSTED_WITH_DETAILS", Cause.CAPACITY),
         ("The zone 'z' does not have enough resources available", Cause.CAPACITY),
         ("(SkuNotAvailable) The requested VM size", Cause.CAPACITY),
+        ("(RequestLimitExceeded) when calling RunInstances: slow down", Cause.CAPACITY),
         ("(MaxSpotInstanceCountExceeded) Max spot instance count exceeded", Cause.QUOTA),
         ("You have requested more vCPU capacity (VcpuLimitExceeded)", Cause.QUOTA),
         ("Quota 'CPUS' exceeded: quotaExceeded", Cause.QUOTA),
@@ -100,3 +101,16 @@ def test_of_a_launchs_log_the_last_try_counts():
     assert failure is not None
     assert failure.cause is Cause.QUOTA
     assert told_last("I Launching on AWS\n") is None
+
+
+def test_of_a_launchs_log_a_code_of_awss_that_is_unknown_counts_too():
+    """Else a blocked account would look like a lack of capacity."""
+    said = "D An error occurred (%s) when calling the RunInstances operation: account is blocked\n"
+    log = said % "Blocked" + "D An error occurred (InvalidGroup.NotFound) when calling Describe\n"
+    failure = told_last(log)
+    assert failure is not None
+    assert failure.cause is Cause.ERROR
+    assert "(Blocked)" in failure.words
+    full = told_last(said % "InsufficientInstanceCapacity" + log)
+    assert full is not None
+    assert full.cause is Cause.CAPACITY

@@ -34,7 +34,7 @@ _CODES: tuple[tuple[Cause, str], ...] = (
         r"|resourceExhausted|does not have enough resources|SkuNotAvailable|AllocationFailed"
         r"|OverconstrainedAllocationRequest|OverconstrainedZonalAllocation"
         r"|(?i:no (spot )?capacity)|(?i:insufficient capacity)|(?i:out of capacity)"
-        r"|no longer any instances available",
+        r"|no longer any instances available|RequestLimitExceeded",
     ),
 )
 _KINDS = {
@@ -58,9 +58,11 @@ def classify(kind: str, texts: Iterable[str]) -> Reason:
 
 
 def told_last(log: str) -> Reason | None:
-    """Return the last failure in a launch's log that has a cloud's error code; None without one."""
-    found = (classify("", [line]) for line in reversed(log.splitlines()))
-    return next((failure for failure in found if failure.cause is not Cause.ERROR), None)
+    """Return the last failure in a launch's log that has a known code, or AWS's; else None."""
+    lines = log.splitlines()[::-1]
+    found = (classify("", [line]) for line in lines)
+    refused = (classify("", [line]) for line in lines if "calling the RunInstances op" in line)
+    return next((one for one in found if one.cause is not Cause.ERROR), next(refused, None))
 
 
 _NOT_ALLOWED = re.compile(r"is not authorized to perform: ")  # after the caller's long name
