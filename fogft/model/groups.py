@@ -106,9 +106,8 @@ def overridden(resources: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str
     out = dict(resources)
     if any(key in own for key in PLACE_KEYS):
         out = {key: value for key, value in out.items() if key not in PLACE_KEYS}
-        for key in ("any_of", "ordered"):
-            if out.get(key):
-                out[key] = [{k: one[k] for k in one if k not in PLACE_KEYS} for one in out[key]]
+        for key in {"any_of", "ordered"} & out.keys():
+            out[key] = [{k: one[k] for k in one if k not in PLACE_KEYS} for one in out[key] or ()]
     return {**out, **own}
 
 
