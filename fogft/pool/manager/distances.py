@@ -14,7 +14,7 @@ import statistics
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ from fogft import disk, template_files
 from fogft.errors import StateError
 from fogft.model.choices import PlacementSpec
 from fogft.model.plain import Moment, stored, to_plain, within
-from fogft.model.replica import LinkReport, LinkState, Machine, Offer
+from fogft.model.replica import LinkState, Observed, Offer
 from fogft.model.spec import PoolSpec
 
 _ENDPOINTS = {
@@ -178,20 +178,14 @@ class Distances:
         self._rtts: dict[str, deque[float]] = {}
         self._busy = threading.Lock()
 
-    def __call__(
-        self,
-        spec: PoolSpec,
-        offers: Sequence[Offer],
-        machines: Sequence[Machine],
-        links: Sequence[LinkReport],
-    ) -> Mapping[str, float]:
+    def __call__(self, spec: PoolSpec, seen: Observed) -> Mapping[str, float]:
         """Return ``cloud/region`` -> round trip in seconds, where it is known."""
-        regions = regions_of(offers)
+        regions = regions_of(seen.offers)
         now = time.monotonic()
         if regions and now - self._looked_at >= RETRY_S:
             self._looked_at = now
             self._submit(lambda: self._renew(regions))
-        known = self._latencies.known(regions, spec.placement, self._from_links(machines, links))
+        known = self._latencies.known(regions, spec.placement, self._from_links(seen))
         return {region: distance.rtt_s for region, distance in known.items()}
 
     def _renew(self, regions: Collection[str]) -> None:
@@ -201,12 +195,10 @@ class Distances:
             finally:
                 self._busy.release()
 
-    def _from_links(
-        self, machines: Sequence[Machine], links: Sequence[LinkReport]
-    ) -> dict[str, float]:
+    def _from_links(self, seen: Observed) -> dict[str, float]:
         """Return the median of the last round trips by region: one slow probe changes nothing."""
-        where = {m.id: f"{m.placement.cloud}/{m.placement.region}" for m in machines}
-        for link in links:
+        where = {m.id: f"{m.placement.cloud}/{m.placement.region}" for m in seen.machines or ()}
+        for link in seen.links or ():
             if link.rtt_s is not None and link.state is LinkState.UP and link.id in where:
                 kept = self._rtts.setdefault(where[link.id], deque(maxlen=REMEMBERED_RTTS))
                 kept.append(link.rtt_s)

@@ -9,7 +9,7 @@ import contextlib
 import functools
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -56,9 +56,7 @@ OFFERS_EVERY_S = 30.0
 LOG_LINES = 20
 
 Links = Callable[[str, float], "tuple[LinkReport, ...] | None"]
-Distances = Callable[
-    [PoolSpec, Sequence[Offer], Sequence[Machine], Sequence[LinkReport]], Mapping[str, float]
-]
+Distances = Callable[[PoolSpec, Observed], Mapping[str, float]]
 BuildOrder = Callable[[Identity, PoolSpec, PlannedLaunch], Launch]
 
 
@@ -225,7 +223,6 @@ class Reconciler:
         sold = self._current_offers(spec, now, trouble) if machines is not None else ()
         ending = frozenset(id for id, order in busy.items() if order is None)
         links = self.links(identity.uid, now)
-        rtt_s = self.distances(spec, sold, machines or (), links or ())
         gateway = tuple(m for m in machines or () if m.id.slot == GATEWAY_SLOT)
         stopped = tuple(m for m in machines or () if m.phase is MachinePhase.STOPPED)
         if machines is not None and (gateway or stopped):
@@ -234,8 +231,8 @@ class Reconciler:
         due: frozenset[ReplicaId] = frozenset()
         with contextlib.suppress(FogftError):  # `_publish` reports it; machines must still end
             due = self.certificates_due(now - doubt_s)
-        seen = Observed(now, machines, links, sold, ending, rtt_s, doubt_s, gateway, stopped, due)
-        return seen, trouble
+        seen = Observed(now, machines, links, sold, ending, {}, doubt_s, gateway, stopped, due)
+        return replace(seen, rtt_s=self.distances(spec, seen)), trouble
 
     def _ask_about_silent(self, observed: Observed, history: History) -> None:
         """Query the cloud about replicas that fell silent, if it caches its list."""

@@ -19,6 +19,7 @@ from fogft.model.replica import (
     LinkState,
     Machine,
     MachinePhase,
+    Observed,
     Offer,
     Placement,
     ReplicaId,
@@ -141,7 +142,8 @@ def test_one_slow_probe_moves_nothing(tmp_path: Path):
 
     def look(rtt_s: float) -> float:
         link = LinkReport(id, LinkState.UP, rtt_s=rtt_s)
-        return distances(spec, (Offer(place, 0.1),), (machine,), (link,))[NEAR]
+        seen = Observed(0.0, (machine,), (link,), (Offer(place, 0.1),))
+        return distances(spec, seen)[NEAR]
 
     for _ in range(5):
         assert look(0.02) == 0.02
