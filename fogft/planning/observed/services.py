@@ -8,11 +8,11 @@ Not here: what a replica offers (`fogft.proxy.replica.offering`), the file
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from fogft.model.plain import Count, Line
-from fogft.model.replica import LinkReport, LinkState, Machine, MachinePhase
+from fogft.model.replica import LinkState, MachinePhase, Observed
 from fogft.model.ros_names import is_below
 from fogft.model.spec import ServiceSpec
 
@@ -65,13 +65,7 @@ class Claims:
         )
 
 
-def claims(
-    known: Discovered,
-    spec_hash: str,
-    machines: Sequence[Machine],
-    links: Sequence[LinkReport],
-    wanted: int,
-) -> Claims:
+def claims(known: Discovered, spec_hash: str, observed: Observed, wanted: int) -> Claims:
     """Return the services that replicas of a hash advertise now.
 
     While no service is known, most of the existing machines decide, as others may be unavailable;
@@ -79,10 +73,11 @@ def claims(
     """
     ours = {
         machine.id
-        for machine in machines
+        for machine in observed.machines or ()
         if machine.spec_hash == spec_hash and machine.phase is not MachinePhase.FAILED
     }
-    heard = [link for link in links if link.id in ours and link.state is LinkState.UP]
+    links = [link for link in observed.links or () if link.id in ours]
+    heard = [link for link in links if link.state is LinkState.UP]
     count = Counter(pair for link in heard for pair in link.offered)
     told = sum(bool(link.offered) for link in heard)
     return Claims(count, max(len(ours), wanted if known.services else 0), told)

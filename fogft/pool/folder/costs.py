@@ -9,7 +9,7 @@ The file is kept when the pool has ended.
 
 import logging
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from fogft import disk
 from fogft.errors import StateError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause
-from fogft.model.replica import Machine, Offer, Placement
+from fogft.model.replica import Observed, Placement
 from fogft.planning.observed.clock_jumps import moved
 
 log = logging.getLogger(__name__)
@@ -79,14 +79,7 @@ class CostBook:
         self._days = {(one.day, one.replica): one for one in self._kept.spent}
         self._running = self._kept.running
 
-    def look(
-        self,
-        now: float,
-        machines: Sequence[Machine],
-        offers: Sequence[Offer],
-        alone_s: float,
-        set_s: float = 0.0,
-    ) -> None:
+    def look(self, observed: Observed, alone_s: float, set_s: float = 0.0) -> None:
         """Charge running machines up to now, and save from time to time.
 
         Args:
@@ -96,6 +89,8 @@ class CostBook:
         Raises:
             StateError: The file cannot be written; the costs are kept, and written later.
         """
+        now = observed.now
+        machines = (*(observed.machines or ()), *observed.gateway, *observed.standbys)
         if by_s := set_s - self._set_s:
             self._running = {
                 name: replace(one, until=moved(one.until, by_s, now))
@@ -109,7 +104,7 @@ class CostBook:
         spots = {m.placement for m in machines if m.placement.spot}
         prices = {
             o.placement: o.usd_per_hour
-            for o in offers
+            for o in observed.offers
             if o.placement in spots and o.usd_per_hour >= 0.0
         }
         seen: dict[str, Running] = {}

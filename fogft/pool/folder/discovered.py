@@ -36,9 +36,7 @@ class Discovery:
         self._doubted = {} if observed.doubt_s else self._doubted  # no time for a set clock
         if spec.services:
             return False
-        told = claims(
-            self.known, spec.replica_hash, observed.machines or (), observed.links or (), wanted
-        )
+        told = claims(self.known, spec.replica_hash, observed, wanted)
         agreed = told.agreed()
         usable = {
             name: kind for name, kind in agreed.items() if not self._refusal(spec, name, kind)

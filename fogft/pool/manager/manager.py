@@ -246,10 +246,7 @@ class Manager:
         seen = tick.observed
         if seen.machines is not None:
             alone_s = tick.spec.unmanaged_max_hours * lifetime.HOUR_S + RUN_ENDED_S
-            machines = (*seen.machines, *seen.gateway, *seen.standbys)
-            self._costs.look(
-                seen.now, machines, seen.offers, alone_s, self._reconciler.timekeeping.watch.set_s
-            )
+            self._costs.look(seen, alone_s, self._reconciler.timekeeping.watch.set_s)
 
     def _leave(self) -> None:
         """Remove everything except the folder of a pool that ends by itself."""

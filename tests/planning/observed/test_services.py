@@ -8,7 +8,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fogft.model.replica import LinkReport, LinkState, Machine, MachinePhase, Placement, ReplicaId
+from fogft.model.replica import (
+    LinkReport,
+    LinkState,
+    Machine,
+    MachinePhase,
+    Observed,
+    Placement,
+    ReplicaId,
+)
 from fogft.model.ros_names import is_of_application
 from fogft.model.spec import PoolSpec
 from fogft.planning.observed.health import is_ready
@@ -32,6 +40,10 @@ def machine(slot: int, spec_hash: str = SPEC.replica_hash) -> Machine:
 def link(slot: int, *services: tuple[str, str], state: LinkState = LinkState.UP) -> LinkReport:
     ready = frozenset(name for name, _ in services)
     return LinkReport(ReplicaId(UID, slot, 1), state, ready, offered=services)
+
+
+def observed(machines: list[Machine], links: list[LinkReport]) -> Observed:
+    return Observed(0.0, tuple(machines), tuple(links))
 
 
 @given(hashes, maps, hashes, maps)
@@ -58,7 +70,7 @@ def test_only_replicas_that_are_up_and_run_the_present_file_are_heard():
         link(1, ("/old", "a/srv/A")),
         link(2, ("/gone", "a/srv/A"), state=LinkState.SUSPECT),
     ]
-    told = claims(Discovered(), SPEC.replica_hash, machines, links, 3)
+    told = claims(Discovered(), SPEC.replica_hash, observed(machines, links), 3)
     assert (told.count, told.voters) == ({A: 1}, 2)
 
 
@@ -69,7 +81,7 @@ def test_one_replicas_word_changes_nothing(count, honest, lies, begun, data):
     known = Discovered(SPEC.replica_hash, dict(honest)) if begun else Discovered()
     links = [link(slot, *(lies if slot == liar else honest)) for slot in range(count)]
     machines = [machine(slot) for slot in range(count)]
-    told = claims(known, SPEC.replica_hash, machines, links, count)
+    told = claims(known, SPEC.replica_hash, observed(machines, links), count)
     after = grown(known, SPEC.replica_hash, told.agreed())
     assert after == Discovered(SPEC.replica_hash, dict(honest))
     spec = replace(SPEC, discovered=after.specs(), discovered_by=after.spec_hash)
@@ -81,14 +93,14 @@ def test_one_replicas_word_changes_nothing(count, honest, lies, begun, data):
 def test_one_that_is_left_alone_cannot_add_a_name(wanted, lie):
     """The others were preempted: what is known stays, and is all that there is."""
     known = Discovered(SPEC.replica_hash, {"/known": "a/srv/A"})
-    told = claims(known, SPEC.replica_hash, [machine(0)], [link(0, lie)], wanted)
+    told = claims(known, SPEC.replica_hash, observed([machine(0)], [link(0, lie)]), wanted)
     assert told.agreed() == {}
     assert told.outvoted() == [lie[0]]
 
 
 def test_where_no_other_machine_can_be_had_the_first_one_decides():
     """A pool for two that gets one machine for a day answers all the same."""
-    told = claims(Discovered(), SPEC.replica_hash, [machine(0)], [link(0, A)], 2)
+    told = claims(Discovered(), SPEC.replica_hash, observed([machine(0)], [link(0, A)]), 2)
     assert told.agreed() == dict([A])
 
 
@@ -98,11 +110,11 @@ def test_a_changed_file_begins_anew_once_most_of_its_replicas_have_told():
     spec = replace(SPEC, discovered=known.specs(), discovered_by="older")
     machines = [machine(0), machine(1, "older"), machine(2, "older")]
     old = [link(slot, ("/old", "a/srv/A")) for slot in (1, 2)]
-    told = claims(known, spec.replica_hash, machines, [link(0, A), *old], 3)
+    told = claims(known, spec.replica_hash, observed(machines, [link(0, A), *old]), 3)
     assert grown(known, spec.replica_hash, told.agreed()) == known
     assert is_ready(spec, machines[0], link(0, A))
     machines[1] = machine(1)
-    told = claims(known, spec.replica_hash, machines, [link(0, A), link(1, A), old[1]], 3)
+    told = claims(known, spec.replica_hash, observed(machines, [link(0, A), link(1, A), old[1]]), 3)
     assert grown(known, spec.replica_hash, told.agreed()) == Discovered(
         SPEC.replica_hash, dict([A])
     )
