@@ -127,19 +127,23 @@ class Dispatcher:
 
     def submit(self, payload: bytes, handle: Any) -> None:
         """Take a caller's request and offer it to the replicas that the policy chooses."""
-        spec, now = self._ledger.spec, self._clock()
+        spec = self._ledger.spec
         request = self._id_of(spec.name, handle)
-        if not (self._decide.takes_any or self.takes_no_more):
-            with self._lock:
-                answer = self._decide.answer_to(request, payload)
-                if answer is not None:
-                    self.outcomes.count["received"] += 1
-                    pending = Pending(now, payload, handle, now)
-                    self._ledger.end(request, pending, Outcome.ANSWERED)
-            if answer is not None:
-                self._delivery.give(pending, answer)
-                return
-        self.forward(request, payload, handle, spec.timeout_s)
+        if self._decide.takes_any or not self._answered_here(request, payload, handle):
+            self.forward(request, payload, handle, spec.timeout_s)
+
+    def _answered_here(self, request: bytes, payload: bytes, handle: Any) -> bool:
+        """Answer a request that no replica may get; return whether it is one."""
+        with self._lock:
+            answer = None if self.takes_no_more else self._decide.answer_to(request, payload)
+            if answer is None:
+                return False
+            self.outcomes.count["received"] += 1
+            now = self._clock()
+            pending = Pending(now, payload, handle, now)
+            self._ledger.end(request, pending, Outcome.ANSWERED)
+        self._delivery.give(pending, answer)
+        return True
 
     def forward(self, request: bytes, payload: bytes, handle: Any, timeout_s: float) -> bool:
         """Like `submit`, for a request with an id and a time-out; return whether it was taken.
