@@ -15,12 +15,12 @@ from xml.etree import ElementTree
 import fogft
 from fogft.child import how_it_ended, python
 from fogft.doctor.finding import Finding, Situation, fail, ok, warn
+from fogft.errors import RosError
 from fogft.ros import environment
+from fogft.ros.reservations import DOMAINS, own_domain
 
 _LIMIT_S = 30.0
 _RMW_WITH_PROFILE = "rmw_fastrtps_cpp"
-# Above this, DDS's ports overlap those that Linux gives to outgoing connections.
-_LAST_SAFE_DOMAIN, _LAST_DOMAIN = 101, 232
 _KNOWN = {
     "rmw_cyclonedds_cpp": "works, but service calls between it and Fast DDS on one machine fail",
     "rmw_zenoh_cpp": "works, and with `rmw: zenoh` in the pool file fogft needs no ROS 2 for it",
@@ -62,21 +62,18 @@ def judge_middleware(rmw: str) -> Finding:
 
 def domain(_: Situation, environ: Mapping[str, str] = os.environ) -> Iterator[Finding]:
     """The ROS domain and the discovery range are valid."""
-    text = environ.get("ROS_DOMAIN_ID", "") or "0"
-    if not text.isdecimal() or int(text) > _LAST_DOMAIN:
-        yield fail(
-            "ROS domain",
-            f"ROS_DOMAIN_ID is `{text}`",
-            f"set it to a number from 0 to {_LAST_SAFE_DOMAIN}, the same in every terminal",
-        )
-    elif int(text) > _LAST_SAFE_DOMAIN:
-        yield warn(
-            "ROS domain",
-            f"ROS_DOMAIN_ID is {text}; its ports may be taken by outgoing connections",
-            f"use a number from 0 to {_LAST_SAFE_DOMAIN}",
-        )
-    else:
-        yield ok("ROS domain", f"{text}; your nodes must use the same")
+    try:
+        number = own_domain(environ)
+        if number <= DOMAINS[-1]:
+            yield ok("ROS domain", f"{number}; your nodes must use the same")
+        else:
+            yield warn(
+                "ROS domain",
+                f"ROS_DOMAIN_ID is {number}; its ports may be taken by outgoing connections",
+                f"use a number from 0 to {DOMAINS[-1]}",
+            )
+    except RosError as error:
+        yield fail("ROS domain", error.message, error.hint)
     reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "")
     if environ.get("ROS_LOCALHOST_ONLY") == "1":
         yield warn(

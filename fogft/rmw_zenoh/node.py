@@ -25,8 +25,8 @@ from fogft.rmw_zenoh.entities import Client, Server
 from fogft.rmw_zenoh.naming import CLIENT, NODE, SERVER, Graph, Token
 from fogft.ros import vendors
 from fogft.ros.pacing.pacer import NodeProbes
+from fogft.ros.reservations import own_domain
 
-_DOMAIN = "ROS_DOMAIN_ID"
 _LOOK_EVERY_S = 1.0
 
 FaultOf = Callable[[str, str], Callable[[bytes], str]]
@@ -57,7 +57,7 @@ class RmwZenohNode:
         self._look_at = 0.0
         self._fault_of = fault_of
         self._noticed = noticed
-        self._domain = _domain(environ) if domain_id is None else domain_id
+        self._domain = own_domain(environ) if domain_id is None else domain_id
         self._numbers = itertools.count(1)
         self._made: list[Server | Client] = []
         self._lock = threading.Lock()
@@ -180,13 +180,6 @@ class RmwZenohNode:
         for made in self._made:
             made.close()
         self._session.close()
-
-
-def _domain(environ: Mapping[str, str]) -> int:
-    text = environ.get(_DOMAIN) or "0"
-    if not text.isdecimal():
-        raise RosError(f"`{_DOMAIN}={text}` is not a ROS domain", "set it to a number, such as 7")
-    return int(text)
 
 
 FILE, OVERRIDE = "ZENOH_SESSION_CONFIG_URI", "ZENOH_CONFIG_OVERRIDE"

@@ -13,10 +13,12 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from fogft.errors import RosError
 from fogft.ros.spdp import domain_of
 
 DOMAINS = range(1, 102)  # ports of higher domains are in Linux's ephemeral range
 _LOW_DOMAINS = 60  # preferred: robots' and tests' own tend to be 0 or above these
+LAST_DOMAIN = 232
 PORTS = range(20_000, 32_000)  # below Linux's ephemeral ones
 
 
@@ -33,11 +35,12 @@ class Reservation:
 
 
 def own_domain(environ: Mapping[str, str] = os.environ) -> int:
-    """Return the ROS domain that an environment names."""
-    try:
-        return int(environ.get("ROS_DOMAIN_ID") or 0)
-    except ValueError:
-        return 0
+    """Return the ROS domain that an environment names. Raises RosError: it names none."""
+    text = environ.get("ROS_DOMAIN_ID") or "0"
+    if not text.isdecimal() or int(text) > LAST_DOMAIN:
+        hint = f"set it to a number from 0 to {DOMAINS[-1]}, the same in every terminal"
+        raise RosError(f"`ROS_DOMAIN_ID={text}` is not a ROS domain", hint)
+    return int(text)
 
 
 def reserve_domain(not_these: Iterable[int] = ()) -> Reservation | None:

@@ -11,7 +11,7 @@ import pytest
 
 from fogft import disk
 from fogft.cli import main, progress
-from fogft.errors import FogftError, SpecError
+from fogft.errors import FogftError, RosError, SpecError
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.pool.commands import init, preview, startup
@@ -358,6 +358,14 @@ def test_an_example_with_a_type_of_its_own_asks_for_its_workspace(tmp_path, name
     with pytest.raises(SpecError, match=f"no package `{package}`") as caught:
         preview.order(files[0])
     assert "source its workspace" in caught.value.hint
+
+
+def test_no_machine_is_launched_for_a_robot_whose_ros_domain_is_none(tmp_path, monkeypatch):
+    (file, *_) = init.copy_example("echo", tmp_path / "echo")
+    for domain in ("seven", "233"):
+        monkeypatch.setenv("ROS_DOMAIN_ID", domain)
+        with pytest.raises(RosError, match=f"`ROS_DOMAIN_ID={domain}` is not a ROS domain"):
+            preview.order(file)
 
 
 def test_an_unknown_example_is_an_error(capsys):

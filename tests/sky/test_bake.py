@@ -108,18 +108,21 @@ def docker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "lab").mkdir()
     (tmp_path / "lab/serve.py").write_text("serve")
     (tmp_path / "lab/pool.yaml").write_text(FILE)
+    by_region = FILE.replace('"docker:lab/ros:1"', '{us-east-1: "docker:lab/ros:1"}')
+    (tmp_path / "lab/by-region.yaml").write_text(by_region)
     return tmp_path
 
 
+@pytest.mark.parametrize("file", ["pool.yaml", "by-region.yaml"])
 @pytest.mark.parametrize(
     ("base", "tag", "found"),
     [(None, "lab/baked:1", "lab/ros:1"), (None, "lab/ros:1", "ubuntu:24.04"),
      ("lab/own:2", "lab/ros:1", "lab/own:2")],
 )  # fmt: skip
 def test_an_image_is_built_on_the_files_own_but_never_on_itself(
-    docker: Path, base: str | None, tag: str, found: str
+    docker: Path, base: str | None, tag: str, found: str, file: str
 ):
-    commands.bake(docker / "lab/pool.yaml", tag, base, push=False)
+    commands.bake(docker / f"lab/{file}", tag, base, push=False)
     text = (docker / "context/Dockerfile").read_text()
     assert text.startswith(f"FROM {found}\n")
     assert "\nCOPY workdir /root/sky_workdir\n" in text

@@ -5,6 +5,7 @@ Not here: the content of the image (`fogft.cloud.port.RealCloud`).
 
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 from fogft.cloud.port import RealCloud
@@ -29,7 +30,9 @@ def bake(file: Path, tag: str, base: str | None, *, push: bool) -> None:
     if not isinstance(cloud, RealCloud):
         raise SpecError(f"`{file}` names no real cloud", "the local cloud needs no image")
     task = with_build(absolute(spec.task, file.resolve().parent))
-    named = {str(one.get("image_id", "")) for _, one in alternatives(task.get("resources") or {})}
+    asked = [one.get("image_id") for _, one in alternatives(task.get("resources") or {})]
+    each = [list(one.values()) if isinstance(one, Mapping) else [one] for one in asked]
+    named = {str(one) for ids in each for one in ids}
     images = sorted(one.removeprefix(_DOCKER) for one in named if one.startswith(_DOCKER))
     if base is None:
         base = next((image for image in images if image != tag), PLAIN)

@@ -32,6 +32,7 @@ from fogft.poolfile.changes import changes, replaces_replicas
 from fogft.poolfile.named_clouds import cloud_named_by, clouds_named, located
 from fogft.poolfile.pool import Checks
 from fogft.reason_words import words
+from fogft.ros.reservations import own_domain
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,11 @@ def order(
     """Read and check a pool file, and preview its effect. Changes nothing.
 
     The pool runs on `cloud`, by default the one that its resources name, else `local`; `told` is
-    called before slow steps.
+    called before slow steps. Raises FogftError: the file, or ROS_DOMAIN_ID, cannot be used.
     """
     source = pool_file.read_text(file)
     spec = pool_file.parse(source, str(file), checks_here(), file.resolve().parent)
+    own_domain()  # before machines are launched that no client proxy could use
     cloud_name = cloud or cloud_named_by(spec, source, file)
     concrete = make_cloud(cloud_name)
     store = make_store(spec.name)
