@@ -13,7 +13,7 @@ from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.planning.observed.history import Event, EventKind
 from tests.fakes.pools import FILE, STATUS, alive, lay_down
-from tests.pool.folder.test_costs import NOON, STEADY, UID, CostBook, machine
+from tests.pool.folder.test_costs import NOON, STEADY, UID, CostBook, machine, seen
 
 LAUNCH = Event(1_000_000.0, EventKind.LAUNCH, 0, 1, "local/us-west-2/a", Reason(Cause.NEW_SLOT))
 GONE = Event(1_000_060.0, EventKind.GONE, 0, 1, reason=Reason(Cause.NOTICE))
@@ -95,7 +95,8 @@ def test_a_pool_is_named_in_the_same_ways_everywhere(home, capsys, words):
 def test_what_was_spent_is_shown_by_day_and_replica(home: Path, capsys):
     for name, price in (("perception", 0.5), ("planner", 0.25)):
         kept = CostBook(home / "costs", name, UID)
-        kept.look(NOON + 18 * 3600, [machine(0, STEADY, usd_per_hour=price)], [], 600.0)
+        machines = [machine(0, STEADY, usd_per_hour=price)]
+        kept.look(seen(NOON + 18 * 3600, machines, []), 600.0)
     assert main.run(["cost", "perception"]) == 0
     shown = capsys.readouterr().out
     assert "perception: $9.000" in shown
