@@ -63,7 +63,7 @@ def judge_middleware(rmw: str) -> Finding:
 def domain(_: Situation, environ: Mapping[str, str] = os.environ) -> Iterator[Finding]:
     """The ROS domain and the discovery range are valid."""
     try:
-        number = own_domain(environ)
+        number = own_domain(environ, of_dds=True)
         if number <= DOMAINS[-1]:
             yield ok("ROS domain", f"{number}; your nodes must use the same")
         else:

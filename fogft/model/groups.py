@@ -105,10 +105,19 @@ def overridden(resources: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str
     """Return `resources` with the keys of `own`; a place in `own` replaces every other place."""
     out = dict(resources)
     if any(key in own for key in PLACE_KEYS):
-        out = {key: value for key, value in out.items() if key not in PLACE_KEYS}
+        out = _without_place(out, own)
         for key in {"any_of", "ordered"} & out.keys():
-            out[key] = [{k: one[k] for k in one if k not in PLACE_KEYS} for one in out[key] or ()]
+            out[key] = [_without_place(one, own) for one in out[key] or ()]
     return {**out, **own}
+
+
+def _without_place(resources: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
+    """Return `resources` without their place, except for the cloud if `own` names none."""
+    out = {key: value for key, value in resources.items() if key not in PLACE_KEYS}
+    cloud = resources.get("cloud") or str(resources.get("infra") or "").partition("/")[0]
+    if cloud not in ("", "*") and not {"infra", "cloud"} & own.keys():
+        out["cloud"] = cloud
+    return out
 
 
 def with_spot(resources: Mapping[str, Any], spot: bool) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """The fraction of time that a replica, or a whole pool, is down. Pure arithmetic.
 
-docs/design/availability.md describes the model, which is exact for any replicas. All arguments come
-from a pool file, whose reader has checked their ranges.
+docs/design/availability.md describes the model, which is exact for any replicas. Ranges are checked
+where arguments are read: in the pool file, or the history.
 
 Source: FogROS2-FT, section III.C, which prints the fraction for N upside down.
 Not here: how many replicas are launched (`sizing`).

@@ -72,6 +72,8 @@ def plan_gateway(inputs: Inputs, offers: Sequence[Offer], *, heard_at: float) ->
             ends.append((machine.id, Reason(Cause.DOWN if intent.stopping else Cause.NOT_WANTED)))
         elif machine.spec_hash != version(spec):
             ends.append((machine.id, Reason(Cause.OUTDATED)))
+        elif machine.id in observed.certificates_due:
+            ends.append((machine.id, Reason(Cause.CERTIFICATE_DUE)))
         elif fault is not None:
             failed.add(machine.id)
             ends.append((machine.id, fault))

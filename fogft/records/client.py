@@ -8,6 +8,7 @@ Not here: what records mean (`fogft.records.roster`).
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import threading
 import time
@@ -85,7 +86,8 @@ class RendezvousClient:
     def close(self) -> None:
         """End all connections and write the cache. Repeatable."""
         if self._thread is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(lambda: self._main.cancel())  # noqa: PLW0108 - set by then
+            with contextlib.suppress(RuntimeError):  # it has just ended
+                self._loop.call_soon_threadsafe(lambda: self._main.cancel())  # noqa: PLW0108 - set by then
             self._thread.join(_END_WAIT_S)
 
     def publish(

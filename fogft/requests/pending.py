@@ -241,7 +241,7 @@ class PendingRequests:
             means = self.decide.judge(id, replica, payload, reading, pending)
         if request is None:
             return means, None, (), Verdict.LATE
-        if pending and pending.died_at and (died := pending.died_at - {replica}):
+        if pending and pending.deaths and (died := pending.died_at - {replica}):
             # If only one died, it is rather the cause: another has survived the request.
             pending.deaths = min(pending.deaths, len(died) - 1)
             for other in died:

@@ -34,13 +34,15 @@ class Reservation:
         self._socket.close()
 
 
-def own_domain(environ: Mapping[str, str] = os.environ) -> int:
+def own_domain(environ: Mapping[str, str] = os.environ, *, of_dds: bool = False) -> int:
     """Return the ROS domain that an environment names. Raises RosError: it names none."""
     text = environ.get("ROS_DOMAIN_ID") or "0"
-    if not text.isdecimal() or int(text) > LAST_DOMAIN:
-        hint = f"set it to a number from 0 to {DOMAINS[-1]}, the same in every terminal"
-        raise RosError(f"`ROS_DOMAIN_ID={text}` is not a ROS domain", hint)
-    return int(text)
+    with contextlib.suppress(ValueError):
+        number = int(text)
+        if number >= 0 and not (of_dds and number > LAST_DOMAIN):
+            return number
+    hint = f"set it to a number from 0 to {DOMAINS[-1]}, the same in every terminal"
+    raise RosError(f"`ROS_DOMAIN_ID={text}` is not a ROS domain", hint)
 
 
 def reserve_domain(not_these: Iterable[int] = ()) -> Reservation | None:

@@ -152,6 +152,7 @@ def test_a_state_folder_that_others_read_is_found(tmp_path):
     [
         ({}, Verdict.OK, Verdict.OK),
         ({"ROS_DOMAIN_ID": "42"}, Verdict.OK, Verdict.OK),
+        ({"ROS_DOMAIN_ID": " 5"}, Verdict.OK, Verdict.OK),
         ({"ROS_DOMAIN_ID": "150"}, Verdict.WARN, Verdict.OK),
         ({"ROS_DOMAIN_ID": "233"}, Verdict.FAIL, Verdict.OK),
         ({"ROS_DOMAIN_ID": "-1"}, Verdict.FAIL, Verdict.OK),

@@ -117,6 +117,9 @@ def test_what_has_failed_or_is_outdated_ends_first():
         found = step(one)
         assert [reason.cause for _, reason in found.ends] == [cause]
         assert found.launch is None
+    observed = Observed(NOW, (), gateway=(machine(),), certificates_due=frozenset({machine().id}))
+    due = plan_gateway(Inputs(POOL, Intent(), observed, History()), (CHEAP,), heard_at=NOW)
+    assert [reason.cause for _, reason in due.ends] == [Cause.CERTIFICATE_DUE]
 
 
 def test_one_that_was_up_is_replaced_at_once_and_one_that_never_was_after_a_pause():

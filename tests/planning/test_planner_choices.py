@@ -232,6 +232,13 @@ def test_a_groups_own_place_replaces_every_place_of_the_file():
     assert overridden(shared, {"infra": "oci"}) == {**kept, "infra": "oci"}
     assert overridden({"infra": "aws"}, {"cloud": "gcp"}) == {"cloud": "gcp"}
     assert overridden(shared, {"cpus": 4}) == {**shared, "cpus": 4}
+    west = {"region": "us-west-2"}
+    assert overridden({"cloud": "aws", "region": "a", "zone": "aa"}, west) == {
+        "cloud": "aws",
+        **west,
+    }
+    listed = {"any_of": [{"infra": "aws/a", "cpus": 2}, {"infra": "*/a"}]}
+    assert overridden(listed, west) == {"any_of": [{"cpus": 2, "cloud": "aws"}, {}], **west}
 
 
 def test_each_group_gets_its_own_kind_in_its_own_slots():

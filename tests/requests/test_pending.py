@@ -476,6 +476,8 @@ def test_any_answer_of_another_replica_clears_a_request_and_disproves_a_crash():
         requests.attempt(id, 2, now)
         requests.answered(id, id, 2, NO, False, None, now)
         assert not requests.get(id).deaths, "it need not run alone any more"
+        requests.attempt(id, 3, now)
+        requests.answered(id, id, 3, NO, False, None, now)  # one false alarm, however many answer
     assert deaths == [1] * FALSE_ALARMS + [0], "at last, it is not believed"
 
 

@@ -116,15 +116,22 @@ def test_an_on_demand_stand_in_keeps_what_its_spot_alternative_asks_for():
     assert built(asked, WEST)["resources"]["image_id"] == "ami-west"
 
 
+def test_of_several_alternatives_that_fit_the_most_precise_counts():
+    anywhere, there = {"infra": "aws", "disk_size": 50}, {"infra": "aws/us-west-2", "disk_size": 60}
+    named = {"infra": "aws", "instance_type": WEST.instance, "disk_size": 70}
+    for asked, size in (([anywhere, there], 60), ([anywhere, there, named], 70)):
+        assert built({"resources": {"any_of": asked}}, WEST)["resources"]["disk_size"] == size
+
+
 def test_alternatives_in_one_place_may_differ_by_the_machine_only():
     there, big = {"infra": "aws/us-east-1", "cpus": "2+"}, {"cpus": "8+", "accelerators": "L4"}
     both = {"resources": {"any_of": [there, {**there, **big}]}}
-    task.refuse_what_cannot_be_honoured(both)
+    task.check(both)
     both["resources"]["any_of"][1]["image_id"] = "ami-gpu"
     with pytest.raises(SpecError, match=r"resources.any_of\[1\]: differs .* same place"):
-        task.refuse_what_cannot_be_honoured(both)
+        task.check(both)
     both["resources"]["any_of"][1]["instance_type"] = "g6.2xlarge"
-    task.refuse_what_cannot_be_honoured(both)
+    task.check(both)
 
 
 def test_accelerators_that_the_instance_type_does_not_imply_are_named():

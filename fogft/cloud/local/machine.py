@@ -20,7 +20,7 @@ from fogft import child, disk, logfile
 from fogft.cloud.local import faults, processes, task_commands
 from fogft.cloud.local.ending import sweep_shared_memory
 from fogft.cloud.local.folder import END, LINK, LOCK, NOTICE, STATE, MachineFolder, Record, State
-from fogft.errors import FogftError, StateError
+from fogft.errors import FogftError, StateError, told
 from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
@@ -100,6 +100,10 @@ class Machine:
             reason = words(failed.reason)
             log.error("machine_failed replica=%s reason=%r", self._folder.id.short, reason)
             self._say(State(MachinePhase.FAILED, failure=failed.reason))
+        except FogftError as error:
+            log.error("machine_failed replica=%s reason=%r", self._folder.id.short, error.message)
+            failure = Reason(Cause.ERROR, words=told(error))
+            self._say(State(MachinePhase.FAILED, failure=failure))
         finally:
             self._end_the_rest({self._guard})
             if self._relay is not None:

@@ -32,7 +32,7 @@ from fogft.cloud.sky.prices import Prices, disk_usd_per_hour
 from fogft.cloud.sky.provider import NotAllowedError, Provider
 from fogft.cloud.sky.sdk import RefusedError
 from fogft.cloud.sky.settings import GROUP
-from fogft.cloud.sky.task import refuse_what_cannot_be_honoured
+from fogft.cloud.sky.task import check, refuse_what_cannot_be_honoured
 from fogft.disk import read_bytes, write_whole
 from fogft.errors import CloudError, CloudUnreachable, NoCapacity, QuotaExceeded, StateError
 from fogft.model.reason import Cause
@@ -87,7 +87,7 @@ class SkyCloud:
     sleep: Callable[[float], object] = time.sleep
     make_wheel: Callable[[Path], Path] = wheel.make
     make_lock: Callable[[Path], wheel.Locks] = wheel.lock
-    check_task = staticmethod(refuse_what_cannot_be_honoured)
+    check_task = staticmethod(check)
 
     def __post_init__(self) -> None:
         self._providers = by_name = {provider.cloud: provider for provider in self.providers}

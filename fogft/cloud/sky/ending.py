@@ -67,7 +67,8 @@ class Ending:
                 continue
             quiet = 0 if left else quiet + 1
             late = self.clock() - begun_at > _LIMIT_S
-            if quiet >= (1 if late or id in self.census.listed else enough):
+            listed = enough < _ABORTED_CHECKS and id in self.census.listed
+            if quiet >= (1 if late or listed else enough):
                 return
             trouble = CloudError(f"still there: {', '.join(left)}")
         raise CloudUnreachable(

@@ -36,16 +36,7 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
     for target in task.get("file_mounts") or {}:
         if f"{os.path.normpath(str(target))}/".startswith(f"{OURS}/"):
             raise SpecError.of_key(f"file_mounts.{target}", f"`{OURS}` is fogft's own folder")
-    of_machine: dict[tuple[object, ...], Mapping[str, Any]] = {}
     for where, entry in alternatives(task.get("resources") or {}):
-        machine = *place(entry), entry.get("instance_type"), bool(entry.get("use_spot"))
-        kept = {key: value for key, value in entry.items() if key not in _CHOICES}
-        if of_machine.setdefault(machine, kept) != kept:  # `alternative` cannot tell them apart
-            raise SpecError.of_key(
-                where,
-                "differs from an earlier alternative in the same place by more than the machine",
-                "name the `instance_type` of each, or put them into `fogft.groups`",
-            )
         for key, reason in _REFUSED_RESOURCES.items():
             if entry.get(key, []) != []:
                 raise SpecError.of_key(f"{where}.{key}", "is not supported in a pool", reason)
@@ -61,6 +52,21 @@ def refuse_what_cannot_be_honoured(task: Mapping[str, Any]) -> None:
             )
 
 
+def check(task: Mapping[str, Any]) -> None:
+    """Raise `SpecError` too if two alternatives cannot be told apart at a launch."""
+    refuse_what_cannot_be_honoured(task)
+    of_machine: dict[tuple[object, ...], Mapping[str, Any]] = {}
+    for where, entry in alternatives(task.get("resources") or {}):
+        machine = *place(entry), entry.get("instance_type"), bool(entry.get("use_spot"))
+        kept = {key: value for key, value in entry.items() if key not in _CHOICES}
+        if of_machine.setdefault(machine, kept) != kept:
+            raise SpecError.of_key(
+                where,
+                "differs from an earlier alternative in the same place by more than the machine",
+                "name the `instance_type` of each, or put them into `fogft.groups`",
+            )
+
+
 def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
     """Return `resources` plus what a launch adds to it, which a cloud may not support."""
     ours = dict(read()["resources"])
@@ -72,7 +78,10 @@ def as_launched(resources: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[str, Any]:
-    """Return the alternative that a placement was offered for; a stand-in's market is another."""
+    """Return the alternative that a placement was offered for; a stand-in's market is another.
+
+    Of several, the one that names the machine, or the place, more precisely.
+    """
     machine = placement.instance.partition("+")[0]
     fitting = (
         entry
@@ -80,9 +89,12 @@ def alternative(resources: Mapping[str, Any], placement: Placement) -> Mapping[s
         if sells(entry, placement.cloud, placement.region, placement.zone)
         and entry.get("instance_type") in (None, machine)
     )
-    return min(
-        fitting, key=lambda one: bool(one.get("use_spot")) != placement.spot, default=resources
-    )
+
+    def distance(entry: Mapping[str, Any]) -> tuple[bool, bool, int]:
+        other_market = bool(entry.get("use_spot")) != placement.spot
+        return other_market, not entry.get("instance_type"), place(entry).count("")
+
+    return min(fitting, key=distance, default=resources)
 
 
 def build(

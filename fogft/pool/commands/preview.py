@@ -13,6 +13,7 @@ from pathlib import Path
 
 from fogft.cloud.port import RealCloud
 from fogft.errors import CloudError, PoolNotFound, SpecError
+from fogft.model.choices import Speaks
 from fogft.model.intent import Intent
 from fogft.model.replica import Observed, Offer
 from fogft.model.spec import PoolSpec
@@ -80,7 +81,8 @@ def order(
     """
     source = pool_file.read_text(file)
     spec = pool_file.parse(source, str(file), checks_here(), file.resolve().parent)
-    own_domain()  # before machines are launched that no client proxy could use
+    # Before machines are launched that no client proxy could use.
+    own_domain(of_dds=spec.rmw.robot is Speaks.RCLPY)
     cloud_name = cloud or cloud_named_by(spec, source, file)
     concrete = make_cloud(cloud_name)
     store = make_store(spec.name)

@@ -78,9 +78,19 @@ def create_authority(folder: Path, pool_uid: str) -> None:
     disk.write_whole(folder / AUTHORITY_CERTIFICATE, certificate)
 
 
+def end_of(folder: Path) -> float:
+    """Return when the CA expires, in seconds since the epoch."""
+    return describe(folder / AUTHORITY_CERTIFICATE).not_after.timestamp()
+
+
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
     """Certify a new key under a name of 1 to 64 characters, for `days` or until the CA expires."""
     issuer, now = _load_authority(folder), datetime.datetime.now(datetime.timezone.utc)
+    if issuer[0].not_valid_after_utc <= now:
+        raise CredentialError(
+            f"the pool's CA expired at {issuer[0].not_valid_after_utc:%Y-%m-%d}",
+            "set the clock, or recreate the pool with `fogft down`, then `fogft up`",
+        )
     not_after = min(now + datetime.timedelta(days=days), issuer[0].not_valid_after_utc)
     certificate, key = _made(common_name, role=role, not_after=not_after, issuer=issuer)
     return Credential(certificate, key, (folder / AUTHORITY_CERTIFICATE).read_bytes())

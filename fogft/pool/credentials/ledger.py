@@ -85,10 +85,14 @@ class Ledger:
         return frozenset(id for id in good if id.slot >= FIRST_BY_HAND)
 
     def due(self, now: float) -> frozenset[ReplicaId]:
-        """Return the replicas whose certificates expire soon, or have expired."""
+        """Return the replicas whose certificates expire soon, and new ones would not."""
         soon = now + authority.RENEW_BEFORE.total_seconds()
-        due = (e.holder for e in self.entries() if e.state(soon) == "expired")
-        return frozenset(_replica(holder) for holder in due if holder.role is Role.REPLICA)
+        last = {e.common_name: e for e in self.entries()}  # a stopped machine has several
+        due = [e.holder for e in last.values() if e.state(soon) == "expired"]
+        found = frozenset(_replica(holder) for holder in due if holder.role is Role.REPLICA)
+        if found and authority.end_of(self._folder) <= soon:
+            return frozenset()
+        return found
 
     def gateways(self) -> dict[str, tuple[int, ...]]:
         """Return the generations of each gateway's valid certificates, by name."""

@@ -230,7 +230,7 @@ class Reconciler:
         doubt_s = self.timekeeping.watch.doubt_s
         due: frozenset[ReplicaId] = frozenset()
         with contextlib.suppress(FogftError):  # `_publish` reports it; machines must still end
-            due = self.certificates_due(now - doubt_s)
+            due = self.certificates_due(min(now, now - doubt_s))
         seen = Observed(now, machines, links, sold, ending, {}, doubt_s, gateway, stopped, due)
         return replace(seen, rtt_s=self.distances(spec, seen)), trouble
 

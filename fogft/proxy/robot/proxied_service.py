@@ -57,7 +57,8 @@ class ProxiedService:
         ready = [link for link in links if self.spec.name in link.ready]
         if self.spec.part is Part.CANCEL:  # draining replicas get cancellations, but no new work
             return ready
-        return [link for link in ready if link.peer.id not in draining] or ready
+        staying = [link for link in ready if link.peer.id not in draining]
+        return staying if len(staying) >= self.spec.quorum else ready
 
     def advertise(self, node: RosNode, now: float) -> None:
         """Offer or withdraw the service, as required now (monotonic seconds)."""

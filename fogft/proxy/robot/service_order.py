@@ -93,7 +93,7 @@ class ServiceOrder(Decide):
             )
         if self._term.stranded:
             return "no reachable replica has the state; see docs/design/state.md"
-        if self._deposed >= _DEPOSED_LIMIT:
+        if self._deposed >= _DEPOSED_LIMIT and not self._term.ready:
             return (
                 "another client proxy keeps ordering its requests with this robot's certificate; "
                 "end it, or give that robot its own: see docs/how-to/several-robots.md"

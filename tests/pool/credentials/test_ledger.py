@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import stat
 import threading
 import time
@@ -103,6 +104,25 @@ def test_replicas_are_due_two_months_before_their_certificates_expire(ledger: Le
     ledger.issue_next(Role.ROBOT, "ada", UID, days=1)
     assert ledger.due(time.time()) == {ReplicaId(UID, 0, 1)}
     assert ledger.due(time.time() - 3 * DAY_S) == frozenset()
+    ledger.issue(Holder(Role.REPLICA, "0", 1, UID), days=61)
+    assert ledger.due(time.time()) == frozenset(), "it was stopped, and started with a new one"
+
+
+@pytest.mark.parametrize("days", [30, -1])
+def test_what_ends_with_the_ca_is_not_replaced_by_what_ends_then_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int
+) -> None:
+    """A CA of an earlier version, made by a slow clock."""
+    now = datetime.datetime.now(datetime.timezone.utc)
+    monkeypatch.setattr(authority, "NEVER", now + datetime.timedelta(days=days))
+    authority.create_authority(tmp_path / "old", UID)
+    old = Ledger(tmp_path / "old")
+    if days < 0:
+        with pytest.raises(CredentialError, match="CA expired at"):
+            old.issue(Holder(Role.REPLICA, "0", 1, UID))
+    else:
+        old.issue(Holder(Role.REPLICA, "0", 1, UID))
+        assert old.due(time.time()) == frozenset()
 
 
 def test_a_clock_that_is_years_ahead_lets_nobody_in_again(ledger: Ledger, clock: Clock) -> None:

@@ -525,12 +525,13 @@ def test_two_proxies_with_one_certificate_say_why_they_answer_nothing(tmp_path):
     while calls := scene.clients[0].snapshot.calls:
         calls.pop()[1](b"state")
         scene.run()
+    assert scene.dispatcher.able
+    assert not scene.dispatcher.report()["order"]["trouble"], "the other one has ended"
     scene.dispatcher.submit(b"q", "h")
     scene.run()
     scene.serve(0, b"a")
     scene.run()
     assert scene.responses == [("h", b"a")]
-    assert not scene.dispatcher.report()["order"]["trouble"], "the other one has ended"
 
 
 @pytest.mark.parametrize("op", [op for op in Op if op is not Op.CLAIM])

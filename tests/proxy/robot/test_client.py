@@ -134,6 +134,15 @@ def test_a_draining_replica_is_spared_while_another_can_answer(by):
     assert [len(link.offered) for link in scene.dialer.links] == [0, 1]
 
 
+def test_a_draining_replica_is_asked_where_a_quorum_needs_it():
+    scene = Scene()
+    scene.proxy.serve([ServiceSpec("/s", SET_BOOL, quorum=2)])
+    scene.follow(member(0, draining=True), member(1))
+    scene.ready(*scene.dialer.links)
+    scene.ask()
+    assert [len(link.offered) for link in scene.dialer.links] == [1, 1]
+
+
 def test_a_draining_replica_is_told_to_cancel_too():
     """It may be the one that works on the goal."""
     scene = Scene()
