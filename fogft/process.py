@@ -135,9 +135,9 @@ class Wakeup:
         except RuntimeError:
             pass  # already woken
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait to be woken, for at most `timeout_s`. One thread."""
-        self._asleep.acquire(timeout=timeout_s)
+    def wait(self, timeout_s: float) -> bool:
+        """Wait to be woken, for at most `timeout_s`; return whether it was. One thread."""
+        return self._asleep.acquire(timeout=timeout_s)
 
 
 _THREADS = "OPENBLAS_NUM_THREADS"

@@ -10,7 +10,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,9 +17,10 @@ from fogft.child import python, tied
 from fogft.errors import FogftError, StateError
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
-from fogft.process import ending_signals
+from fogft.process import Wakeup, ending_signals
 
 _LOGS_AGAIN_S = 5
+_LOOK_S = 0.1
 _PR_SET_PDEATHSIG = 1
 READY = "fogft_pool_ready"  # a line on stdout for the launch file
 
@@ -34,20 +34,17 @@ def main(arguments: Sequence[str]) -> int:
     parser.add_argument("--timeout")
     parser.add_argument("--down", action="store_true")
     asked = parser.parse_args(arguments)
-    ending = ending_signals()
-    for number in ending:
-        signal.signal(number, signal.default_int_handler)
+    stop = Wakeup()
+    for number in ending_signals():
+        signal.signal(number, lambda *_: stop.wake())
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGTERM), 0, 0, 0)  # even if it is killed
     status = 0
     try:
-        return _run(asked)
-    except KeyboardInterrupt:
-        pass
+        status = _run(asked, stop)
     finally:
-        for number in ending:
-            signal.signal(number, signal.SIG_IGN)  # launch resends it while `down` runs
         if asked.down and _is_ours(asked):
-            status = _fogft("down", asked.pool, "--yes").wait()
+            ended = _fogft("down", asked.pool, "--yes").wait()
+            status = status or ended
     return status
 
 
@@ -61,19 +58,20 @@ def _is_ours(asked: argparse.Namespace) -> bool:
         return False
 
 
-def _run(asked: argparse.Namespace) -> int:
+def _run(asked: argparse.Namespace, stop: Wakeup) -> int:
     options = ["--yes"]
     if asked.cloud:
         options += ["--cloud", asked.cloud]
     if asked.timeout:
         options += ["--timeout", asked.timeout]
-    status = _wait(_fogft("up", asked.file, *options))
+    status = _wait(_fogft("up", asked.file, *options), stop)
     if status != 0:
-        return status
+        return status or 0
     print(READY, flush=True)
     while _is_ours(asked):  # both go on if `logs` is killed
-        _wait(_fogft("logs", "--follow", "--lines", "0", "--pool", asked.pool))
-        time.sleep(_LOGS_AGAIN_S)
+        logs = _fogft("logs", "--follow", "--lines", "0", "--pool", asked.pool)
+        if _wait(logs, stop) is None or stop.wait(_LOGS_AGAIN_S):
+            break
     return 0
 
 
@@ -88,17 +86,18 @@ def _fogft(*words: str) -> subprocess.Popen[bytes]:
     )
 
 
-def _wait(child: subprocess.Popen[bytes]) -> int:
-    try:
-        return child.wait()
-    except KeyboardInterrupt:
-        child.send_signal(signal.SIGINT)
-        try:
-            child.wait(5)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-        raise
+def _wait(child: subprocess.Popen[bytes], stop: Wakeup) -> int | None:
+    """Return a child's status, or None once this process is to stop, with the child ended."""
+    while child.poll() is None:
+        if stop.wait(_LOOK_S):
+            child.send_signal(signal.SIGINT)
+            try:
+                child.wait(5)
+            except subprocess.TimeoutExpired:
+                child.kill()
+                child.wait()
+            return None
+    return child.returncode
 
 
 if __name__ == "__main__":

@@ -22,11 +22,10 @@ import os, signal, sys, time
 with open(os.environ["TRACE"], "a") as trace:
     trace.write(" ".join(sys.argv[1:]) + "\\n")
 if sys.argv[1] == "up":
-    if os.environ["FAKE_UP"] == "slow":
-        signal.pause()
     if os.environ["FAKE_UP"] == "orphaned":  # launch dies meanwhile
         os.kill(int(os.environ["LAUNCH"]), signal.SIGKILL)
-        sys.exit(0)
+    if os.environ["FAKE_UP"] in ("orphaned", "slow"):
+        signal.pause()
     sys.exit(0 if os.environ["FAKE_UP"] == "killed later" else int(os.environ["FAKE_UP"]))
 if sys.argv[1] == "logs":
     print(f"0.1 a line, pid {os.getpid()}", flush=True)
@@ -131,10 +130,10 @@ def test_the_pool_ends_with_it_when_asked_to(run_pool, tmp_path: Path, number: i
 
 
 def test_a_pool_that_does_not_come_up_is_told_by_the_status(run_pool, tmp_path: Path) -> None:
-    child = run_pool(up="3")
+    child = run_pool("--down", up="3")
     assert child.wait(20) == 3
     assert READY not in child.stdout.read()
-    assert trace(tmp_path) == ["up f.yaml --yes"]
+    assert trace(tmp_path) == ["up f.yaml --yes", "down p --yes"]
 
 
 def test_an_interrupt_during_up_still_ends_the_pool(run_pool, tmp_path: Path) -> None:
