@@ -106,6 +106,10 @@ class ManagerRecords:
         self._announced = cache.content([sign_record(one, signer) for one in records])
         self._revoked, self._lease = revoked, lease
 
+    def rise(self, epoch: int) -> None:
+        """Sign in a later epoch from now on, beginning with the next look."""
+        self._epoch, self._lease = epoch, None
+
     def _record(self, kind: RecordKind, sequence: int, content: dict[str, Any]) -> Record:
         return Record(self._pool_uid, kind, "", self._epoch, sequence, content)
 

@@ -196,6 +196,10 @@ class Manager:
         report = self._fresh_report(time.time())
         heard = max(self._records.newest_epoch, report.manager_epoch if report else 0)
         if not supersedes(heard, self._lease.epoch):
+            if heard > self._lease.epoch:  # our folder is older: replicas would ignore our leases
+                log.warning("epoch_was_behind pool=%s heard=%d", self._identity.name, heard)
+                self._lease.epoch = self._reconciler.epoch = heard + 1
+                self._records.rise(heard + 1)
             return
         log.error("pool_superseded pool=%s epoch=%d", self._identity.name, heard)
         proxy_supervisor.forbid_restart(self._paths)

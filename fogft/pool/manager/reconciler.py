@@ -338,7 +338,7 @@ class Reconciler:
         gateways = self.gateways() if spec.topology else {}
         ending = {end.id for end in plan.terminations} | observed.ending
         machines = observed.machines or ()
-        cause = spec, machines, plan.draining, ending, revoked, by_hand, gateways
+        cause = self.epoch, spec, machines, plan.draining, ending, revoked, by_hand, gateways
         if cause == self._published_for:
             return
         members = members_of(
