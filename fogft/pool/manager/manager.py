@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from fogft import __version__, disk, logfile
 from fogft.cloud.port import Cloud, Launch, RealCloud
-from fogft.errors import FogftError, PoolBusy, PoolNotFound
+from fogft.errors import FogftError, PoolBusy, PoolNotFound, StateError
 from fogft.metrics.scrape import Scrape
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkReport, LinkState, Offer
@@ -212,14 +212,18 @@ class Manager:
             logfile.bound(path)
 
     def _build_order(self, identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> Launch:
-        signed = self._records.announcements(self._serving_lease(spec))
-        return configuration.build_order(self._paths, identity, spec, planned, signed)
+        return configuration.build_order(self._paths, identity, spec, planned, self._signed(spec))
 
     def _gateway_order(self, spec: PoolSpec, offer: Offer, generation: int) -> Launch:
-        signed = self._records.announcements(self._serving_lease(spec))
         return configuration.gateway_order(
-            self._paths, self._identity, spec, offer, generation, signed=signed
+            self._paths, self._identity, spec, offer, generation, signed=self._signed(spec)
         )
+
+    def _signed(self, spec: PoolSpec) -> bytes:
+        """Return the signed records for a launch. Raises StateError: robots could not be told."""
+        if why := disk.unwritable(self._paths.folder):
+            raise StateError(f"the disk of `{self._paths.folder}` is {why}: nothing is launched")
+        return self._records.announcements(self._serving_lease(spec))
 
     def _gateway_up(self, now: float) -> bool:
         report = self._fresh_report(now)

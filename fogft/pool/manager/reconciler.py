@@ -139,7 +139,7 @@ class Reconciler:
         """Observe, plan and apply once.
 
         Raises:
-            StateError: A file cannot be read or written; the launch concerned was not ordered.
+            StateError: A file cannot be read, or written before the plan is applied.
         """
         if self.timekeeping.look():  # first: `renewed` relies on all else being observed later
             self._silent = Silent()
@@ -179,10 +179,15 @@ class Reconciler:
         trouble += [update.reason] if update is not None else []
         decided = decided._replace(notes=(*map(self._with_log, decided.notes), *trouble))
         if observed.machines is not None:
-            awaited = self._tend_gateway(inputs)
-            if awaited is not None:
-                decided = decided._replace(launches=(), notes=(awaited, *decided.notes))
-            self._apply(identity, inputs, decided)
+            try:
+                awaited = self._tend_gateway(inputs)
+                if awaited is not None:
+                    decided = decided._replace(launches=(), notes=(awaited, *decided.notes))
+                self._apply(identity, inputs, decided)
+            except (FogftError, OSError) as error:  # disk full, no descriptors
+                log.error("plan_not_applied reason=%r", str(error))
+                failed = Reason(Cause.TROUBLE, words=str(error))
+                decided = decided._replace(notes=(*decided.notes, failed))
         return Tick(
             identity, spec, intent, observed, decided, self._membership, over, update, trial.file
         )

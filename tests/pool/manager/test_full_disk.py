@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import subprocess
 import time
@@ -13,6 +14,7 @@ import pytest
 
 from fogft import disk
 from fogft.model import intent
+from fogft.model.replica import ReplicaId
 from fogft.pool.commands import status
 from tests.needs import needs
 from tests.pool.scene import Scene
@@ -77,6 +79,21 @@ def test_a_full_disk_ends_nothing_and_is_waited_out(small: Scene) -> None:
     scaled_by(small, 1)
     small.wait(lambda: small.whole(2))
     assert manager.poll() is None
+
+
+def test_nothing_is_launched_while_the_disk_is_nearly_full(small: Scene) -> None:
+    """Robots might never be told of the machine; status stays true, and says why it waits."""
+    small.write(replicas=1)
+    small.start_manager()
+    small.wait(lambda: small.whole(1))
+    filler = fill(small.home)
+    os.truncate(filler, filler.stat().st_size - (32 << 10))  # room for small files alone
+    small.cloud.terminate(ReplicaId(small.store.identity().uid, 0, 1))
+    small.wait(lambda: any("full: nothing is launched" in n for n in small.status()["notes"]))
+    assert (small.status()["replicas"], small.cloud.launched()) == ([], ["0.1"])
+    filler.unlink()
+    small.wait(lambda: small.whole(1))
+    assert small.cloud.launched() == ["0.1", "0.2"]
 
 
 def test_a_disk_that_is_read_only_for_a_while_is_waited_out(small: Scene) -> None:
