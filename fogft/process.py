@@ -103,6 +103,13 @@ def on_thread(run: Callable[..., object], *arguments: Any, name: str = "") -> th
     return thread
 
 
+def prepared_thread(run: Callable[[], object]) -> Callable[[], None]:
+    """Start a daemon thread that waits; return what lets it run. Raises as `on_thread` does."""
+    begins = threading.Event()
+    on_thread(lambda: begins.wait() and run())
+    return begins.set
+
+
 def ending_signals() -> list[signal.Signals]:
     """Return the signals that end this process: SIGTERM, SIGINT and, except under nohup, SIGHUP."""
     ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN

@@ -105,7 +105,7 @@ class Managed:
         ]
         self._ready = frozenset(service.name for service in spec.services)
         self._reconciler = Reconciler(
-            world, self.store, clock=self._clock, links=self._links, submit=self._submit
+            world, self.store, clock=self._clock, links=self._links, prepare=self._prepare
         )
 
     def _clock(self) -> Reading:
@@ -160,8 +160,8 @@ class Managed:
         gone = sum([vm.gone_at < NEVER for vm in self.world.vms.values()])
         return gone > 1 or any(r.draining_since is not None for r in self.store.history().open())
 
-    def _submit(self, call: Callable[[], None]) -> None:
-        """Submit a cloud call. An accepted order has no effect on the manager until it boots."""
+    def _prepare(self, call: Callable[[], None]) -> Callable[[], None]:
+        """Return what begins a cloud call: once accepted, the manager sees no effect until boot."""
         vms = self.world.vms
 
         def answer() -> object:
@@ -169,7 +169,7 @@ class Managed:
             call()
             return UNSEEN if len(vms) > before else None
 
-        self.world.submit(answer)
+        return lambda: self.world.submit(answer)
 
     def _links(self, pool_uid: str, now: float) -> tuple[LinkReport, ...]:
         """Report the links to the published members, as the client proxy does."""

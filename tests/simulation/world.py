@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from fogft.cloud.port import Launch
@@ -122,7 +123,7 @@ class World:
             self.store,
             clock=lambda: Reading(self.now + self.clock_ahead_s, self.now, self.now),
             links=self.links,
-            submit=self._queue.append if self.deferred else lambda run: run(),
+            prepare=lambda run: partial(self._queue.append, run) if self.deferred else run,
             epoch=epoch,
         )
 

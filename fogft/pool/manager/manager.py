@@ -50,7 +50,7 @@ from fogft.pool.manager.proxy_report import ProxyReport
 from fogft.pool.manager.proxy_supervisor import ProxySupervisor
 from fogft.pool.manager.reconciler import Reconciler, Tick
 from fogft.pool.manager.tally import Tally, of_pool
-from fogft.process import Watchdog, notify, on_thread, start_log, stop_on_signal
+from fogft.process import Watchdog, notify, on_thread, prepared_thread, start_log, stop_on_signal
 from fogft.records.roster import ServingLease
 
 log = logging.getLogger(__name__)
@@ -113,7 +113,7 @@ class Manager:
             clock=timekeeping.read,
             links=self._links,
             build_order=self._build_order,
-            submit=on_thread,
+            prepare=prepared_thread,
             epoch=self._lease.epoch,
             revoked=self._ledger.revoked,
             by_hand=self._ledger.by_hand,
@@ -176,6 +176,7 @@ class Manager:
         for step in (self._lease.beat, self._step_back, self._bound_logs, self._keep_proxy):
             self._attempt(step)
         tick = self._attempt(self._reconciler.tick)
+        self._versions[self._ledger.path] = disk.version(self._ledger.path)  # by a launch's issue
         self._attempt(lambda: self._announce(tick))
         if tick is None:
             return False

@@ -4,7 +4,7 @@ An operation stays in the list until its outcome is collected, so a caller that 
 *before* asking the cloud what exists misses nothing: an order is either still in the list
 or already in the cloud's.
 
-Not here: what to order (`reconciler`) and the threads (the `Submit` that is passed in).
+Not here: what to order (`reconciler`) and the threads (the `Prepare` that is passed in).
 """
 
 import logging
@@ -18,7 +18,8 @@ from fogft.model.replica import ReplicaId
 
 log = logging.getLogger(__name__)
 
-Submit = Callable[[Callable[[], None]], object]
+Run = Callable[[], None]
+Prepare = Callable[[Run], Callable[[], object]]  # returns what begins a run; OSError: nothing can
 T = TypeVar("T")
 
 
@@ -34,8 +35,8 @@ class Outcome(Generic[T]):
 class Operations(Generic[T]):
     """Running operations, each for one replica; `on_done` is called when one ends."""
 
-    def __init__(self, submit: Submit, on_done: Callable[[], None] = lambda: None) -> None:
-        self._submit = submit
+    def __init__(self, prepare: Prepare, on_done: Callable[[], None] = lambda: None) -> None:
+        self._prepare = prepare
         self._on_done = on_done
         self._lock = threading.Lock()
         self._busy: dict[ReplicaId, T] = {}
@@ -54,16 +55,23 @@ class Operations(Generic[T]):
                 del self._busy[outcome.id]
             return outcomes
 
-    def start(self, id: ReplicaId, subject: T, operation: Callable[[], None]) -> bool:
-        """Start an operation, or return False if this replica has one running."""
+    def start(self, id: ReplicaId, subject: T, run: Run, record: Run = lambda: None) -> bool:
+        """Start an operation, or return False if this replica has one running.
+
+        `record` is called once nothing else can prevent it. Raises OSError: no thread can start.
+        """
         with self._lock:
             if id in self._busy:
                 return False
-            self._busy[id] = subject
+        recorded = False
+        begin = self._prepare(lambda: self._run(id, subject, run) if recorded else None)
         try:
-            self._submit(lambda: self._run(id, subject, operation))
-        except OSError as error:  # no thread can be started
-            self._outcomes.append(Outcome(id, subject, error))
+            record()
+            recorded = True
+            with self._lock:
+                self._busy[id] = subject
+        finally:
+            begin()
         return True
 
     def _run(self, id: ReplicaId, subject: T, operation: Callable[[], None]) -> None:

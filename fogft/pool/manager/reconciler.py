@@ -45,7 +45,7 @@ from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import offers
 from fogft.pool.manager.event_recorder import EventRecorder
 from fogft.pool.manager.launched_gateway import LaunchedGateway
-from fogft.pool.manager.operations import Operations, Submit
+from fogft.pool.manager.operations import Operations, Prepare
 from fogft.pool.manager.timekeeping import Timekeeping
 from fogft.pool.manager.updating import Updating
 from fogft.reason_words import words
@@ -109,7 +109,7 @@ class Reconciler:
     clock: Callable[[], Reading]
     links: Links
     build_order: BuildOrder = bare_order
-    submit: Submit = lambda run: run()
+    prepare: Prepare = lambda run: run
     epoch: int = 1
     revoked: Callable[[], frozenset[str]] = frozenset
     by_hand: Callable[[], frozenset[ReplicaId]] = frozenset
@@ -123,8 +123,8 @@ class Reconciler:
         self._refreshing = self.cloud if isinstance(self.cloud, Refreshing) else None
         self._stopping = self.cloud if isinstance(self.cloud, RealCloud) else None
         # The machine that is expected of a launch; None for a termination.
-        self.operations: Operations[Machine | None] = Operations(self.submit, self.on_done)
-        self._refreshes: Operations[None] = Operations(self.submit, self.on_done)
+        self.operations: Operations[Machine | None] = Operations(self.prepare, self.on_done)
+        self._refreshes: Operations[None] = Operations(self.prepare, self.on_done)
         self._silent = Silent()
         self._offers: tuple[Offer, ...] = ()
         self._offers_for: tuple[str, float] | None = None
@@ -184,7 +184,7 @@ class Reconciler:
                 if awaited is not None:
                     decided = decided._replace(launches=(), notes=(awaited, *decided.notes))
                 self._apply(identity, inputs, decided)
-            except (FogftError, OSError) as error:  # disk full, no descriptors
+            except (FogftError, OSError) as error:  # disk full, no descriptors, no threads
                 log.error("plan_not_applied reason=%r", str(error))
                 failed = Reason(Cause.TROUBLE, words=str(error))
                 decided = decided._replace(notes=(*decided.notes, failed))
@@ -247,9 +247,10 @@ class Reconciler:
         for outcome in self._refreshes.collect():
             if outcome.error is not None:
                 log.warning("refresh_failed replica=%s reason=%r", outcome.id.short, outcome.error)
-        for id in self._silent.due(observed, history):
-            if self._refreshes.start(id, None, functools.partial(cloud.refresh, id)):
-                log.info("refresh_ordered replica=%s", id.short)
+        with contextlib.suppress(OSError):  # no thread can be started
+            for id in self._silent.due(observed, history):
+                if self._refreshes.start(id, None, functools.partial(cloud.refresh, id)):
+                    log.info("refresh_ordered replica=%s", id.short)
 
     def _current_offers(
         self, spec: PoolSpec, now: float, trouble: list[Reason]
@@ -366,17 +367,19 @@ class Reconciler:
         self._published_for = cause
 
     def _order(self, order: Launch, reason: Reason) -> None:
-        location = order.placement.location
-        self._recorder.add(
-            EventKind.LAUNCH,
-            order.id,
-            location=location,
-            reason=reason,
-            on_demand=not order.placement.spot,
-            version=order.spec_hash,
-        )
-        why = words(reason)
-        log.info("launch_ordered replica=%s zone=%s reason=%r", order.id.short, location, why)
+        def record() -> None:
+            location = order.placement.location
+            self._recorder.add(
+                EventKind.LAUNCH,
+                order.id,
+                location=location,
+                reason=reason,
+                on_demand=not order.placement.spot,
+                version=order.spec_hash,
+            )
+            why = words(reason)
+            log.info("launch_ordered replica=%s zone=%s reason=%r", order.id.short, location, why)
+
         expected = Machine(
             id=order.id,
             placement=order.placement,
@@ -385,7 +388,7 @@ class Reconciler:
             usd_per_hour=order.usd_per_hour,
             spec_hash=order.spec_hash,
         )
-        self.operations.start(order.id, expected, lambda: self.cloud.launch(order))
+        self.operations.start(order.id, expected, lambda: self.cloud.launch(order), record)
 
     def _terminate(
         self, id: ReplicaId, reason: Reason, history: History, *, stopped: Launch | None = None

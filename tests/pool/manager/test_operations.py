@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+from functools import partial
 
 import pytest
 
@@ -16,9 +17,10 @@ from fogft.planning.planner import PlannedLaunch
 from fogft.pool.folder.store import Identity
 from fogft.pool.manager.operations import Operations
 from fogft.pool.manager.reconciler import Reconciler
-from fogft.process import on_thread
+from fogft.process import prepared_thread
 from tests.fakes.cloud import MockCloud, zones
 from tests.fakes.threads import no_more
+from tests.fakes.waiting import wait_for
 from tests.planning.pool_worlds import NOW, SERVICE, UID, spec
 from tests.simulation.memory_store import MemoryStore
 
@@ -28,7 +30,7 @@ ID = ReplicaId(UID, 0, 1)
 def test_one_operation_a_replica() -> None:
     """A second one is refused until the first one's outcome was collected."""
     waiting: list = []
-    operations: Operations[str] = Operations(waiting.append)
+    operations: Operations[str] = Operations(lambda run: partial(waiting.append, run))
     assert operations.start(ID, "first", lambda: None)
     assert not operations.start(ID, "second", lambda: None)
     waiting.pop()()
@@ -39,18 +41,17 @@ def test_one_operation_a_replica() -> None:
 
 
 def test_operation_without_a_thread_has_failed_and_keeps_no_slot() -> None:
-    """The rest of the tick goes on; the next one may try again."""
-    operations: Operations[str] = Operations(on_thread)
-    with no_more():
-        assert operations.start(ID, "first", lambda: None)
-    assert ["TasksMax" in str(outcome.error) for outcome in operations.collect()] == [True]
-    assert operations.busy() == {}
+    """Nothing is recorded of it; the next tick may try again."""
+    operations: Operations[str] = Operations(prepared_thread)
+    with no_more(), pytest.raises(OSError, match="TasksMax"):
+        operations.start(ID, "first", lambda: None, lambda: pytest.fail("recorded"))
+    assert (operations.busy(), operations.collect()) == ({}, [])
 
 
 def test_outcome_carries_the_error_and_wakes(caplog: pytest.LogCaptureFixture) -> None:
     """A refusal is data; a defect of an adapter is logged with its trace; both wake the owner."""
     woken = threading.Event()
-    operations: Operations[None] = Operations(lambda run: run(), woken.set)
+    operations: Operations[None] = Operations(lambda run: run, woken.set)
 
     def refuse() -> None:
         raise NoCapacity("full")
@@ -81,7 +82,7 @@ class Bench:
             self.store,
             clock=lambda: Reading(*[self.now] * 3),
             links=self.links,
-            submit=self.waiting.append,
+            prepare=lambda run: partial(self.waiting.append, run),
         )
 
     def links(self, uid: str, now: float) -> tuple[LinkReport, ...]:
@@ -109,6 +110,39 @@ def test_launch_is_in_the_history_before_the_cloud_is_asked() -> None:
         tick = bench.reconciler.tick()
         assert tick.plan.launches == ()
     assert len(bench.waiting) == 1
+
+
+def test_launch_that_gets_no_thread_is_no_failure_of_its_location() -> None:
+    """Status says why nothing starts; the tick after there is room launches the same."""
+    bench = Bench()
+    bench.reconciler.operations = Operations(prepared_thread)
+    with no_more():
+        for _ in range(3):
+            tick = bench.reconciler.tick()
+    assert bench.store.events == []
+    assert [n.cause for n in tick.plan.notes if "TasksMax" in n.words] == [Cause.TROUBLE]
+    bench.reconciler.tick()
+    wait_for(lambda: [id.short for id in bench.cloud.calls.launched] == ["0.1"])
+    assert bench.kinds() == [EventKind.LAUNCH]
+
+
+def test_launch_that_cannot_be_written_is_not_begun() -> None:
+    """The thread that was ready for it ends, and the next tick may order the same again."""
+    bench = Bench()
+    written = bench.store.append
+
+    def full(event: Event) -> None:
+        raise StateError("no space left")
+
+    bench.store.append = full  # type: ignore[method-assign]
+    tick = bench.reconciler.tick()
+    assert tick.plan.notes[-1].words == "no space left"
+    bench.run()
+    bench.store.append = written  # type: ignore[method-assign]
+    bench.reconciler.tick()
+    bench.run()
+    assert [id.short for id in bench.cloud.calls.launched] == ["0.1"]
+    assert bench.kinds() == [EventKind.LAUNCH]
 
 
 def test_refused_launch_is_followed_elsewhere_under_a_new_generation() -> None:
