@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from fogft import __version__, logfile
+from fogft import __version__, disk, logfile
 from fogft.cli import output, status_text
 from fogft.errors import FogftError
 from fogft.pool.commands import composition
@@ -118,6 +118,8 @@ def wait(paths: PoolPaths, awaited: Awaited | Settled, timeout_s: float) -> tupl
                 managed_at = time.monotonic()
             elif time.monotonic() - managed_at >= MANAGER_GONE_S:
                 name, log = paths.folder.name, logfile.tail(paths.manager_log, lines=8)
+                if full := disk.unwritable(paths.folder):  # its log lacks that
+                    log = f"{log}\nthe disk of `{paths.folder}` is {full}".strip()
                 raise FogftError(
                     f"the manager of `{name}` has exited:\n{log}",
                     f"restart it with `fogft up`; `fogft down {name}` shuts the pool down",

@@ -117,7 +117,9 @@ def _remark(seen: Seen, paths: PoolPaths) -> None:
         if seen.lease_left_s is not None:
             goes_on += f", and the others shut down in {age(seen.lease_left_s)}"
         output.warn(f"no manager is running: {goes_on if seen.answers else 'nothing is replaced'}")
-        output.hint(f"start one with {up}, or shut the pool down with `fogft down`")
+        full = disk.unwritable(folder)
+        first = f"the disk of `{folder}` is {full}: fix that, then " if full else ""
+        output.hint(f"{first}start one with {up}, or shut the pool down with `fogft down`")
     elif why := disk.unwritable(folder):
         output.warn(f"the disk of `{folder}` is {why}: nothing is launched")
         output.hint(

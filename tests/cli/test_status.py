@@ -117,6 +117,9 @@ def test_a_full_disk_is_told_instead(home, capsys, monkeypatch, why):
     assert said.startswith(f"warning: the disk of `{paths.folder}` is {why}: ")
     assert "`unmanaged_max_hours`" in said  # leases need a file there
     assert "observed" not in said
+    main.run(["status"])  # without a manager, which cannot start either
+    fix = f"the disk of `{paths.folder}` is {why}: fix that, then start one with"
+    assert f"hint: {fix}" in capsys.readouterr().err
 
 
 def test_what_sounds_alarm_stands_in_the_first_line(home, capsys, monkeypatch):

@@ -163,6 +163,10 @@ def test_a_manager_that_ends_meanwhile_ends_the_waiting(home, file, looks, monke
     assert (
         "error: the manager of `planner` has exited:\nits last words\n" in capsys.readouterr().err
     )
+    monkeypatch.setattr(disk, "unwritable", lambda folder: "full")  # then its log may be empty
+    looks(Seen(STATUS, 0.1, False))
+    assert main.run(["up", str(file)]) == 1
+    assert "its last words\nthe disk of `" in capsys.readouterr().err
 
 
 def test_a_manager_that_another_up_replaces_is_waited_for(file, looks):
