@@ -176,7 +176,6 @@ class Manager:
         for step in (self._lease.beat, self._step_back, self._bound_logs, self._keep_proxy):
             self._attempt(step)
         tick = self._attempt(self._reconciler.tick)
-        self._versions[self._ledger.path] = disk.version(self._ledger.path)  # by a launch's issue
         self._attempt(lambda: self._announce(tick))
         if tick is None:
             return False
@@ -221,7 +220,8 @@ class Manager:
         )
 
     def _signed(self, spec: PoolSpec) -> bytes:
-        """Return the signed records for a launch. Raises StateError: robots could not be told."""
+        """Return the signed records for a launch. Raises StateError, OSError: it cannot succeed."""
+        on_thread(lambda: None)  # first: each order issues a certificate
         if why := disk.unwritable(self._paths.folder):
             raise StateError(f"the disk of `{self._paths.folder}` is {why}: nothing is launched")
         return self._records.announcements(self._serving_lease(spec))

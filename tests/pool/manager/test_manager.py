@@ -15,13 +15,16 @@ import pytest
 from fogft import __version__, disk, logfile
 from fogft.errors import PoolBusy, StateError
 from fogft.model import intent as intents
+from fogft.model.credentials import Role
 from fogft.pool.commands import startup
+from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.lease import TERM, Lease, read_epoch
 from fogft.pool.manager import process_control, teardown
 from fogft.pool.manager.manager import Manager
 from fogft.pool.manager.reconciler import Reconciler
 from fogft.records import cache
 from fogft.records.record import read_body
+from tests.fakes.threads import no_more
 from tests.pool.scene import Scene
 
 
@@ -359,6 +362,24 @@ def test_a_manager_steps_back_from_a_later_import_and_from_no_other(scene: Scene
         scene.store.identity()
     assert len(list(scene.cloud.folder.glob("*.json"))) == 2
     assert scene.start_manager().wait(30) == 1
+
+
+def test_no_certificate_is_issued_while_no_thread_can_be_started(scene: Scene) -> None:
+    """Each tick tries to launch; status says why none succeeds, until one does."""
+    scene.write(replicas=1)
+    stop = threading.Event()
+    manager = Manager(scene.store, scene.cloud, keeps_proxy=False)
+    running = threading.Thread(target=manager.run, args=(stop,))
+    running.start()
+    try:
+        with no_more():
+            scene.wait(lambda: any("TasksMax" in n for n in scene.status().get("notes", [])))
+            issued = Ledger(scene.paths.credentials).entries()
+            assert Role.REPLICA not in {entry.holder.role for entry in issued}
+        scene.wait(lambda: scene.running() == ["0.1"])
+    finally:
+        stop.set()
+        running.join()
 
 
 def test_a_tick_that_fails_keeps_no_lease_from_the_replicas(
