@@ -28,7 +28,7 @@ NUMBER_BYTES = {
 }
 _SEQUENCE = re.compile(r"sequence<(?P<of>.+?)(?:, (?P<bound>\d+))?>")
 _ARRAY = re.compile(r"(?P<of>.+)\[(?P<count>\d+)\]")
-_STRING = re.compile(r"string(?:<(?P<bound>\d+)>)?")
+_STRING = re.compile(r"string(<\d+>)?")  # ROS holds no text to its bound, of characters or bytes
 
 
 class _Malformed(Exception):
@@ -118,8 +118,8 @@ class Shape:
     def _kind(self, kind: str, within: tuple[str, ...]) -> _Kind:
         if kind in NUMBER_BYTES:
             return _number(kind)
-        if found := _STRING.fullmatch(kind):
-            return _string(int(found["bound"] or 0))
+        if _STRING.fullmatch(kind):
+            return _Kind(_skip_string, 4, False)
         if found := _ARRAY.fullmatch(kind):
             of = self._kind(found["of"], within)
             return _Kind(partial(_several, of, int(found["count"])), of.align, of.has_fixed_size)
@@ -143,15 +143,10 @@ def _number(kind: str) -> _Kind:
     return _Kind(walk_boolean if kind == "boolean" else walk, size, True)
 
 
-def _string(bound: int) -> _Kind:
-    def walk(data: _Bytes, at: int) -> int:
-        at += -(at - HEADER_BYTES) % 4
-        length: int = data.length_at(data.payload, at)[0]
-        if bound and length > bound + 1:  # with the terminating zero
-            raise _Malformed(f"a text of at most {bound} bytes has {length - 1}")
-        return at + 4 + length
-
-    return _Kind(walk, 4, False)
+def _skip_string(data: _Bytes, at: int) -> int:
+    at += -(at - HEADER_BYTES) % 4
+    length: int = data.length_at(data.payload, at)[0]
+    return at + 4 + length
 
 
 def _sequence(of: _Kind, bound: int) -> _Kind:

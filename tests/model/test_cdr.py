@@ -64,12 +64,12 @@ def test_a_boolean_in_an_array_in_a_sequence_is_seen(wrong: int) -> None:
     assert shape.fault(bytes(payload)) != ""
 
 
-def test_a_length_beyond_its_bound_is_refused() -> None:
-    """The bound is the type's: a reader has no room for more."""
+def test_a_sequence_beyond_its_bound_is_refused_and_a_text_is_not() -> None:
+    """A reader may have no room for more elements. Three characters may be six bytes."""
     bounded = Shape("m", {"m": (("name", "string<3>"), ("values", "sequence<uint8, 2>"))})
     name, values = struct.pack("<I", 4) + b"abc\0", struct.pack("<I", 2) + b"\1\2"
     assert bounded.fault(LITTLE + name + values) == ""
-    assert bounded.fault(LITTLE + struct.pack("<I", 5) + b"abcd\0\0\0\0" + values) != ""
+    assert bounded.fault(LITTLE + struct.pack("<I", 7) + "äöü\0\0".encode() + values) == ""
     assert bounded.fault(LITTLE + name + struct.pack("<I", 3) + b"\1\2\3") != ""
 
 
