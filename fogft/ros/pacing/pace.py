@@ -114,9 +114,14 @@ class ClientPace:
         self.waiting.appendleft((handle, payload, now))
         self._waiting_bytes += len(payload)
         self.finding_until = self.finding_until or now + FIND_LIMIT_S
-        self.find_again_at = now + EVERY_S
+        self.find_again_at = self.finding_until  # or as soon as discovery lists it
         self._open += 1
         self.untaken.clear()  # responses sent along with it were lost, too
+
+    def give_up(self) -> None:
+        """Drop what waits for a client that is never discovered: it is gone."""
+        self.waiting.clear()
+        self._waiting_bytes = 0
 
     def sent(self, number: int) -> None:
         """Record that a response to this client was sent."""

@@ -1,8 +1,8 @@
 """Send responses no faster than their clients take them.
 
 A client keeps the last ten responses that it has not taken yet and silently loses older ones, so
-responses that do not fit in its queue wait here. For a client that discovery has not found yet, the
-first response is retried until it has; the others wait behind it.
+responses that do not fit in its queue wait here. For a client that discovery has not found yet, all
+wait until it has: ROS waits 0.1 s for one that is gone, and sends nothing to others meanwhile.
 
 Owns: the waiting responses, the thread that sends them, and probes of clients' nodes. Not here:
 when a response may be sent (`pace`), sending it (`entities`).
@@ -47,10 +47,12 @@ class NodeProbes:
         make_client: As `RosNode.client`.
         same_node_serves: Takes a service's last name, another service and a client of the latter.
             Returns the first one's full name on the client's node; None: unknown, empty: none.
+        is_found: Whether discovery lists this client of a service.
     """
 
     make_client: Callable[[str, str], RosClient]
     same_node_serves: Callable[[str, str, bytes], str | None]
+    is_found: Callable[[str, bytes], bool] = lambda service, client: True
 
     def __post_init__(self) -> None:
         self._by_name: dict[str, RosClient] = {}
@@ -157,6 +159,7 @@ class Pacer:
                     self._held[id] = client
                     self._begin()
                     return
+                client.give_up()
             raise
         client.finding_until = None
 
@@ -174,6 +177,7 @@ class Pacer:
                     self._wake.wait(wait_s)
                     due, probed, wait_s = self._step(self.clock())
                 asked = list(self._asked)
+                finding = [(i, c) for i, c in self._held.items() if c.finding_until is not None]
                 if self._closed:
                     return
             for id, client, handle, payload in due:
@@ -185,6 +189,9 @@ class Pacer:
                 self.probes.send(id, partial(self._answered, id))
             for id in asked:
                 self._ask(id)
+            for id, client in finding:
+                if self.probes.is_found(self.service, id):
+                    client.find_again_at = self.clock()
 
     def _step(self, now: float) -> tuple[list[_Due], list[bytes], float | None]:
         """Return the due responses, a client id per probe, and how long to wait if none."""
@@ -205,10 +212,9 @@ class Pacer:
         probed = []
         for id, client in in_the_way.items():
             probed += [id] * client.probes_due(now, self._pace.sent)
-        if self._asked:
+        if self._asked or any(client.finding_until for client in self._held.values()):
             return due, probed, _ASK_EVERY_S
-        by_time = any(not client.strict for client in in_the_way.values())
-        if by_time or any(client.finding_until for client in self._held.values()):
+        if any(not client.strict for client in in_the_way.values()):
             return due, probed, EVERY_S
         return due, probed, _LOOK_EVERY_S if self._held else None
 

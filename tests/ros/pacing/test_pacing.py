@@ -6,7 +6,7 @@ import math
 import random
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 
 import pytest
 from hypothesis import given
@@ -29,14 +29,21 @@ from fogft.ros.pacing.pace import (
 from fogft.ros.pacing.pacer import Pacer
 from fogft.ros.port import NotFoundYet
 from tests.fakes.threads import no_more
+from tests.fakes.waiting import wait_for
 from tests.nightly import by_day
 
 
 class _NoNodes:
     """Nodes that answer no probes."""
 
+    def __init__(self) -> None:
+        self.hidden: set[bytes] = set()  # clients that discovery does not list
+
     def answers(self, service, client):
         return False
+
+    def is_found(self, service, client):
+        return client not in self.hidden
 
 
 UNKNOWN = _NoNodes()
@@ -483,22 +490,50 @@ def test_where_there_can_be_no_more_threads_a_later_response_has_one():
 
 
 def test_a_client_that_is_never_found_is_given_up(caplog):
-    """What waited for it goes after a while, each with a line in the log."""
-    now, refused = 0.0, threading.Event()
+    """What waited for it goes after a while, with a line in the log."""
+    now, tries, both = 0.0, list[bytes](), threading.Event()
 
     def send(handle: bytes, payload: bytes) -> None:
         nonlocal now
         now += 11.0
-        if payload == b"2":
-            refused.set()
+        tries.append(payload)
+        if payload == b"3":
+            both.set()
         raise NotFoundYet("client will not receive response")
 
     pacer = Pacer(send, UNKNOWN, "/s", clock=lambda: now + time.monotonic())
     pacer.respond(bytes(24), b"1")
     pacer.respond(bytes(24), b"2")
-    assert refused.wait(30)
+    wait_for(lambda: "response_refused" in caplog.text)
+    pacer.respond(bytes(24), b"3")
+    assert both.wait(30)
     pacer.close()
-    assert "response_refused" in caplog.text
+    assert tries == [b"1", b"1", b"3"]
+
+
+def test_clients_that_are_gone_hold_up_nobody():
+    """Each is tried once, not again and again while another has much to take."""
+    probes, tries, all_sent = _NoNodes(), Counter[int](), threading.Event()
+
+    def send(handle: bytes, payload: bytes) -> None:
+        who = handle[0]
+        tries[who] += 1
+        if who < 8:
+            raise NotFoundYet("client will not receive response")
+        if tries[who] == 40:
+            all_sent.set()
+
+    pacer = Pacer(send, probes, "/s")
+    for who in range(8):
+        probes.hidden.add(handle(who, 0)[:16])
+        pacer.respond(handle(who, 0), b"")
+    for n in range(40):
+        pacer.requested(handle(8, n))
+    for n in range(40):
+        pacer.respond(handle(8, n), b"")
+    assert all_sent.wait(30)
+    pacer.close()
+    assert tries == {**dict.fromkeys(range(8), 1), 8: 40}
 
 
 def test_what_waits_for_a_client_to_be_found_does_not_come_all_at_once():
