@@ -52,7 +52,9 @@ class Selection:
     def __init__(self, select: Select) -> None:
         self._select = select
         self._leader = Leader()
-        self._stamps: OrderedDict[bytes, None] = OrderedDict()
+        # The replicas that sent each stamp. One that repeats it has a clock that was set back or
+        # stands still, as a simulation's may: it is the stamp of a new message.
+        self._stamps: OrderedDict[bytes, set[int]] = OrderedDict()
         self._goals: OrderedDict[bytes, Leader] = OrderedDict()
 
     def passes(self, replica: int, message: bytes, now: float) -> bool:
@@ -71,9 +73,10 @@ class Selection:
         stamp = message[:2] + message[_STAMP]
         if not any(message[_STAMP]):  # not set: it identifies nothing
             return self._leader.passes(replica, now)
-        if stamp in self._stamps:
+        if replica not in self._stamps.get(stamp, (replica,)):
+            self._stamps[stamp].add(replica)
             return False
-        self._stamps[stamp] = None
+        self._stamps[stamp] = {replica}
         if len(self._stamps) > _KEPT:
             self._stamps.popitem(last=False)
         return True

@@ -46,6 +46,14 @@ def test_the_first_of_each_stamp_passes_whoever_says_it():
     assert passed == [(0, 7), (1, 8), (2, 9)]
 
 
+def test_a_stamp_that_a_replica_repeats_is_a_new_one():
+    """A simulation's clock jumps back to 7, then stands still at 8; another one comes later."""
+    selection = Selection(Select.STAMP)
+    said = [(0, 7), (1, 7), (0, 8), (1, 8), (1, 7), (0, 7), (1, 8), (0, 8), (1, 8), (0, 8)]
+    passed = [(r, s) for r, s in [*said, (2, 8), (2, 8)] if selection.passes(r, message(s), 0.0)]
+    assert passed == [(0, 7), (0, 8), (1, 7), (1, 8), (1, 8), (2, 8)]
+
+
 def test_without_a_stamp_one_replica_leads():
     selection = Selection(Select.STAMP)
     assert [selection.passes(r, message(0), 0.1) for r in (0, 1, 0)] == [True, False, True]
