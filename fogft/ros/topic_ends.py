@@ -34,7 +34,8 @@ def profile(topic: TopicSpec) -> Any:
 
 def mismatch(other: str, topic: TopicSpec, find: Callable[[], Any]) -> str:
     """Return which `other`, "publisher" or "subscriber", has incompatible QoS, and the remedy."""
-    from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+    from rclpy.duration import Infinite
+    from rclpy.qos import DurabilityPolicy, LivelinessPolicy, ReliabilityPolicy
 
     ours = other == "subscriber"  # we publish
     reliability = ReliabilityPolicy.RELIABLE if ours else ReliabilityPolicy.BEST_EFFORT
@@ -52,6 +53,11 @@ def mismatch(other: str, topic: TopicSpec, find: Callable[[], Any]) -> str:
         if topic.latched is not ours and one.qos_profile.durability == durability:
             why = "asks for latched messages" if ours else "is not latched"
             return f"a {other} of `{topic.name}` {why}: write `latched: {str(ours).lower()}`"
+        within = min(one.qos_profile.deadline, one.qos_profile.liveliness_lease_duration)
+        manual = one.qos_profile.liveliness == LivelinessPolicy.MANUAL_BY_TOPIC
+        if ours and (within < Infinite or manual):
+            why = "asks for a deadline or liveliness, which is not offered"
+            return f"a {other} of `{topic.name}` {why}: remove it from the {other}'s QoS"
     return ""
 
 

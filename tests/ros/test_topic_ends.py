@@ -8,6 +8,7 @@ import pytest
 
 from fogft.errors import RosError, Unreadable
 from fogft.model.topic import Origin, TopicSpec
+from fogft.ros import topic_ends
 
 from .conftest import wait_for
 
@@ -61,6 +62,25 @@ def test_a_subscriber_that_asks_for_more_is_told_of_with_the_remedy(make_node, r
     assert fine.mismatch() == ""
     other.subscribe(SAID, print)  # as beside a tool that asks for more than others
     wait_for(lambda: not plain.mismatch(), "a subscriber that receives messages")
+
+
+@pytest.mark.parametrize("asks", ["deadline", "liveliness_lease_duration"])
+def test_a_subscriber_that_asks_for_a_time_limit_is_told_of(
+    make_node, ros_domain, monkeypatch, asks
+):
+    from rclpy.duration import Duration
+
+    def strict(topic):
+        quality = usual(topic)
+        setattr(quality, asks, Duration(seconds=2))
+        return quality
+
+    publisher = make_node(ros_domain).publisher(SAID)
+    usual = topic_ends.profile
+    monkeypatch.setattr(topic_ends, "profile", strict)
+    make_node(ros_domain).subscribe(SAID, print)
+    wait_for(publisher.mismatch, "the subscriber")
+    assert "asks for a deadline or liveliness" in publisher.mismatch()
 
 
 def test_a_publisher_of_another_type_is_told_of(make_node, ros_domain):
