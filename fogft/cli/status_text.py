@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from fogft.cli import output
 from fogft.cli.output import cell
+from fogft.model.topic import PREFIX
 
 if TYPE_CHECKING:
     from rich.console import Group, RenderableType
@@ -167,10 +168,11 @@ def notes(status: PoolStatus) -> list[Text]:
 def troubles(status: PoolStatus) -> list[str]:
     """Return a sentence with the reason for each service or topic whose messages do not arrive."""
     found = [row.counters["trouble"] for row in status.services if row.counters.get("trouble")]
+    differing = {name for one in status.replicas for name in one.differing}  # their details say it
     for row in status.topics:
         if row.counters.trouble:
             found.append(row.counters.trouble)
-        elif not row.heard_by and status.ready:
+        elif not row.heard_by and status.ready and PREFIX + row.name not in differing:
             found.append(f"`{row.name}` has no subscriber with compatible QoS on a replica")
     return found
 

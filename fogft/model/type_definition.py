@@ -1,4 +1,4 @@
-"""Definitions of service types, and the differences between two of the same name. Pure.
+"""Definitions of service and message types, and the differences between two of the same name. Pure.
 
 The robot and a replica load a type by its name, each from its own workspace: bytes of a different
 definition would decode to plausible but wrong values. With distributions that have type hashes
@@ -13,7 +13,7 @@ from typing import Annotated
 from fogft.model.keys import only
 from fogft.model.plain import Line
 
-REQUEST, RESPONSE = "request", "response"
+REQUEST, RESPONSE, MESSAGE = "request", "response", "message"
 _HASH = re.compile(r"\w*", re.ASCII)
 _NESTED = re.compile(r"(?:sequence<)?([A-Za-z]\w*/[A-Za-z]\w*)")
 
@@ -22,11 +22,11 @@ Fields = tuple[tuple[Line, Line], ...]
 
 @dataclass(frozen=True)
 class Definition:
-    """The definition of a service type on one machine. Hashes are empty where not known.
+    """The definition of a service or message type on one machine. Hashes are empty where not known.
 
-    `fields` has the names and types, in order, of `REQUEST`, `RESPONSE` and each nested
-    ``package/Message``, as the generated Python code lists them. `service_hash` covers the whole
-    service including its event message, as in the names that `rmw_zenoh` uses.
+    `fields` has the names and types, in order, of `REQUEST` and `RESPONSE`, or of `MESSAGE`, and of
+    each nested ``package/Message``, as the generated Python code lists them. `service_hash` covers
+    the whole service including its event message, as in the names that `rmw_zenoh` uses.
     """
 
     hash: Line = ""  # of request and response: ``RIHS01_...+RIHS01_...``
@@ -55,7 +55,7 @@ def difference(type_name: str, here: Definition, there: Definition) -> str:
         return ""
     if not (here.fields and there.fields):  # on one side only the hash is known
         return _of_hashes(type_name, here.service_hash, there.service_hash)
-    for part in (REQUEST, RESPONSE):
+    for part in (REQUEST, RESPONSE, MESSAGE):
         found = _first_difference(part, part, here, there, set())
         if found:
             return f"`{type_name}` is not the same: {found}"

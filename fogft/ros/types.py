@@ -22,7 +22,7 @@ from typing import Any
 from fogft.errors import RosError
 from fogft.model.cdr import Shape
 from fogft.model.plain import as_line
-from fogft.model.type_definition import REQUEST, RESPONSE, Definition, Fields, nested
+from fogft.model.type_definition import MESSAGE, REQUEST, RESPONSE, Definition, Fields, nested
 
 _NAME = re.compile(
     r"[a-z][a-z0-9_]*/(srv/[A-Z][A-Za-z0-9]*|action/[A-Z][A-Za-z0-9]*_(SendGoal|GetResult))"
@@ -151,10 +151,13 @@ def _did_you_mean(name: str) -> str:
 
 
 def definition(type_name: str) -> Definition:
-    """Return a service type's definition here, with `trouble` if it fails; never raises."""
+    """Return a type's definition here, with `trouble` if it fails; never raises."""
+    fields: dict[str, Fields] = {}
     try:
+        if _MESSAGE.fullmatch(type_name):
+            _add(MESSAGE, load_message_type(type_name), fields)
+            return Definition(fields=fields)
         service_type = load_service_type(type_name)
-        fields: dict[str, Fields] = {}
         for part, message in ((REQUEST, service_type.Request), (RESPONSE, service_type.Response)):
             _add(part, message, fields)
     except RosError as error:

@@ -53,6 +53,12 @@ def test_a_topic_that_does_not_pass_is_named(ready, trouble, said):
     assert f"note: {said}" in shown_lines(seen)
 
 
+def test_a_topic_whose_type_differs_is_named_at_its_replica_alone():
+    seen = with_topic(frozenset({"/plan"}), TopicCounted(5))
+    replica = replace(REPLICA, differs=True, differing=("topic /scan",), detail="a field differs")
+    assert troubles(replace(seen.status, replicas=(replica,))) == []
+
+
 def test_more_replicas_than_wanted_are_not_a_part_of_them():
     """As while one stands in for another."""
     seen = Seen(replace(STATUS, ready=3, target=2), 0.0, manager_alive=True)

@@ -179,6 +179,13 @@ def test_a_definition_has_the_hash_and_the_fields_of_the_loaded_code() -> None:
     assert re.fullmatch(r"RIHS01_[0-9a-f]{64}\+RIHS01_[0-9a-f]{64}", found.hash)
 
 
+def test_the_definition_of_a_topic_has_the_fields_of_its_message() -> None:
+    stamp = ("sec", "int32"), ("nanosec", "uint32")
+    clock = {"message": (("clock", "builtin_interfaces/Time"),), "builtin_interfaces/Time": stamp}
+    assert definition("rosgraph_msgs/msg/Clock").fields == clock
+    assert "p" in definition("p/msg/None").trouble
+
+
 def test_every_installed_type_can_be_described_and_is_the_same_as_itself() -> None:
     names = types.installed_service_types()
     assert len(names) > 20

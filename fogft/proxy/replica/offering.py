@@ -25,6 +25,7 @@ class Offering:
     services: tuple[ServiceSpec, ...]
     define: Callable[[str], Definition]
     clock: Callable[[], float]
+    topic_types: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self._finds_out = not self.services
@@ -73,11 +74,11 @@ class Offering:
         return {one.name: found for one, found in offered if found != one.type}
 
     def types(self) -> dict[str, Definition]:
-        """Return the definitions of all service types here; empty until each is known."""
-        for service in self.services:
-            found = self._definitions.get(service.type)
+        """Return the definitions of all types here; empty until each is known."""
+        for type_name in (*(service.type for service in self.services), *self.topic_types):
+            found = self._definitions.get(type_name)
             if found is None or not found.known:
-                self._definitions[service.type] = self.define(service.type)
+                self._definitions[type_name] = self.define(type_name)
         told = dict(self._definitions)
         return told if all(definition.known for definition in told.values()) else {}
 

@@ -56,7 +56,7 @@ class ServerProxy:
         services: The services to offer; if empty, whatever the command offers.
         make_node: Joins ROS; called again after each death of the command.
         spare: A second process of the command, which takes over when the first dies.
-        define: Returns the local definition of a service type, for the robot to compare.
+        define: Returns the local definition of a type, for the robot to compare.
         topics: The topics to forward; these need nodes that publish and subscribe.
         answered: As for `Responder`.
     """
@@ -77,7 +77,8 @@ class ServerProxy:
     ) -> None:
         self._id = id
         self._keys = partial(names.service_keys, id.pool_uid, id.slot)
-        self._offering = Offering(services, define, clock)
+        types = tuple(topic.type for topic in topics)
+        self._offering = Offering(services, define, clock, types)
         self._not_usable: dict[str, str] = {}  # service -> why it cannot be called; "" if it can
         self._listener, self._make_node = listener, make_node
         self.endpoint = listener.endpoint  # ``host:port`` at which it listens

@@ -44,7 +44,7 @@ class ClientProxy:
 
     Args:
         node: The ROS node on the robot; None in a gateway, which gets requests over links.
-        define: Returns the local definition of a service type; unknown ones are not compared.
+        define: Returns the local definition of a type; unknown ones are not compared.
         merge: Merges the statuses that replicas report for an action into one.
     """
 
@@ -185,8 +185,12 @@ class ClientProxy:
         self.look_again()
 
     def _keys(self, slot: int) -> dict[str, str]:
+        return names.service_keys(self.pool_uid, slot, self._types())
+
+    def _types(self) -> dict[str, str]:
+        """Return the type of each service and topic, by its name on the link."""
         types = {name: service.spec.type for name, service in self._services.items()}
-        return names.service_keys(self.pool_uid, slot, types | self._topics.types())
+        return types | self._topics.types()
 
     def _drop(self, id: ReplicaId) -> None:
         link = self.links.remove(id)
@@ -274,18 +278,18 @@ class ClientProxy:
         self._look_now = False
 
     def _differences(self, link: Link) -> Mapping[str, str]:
-        return self._type_check.differences(link, [s.spec for s in self._services.values()])
+        return self._type_check.differences(link, self._types())
 
     def _route(self) -> None:
         links = list(self.links)
-        self._topics.route({key_of(link): link for link in links})
-        differ = {link.peer.id: self._differences(link) for link in links}
+        differ = {key_of(link): self._differences(link) for link in links}
+        self._topics.route({key_of(link): link for link in links}, differ)
         versions = {id: member.version for id, member in self.links.members.items()}
         draining = frozenset(link.peer.id for link in links if self.links.draining(link))
         hanging = self.links.hanging()
         for service in self._services.values():
             name = service.spec.name
-            fit = [link for link in links if name not in differ[link.peer.id]]
+            fit = [link for link in links if name not in differ[key_of(link)]]
             hang = {id for id, names in hanging.items() if name in names}
             service.dispatcher.route(service.may_ask(fit, draining), versions, draining, hang)
 

@@ -15,7 +15,6 @@ from typing import Any
 from fogft.link.port import Dialer, GatewayView, Link, LinkEvents, LinkStatus, Peer
 from fogft.metrics.outcomes import OfReplica
 from fogft.model.replica import LinkState, Member, ReplicaId
-from fogft.model.spec import ServiceSpec
 from fogft.model.type_definition import Definition, difference
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.sending import key_of
@@ -131,21 +130,19 @@ class TypeCheck:
         self._ours: dict[str, Definition] = {}
         self._found: dict[tuple[ReplicaId, str], tuple[Definition, str]] = {}
 
-    def differences(self, link: Link, services: Iterable[ServiceSpec]) -> Mapping[str, str]:
-        """Return the services that a replica cannot answer because of their types, with reasons."""
+    def differences(self, link: Link, types: Mapping[str, str]) -> Mapping[str, str]:
+        """Return the services and topics of a replica whose types are not as here, with reasons."""
         answer = link.status().probe_answer
         if answer is None or not (answer.types or answer.offered):
             return {}
         found = {}
-        for service in services:
-            theirs = answer.types.get(service.type)
-            offered = answer.offered.get(service.name, service.type)
-            if offered != service.type and service.name not in answer.ready:
-                found[service.name] = (
-                    f"`run` offers {service.name} as {offered}, not as {service.type}"
-                )
-            elif theirs and (why := self._compare(link.peer.id, service.type, theirs)):
-                found[service.name] = why
+        for name, type_name in types.items():
+            theirs = answer.types.get(type_name)
+            offered = answer.offered.get(name, type_name)
+            if offered != type_name and name not in answer.ready:
+                found[name] = f"`run` offers {name} as {offered}, not as {type_name}"
+            elif theirs and (why := self._compare(link.peer.id, type_name, theirs)):
+                found[name] = why
         return found
 
     def _compare(self, id: ReplicaId, type_name: str, theirs: Definition) -> str:

@@ -10,7 +10,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -308,10 +308,11 @@ class TopicsOnRobot:
         """Return the type of each topic, by its name on the link."""
         return {name: one.topic.type for name, one in self._topics.items()}
 
-    def route(self, links: Mapping[int, Link]) -> None:
-        """Set the links to all replicas, by replica key."""
+    def route(self, links: Mapping[int, Link], differ: Mapping[int, Collection[str]] = {}) -> None:
+        """Set the links to all replicas and, by replica key, the topics whose types differ."""
         for name, one in self._topics.items():
-            one.route({k: link for k, link in links.items() if name in link.ready}, links)
+            fit = {k: link for k, link in links.items() if name not in differ.get(k, ())}
+            one.route({k: link for k, link in fit.items() if name in link.ready}, links)
 
     def answered(self, key: int, answer: Answer) -> None:
         """Pass the end of an attempt to its topic."""

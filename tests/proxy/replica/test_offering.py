@@ -7,7 +7,7 @@ from fogft.model import names
 from fogft.model.replica import ReplicaId
 from fogft.model.spec import ServiceSpec
 from fogft.model.type_definition import Definition
-from fogft.proxy.replica.offering import LOOK_EVERY_S, SETTLED_S
+from fogft.proxy.replica.offering import LOOK_EVERY_S, SETTLED_S, Offering
 from fogft.proxy.replica.server import ServerProxy
 from tests.fakes.proxy import UID, Clock, FakeIncoming, FakeListener, FakeNode, FakeSupervisor
 
@@ -140,3 +140,5 @@ def test_definitions_are_told_only_where_they_are_asked_for():
     scene = Scene(ServiceSpec("/s", SET_BOOL))
     assert scene.probe().types == {SET_BOOL: Definition(hash=SET_BOOL)}
     assert scene.listener.on_probe(Probe("robot")).types == {}
+    topics = Offering((), lambda name: Definition(hash=name), Clock(), ("p/msg/T",))
+    assert topics.types() == {"p/msg/T": Definition(hash="p/msg/T")}

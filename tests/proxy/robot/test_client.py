@@ -26,7 +26,8 @@ from tests.fakes.proxy import UID, Clock, FakeDialer, FakeNode
 from tests.fakes.threads import meanwhile
 
 SET_BOOL = "std_srvs/srv/SetBool"
-OURS = {SET_BOOL: Definition(fields={"request": (("data", "boolean"),)})}
+PAIR = Definition(fields={"message": (("a", "int32"), ("b", "int32"))})
+OURS = {SET_BOOL: Definition(fields={"request": (("data", "boolean"),)}), "p/msg/T": PAIR}
 
 
 def member(slot: int, generation: int = 1, *, port: int = 1, draining: bool = False) -> Member:
@@ -360,6 +361,26 @@ def test_a_replica_that_offers_the_service_as_another_type_says_so():
     link.told = replace(link.told, ready=frozenset({"/s"}))  # `run` finds out what it offers
     scene.ready(link)
     assert not scene.proxy.report()["links"][0]["differs"]
+
+
+def test_a_topic_does_not_pass_to_a_replica_that_has_its_fields_in_another_order():
+    """Its bytes would be read there as another message."""
+    scene, heard = Scene(), []
+    end = SimpleNamespace(close=lambda: None, mismatch=str)
+    node = SimpleNamespace(subscribe=lambda topic, on_message: heard.append(on_message) or end)
+    topic = TopicSpec("/t", "p/msg/T", Origin.ROBOT)
+    scene.proxy.pass_topics([topic], node)
+    scene.follow(member(0), member(1))
+    other = Definition(fields={"message": (("b", "int32"), ("a", "int32"))})
+    for link, theirs in zip(scene.dialer.links, (PAIR, other), strict=True):
+        types = {"p/msg/T": theirs}
+        link.told = replace(told(link.peer.id.slot, "boolean"), types=types)
+    scene.ready(*scene.dialer.links, service=topic.key_name)
+    heard[0](b"message")
+    assert [len(link.offered) for link in scene.dialer.links] == [1, 0]
+    bad = scene.proxy.report()["links"][1]
+    assert bad["differing"] == [topic.key_name]
+    assert "the order of fields differs: `message.a` here, `message.b` there" in bad["detail"]
 
 
 def test_what_a_replica_that_says_it_hangs_has_is_sent_to_another():
