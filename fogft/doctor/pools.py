@@ -3,7 +3,7 @@
 import contextlib
 import shlex
 from collections.abc import Iterator
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timezone
 from pathlib import Path
 
 from fogft import disk
@@ -20,8 +20,8 @@ from fogft.pool.credentials import authority
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
 from fogft.pool.manager.proxy_report import STALE_S
+from fogft.records.expiry import SOON
 
-_EXPIRY_WARNING = timedelta(days=3)
 _UP = "`fogft up FILE`"
 
 
@@ -83,7 +83,7 @@ def pool_file(situation: Situation) -> Iterator[Finding]:
 
 
 def certificates(situation: Situation) -> Iterator[Finding]:
-    """Every pool's certificates are valid now, its keys private."""
+    """Certificates outlast a month, and all keys are private."""
     now = datetime.fromtimestamp(situation.now, timezone.utc)
     for pool in situation.pools:
         folder = PoolPaths.of(pool, situation.home).credentials
@@ -94,41 +94,45 @@ def certificates(situation: Situation) -> Iterator[Finding]:
                 "the manager creates them; see `fogft logs`",
             )
             continue
-        problems = list(judge_folder(pool, folder, now))
+        anew = f"run `fogft down {pool}` and `fogft up` again: that creates new ones"
+        problems = list(judge_folder(f"pool `{pool}`", folder, now, anew))
         yield from problems
         if not problems:
             count = len(list(folder.rglob("*.crt")))
             yield ok("credentials", f"pool `{pool}`: {count} certificates valid, keys private")
+    for folder in sorted((situation.home / "joined").glob("*.*.*")):
+        pool, role, name = folder.name.split(".", 2)
+        issue = f"`fogft credentials issue {role} {name}`"
+        anew = f"join anew with a bundle of {issue}, or remove the folder if the pool is gone"
+        yield from judge_folder(f"`{folder}`", folder, now, anew)
 
 
-def judge_folder(pool: str, folder: Path, now: datetime) -> Iterator[Finding]:
+def judge_folder(whose: str, folder: Path, now: datetime, anew: str) -> Iterator[Finding]:
     """Judge the keys and certificates in a folder; yield nothing when all is well."""
     for key in sorted(folder.rglob("*.key")):
         if key.stat().st_mode & 0o077:
             yield fail(
                 "credentials",
-                f"pool `{pool}`: `{key}` can be read by other users",
+                f"{whose}: `{key}` can be read by other users",
                 f"run `chmod 600 {key}`",
             )
-    anew = f"run `fogft down {pool}` and `fogft up` again: that creates new ones"
     for certificate in sorted(folder.rglob("*.crt")):
         try:
             said = authority.describe(certificate)
         except CredentialError as error:
-            yield fail("credentials", f"pool `{pool}`: {error.message}", anew)
+            yield fail("credentials", f"{whose}: {error.message}", anew)
             continue
         problem = said.problem(now)
         if problem:
             yield fail(
                 "credentials",
-                f"pool `{pool}`: `{certificate.name}` ({said.common_name}) is {problem}",
+                f"{whose}: `{certificate.name}` ({said.common_name}) is {problem}",
                 f"is this machine's clock right (see `clock`)? If so, {anew}",
             )
-        elif said.not_after - now < _EXPIRY_WARNING:
+        elif said.not_after - now < SOON:
             yield warn(
                 "credentials",
-                f"pool `{pool}`: `{certificate.name}` expires at "
-                f"{said.not_after:%Y-%m-%d %H:%M} UTC",
+                f"{whose}: `{certificate.name}` expires at {said.not_after:%Y-%m-%d %H:%M} UTC",
                 anew,
             )
 

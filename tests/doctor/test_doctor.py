@@ -6,7 +6,6 @@ import json
 import sys
 import time
 from dataclasses import replace
-from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 import pytest
@@ -287,18 +286,24 @@ def test_a_key_that_others_can_read_is_found(folder, tmp_path):
 
 @pytest.mark.parametrize(
     ("days", "verdict", "words"),
-    [(364, Verdict.WARN, "expires at"), (366, Verdict.FAIL, "expired at")],
+    [(336, Verdict.WARN, "expires at"), (366, Verdict.FAIL, "expired at")],
 )
 def test_certificates_out_of_time_are_found(folder, days, verdict, words):
-    now = datetime.now(timezone.utc) + timedelta(days=days)
-    robot = [f for f in pools.judge_folder("planner", folder, now) if "robot" in f.text]
-    assert the_only(robot).verdict is verdict
-    assert words in robot[0].text
+    now = time.time() + days * 86_400
+    own = pools.certificates(situation(folder.parents[2], "planner", now=now))
+    assert the_only(own).verdict is verdict
+    joined = folder.parents[2] / "joined" / "planner.robot.ada"
+    joined.parent.mkdir()
+    folder.rename(joined)
+    found = the_only(pools.certificates(situation(joined.parents[1], now=now)))
+    assert found.verdict is verdict
+    assert words in found.text
+    assert "`fogft credentials issue robot ada`" in found.advice
 
 
 def test_a_damaged_certificate_is_found(folder):
     (folder / "robot.crt").write_text("no certificate")
-    found = the_only(pools.judge_folder("planner", folder, datetime.now(timezone.utc)))
+    found = the_only(pools.certificates(situation(folder.parents[2], "planner")))
     assert found.verdict is Verdict.FAIL
 
 

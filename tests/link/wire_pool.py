@@ -39,7 +39,7 @@ class Authority:
         folder.mkdir(exist_ok=True)
         authority.create_authority(self._ca, POOL_UID)
 
-    def issue(self, common_name: str, role: Role, *, days: float = 30.0) -> CredentialPaths:
+    def issue(self, common_name: str, role: Role, *, days: float = 365.0) -> CredentialPaths:
         stem = f"{common_name}-{role.value}"
         credential = authority.issue(self._ca, common_name, role=role, days=days)
         authority.write(credential, self.folder, stem)

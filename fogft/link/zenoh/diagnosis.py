@@ -1,9 +1,6 @@
 """Time limits for opening a link, and why one cannot be opened, in words. Zenoh reports neither.
 
 After a failure only, connects to the endpoint again with plain TCP and TLS.
-
-If a certificate is "not yet valid", the issuer's clock was ahead of the verifier's, which TLS's
-own message does not say.
 """
 
 import contextlib
@@ -21,9 +18,9 @@ from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import host_and_port
 from fogft.records.dialling import client_context
+from fogft.records.expiry import end_of
 
-# OpenSSL's X509_V_ERR_CERT_NOT_YET_VALID and X509_V_ERR_CERT_HAS_EXPIRED.
-_OUT_OF_TIME = (9, 10)
+_EXPIRED = 10  # OpenSSL's X509_V_ERR_CERT_HAS_EXPIRED
 _TIMEOUT_S = 0.5  # for each step
 _ALERTS = {
     "unknown ca": "our certificate is from a different CA than the replica's",
@@ -102,20 +99,20 @@ def wrong_name(found: str | None, peer: Peer) -> str:
 
 
 def _clock_words(error: ssl.SSLError, peer: Peer, credentials: CredentialPaths) -> str:
-    """Return whose clock is wrong if a certificate was rejected for its dates, else ""."""
+    """Return whose clock is wrong if a certificate was rejected as expired, else ""."""
     now = datetime.datetime.now(datetime.timezone.utc)
     if isinstance(error, ssl.SSLCertVerificationError):
-        if error.verify_code not in _OUT_OF_TIME:
+        if error.verify_code != _EXPIRED:
             return ""
-        validity = validity_of(_certificate_of(peer, credentials))
-        why = judged_here(validity, now) if validity is not None else ""
+        ends = end_of(_certificate_of(peer, credentials))
+        why = judged_here(ends, now) if ends is not None and ends <= now else ""
         return f"the replica's certificate is refused: {why}" if why else ""
     if "certificate expired" not in str(error).lower():
         return ""
     with contextlib.suppress(OSError):
-        validity = validity_of(credentials.certificate.read_bytes())
-        if validity is not None:
-            return judged_there(validity, now)
+        ends = end_of(credentials.certificate.read_bytes())
+        if ends is not None:
+            return judged_there(ends, now)
     return ""
 
 
@@ -141,46 +138,21 @@ def _tls_words(error: ssl.SSLError) -> str:
     return f"TLS failed: {error.reason or error}"
 
 
-Validity = tuple[datetime.datetime, datetime.datetime]  # start and end of a certificate's validity
-
-
-def validity_of(certificate: bytes) -> Validity | None:
-    """Return a certificate's (PEM) validity period; None if it cannot be read."""
-    from cryptography import x509
-
-    try:
-        read = x509.load_pem_x509_certificate(certificate)
-    except Exception:  # the parser may raise anything on hostile bytes
-        return None
-    return read.not_valid_before_utc, read.not_valid_after_utc
-
-
-def judged_here(validity: Validity, now: datetime.datetime) -> str:
-    """Return why we reject a replica's certificate; ``now`` is this machine's clock."""
-    begins, ends = validity
-    if now < begins:
-        return (
-            f"it is not valid before {_utc(begins)}, and this machine's clock says "
-            f"{_utc(now)}. Set this machine's clock, or that of the manager, which issued it"
-        )
-    if now >= ends:
-        return (
-            f"it expired at {_utc(ends)}, and this machine's clock says {_utc(now)}. If "
-            "that is right, replace the replica"
-        )
-    return ""
-
-
-def judged_there(validity: Validity, now: datetime.datetime) -> str:
-    """Return why a replica rejects our certificate for its dates."""
-    begins, ends = validity
-    valid = f"valid from {_utc(begins)} to {_utc(ends)}"
-    clock = f"this machine's clock says {_utc(now)}"
-    if now < begins or now >= ends:
-        which = "is not yet valid" if now < begins else "has expired"
-        return f"our certificate {which} ({valid}, {clock})"
+def judged_here(ends: datetime.datetime, now: datetime.datetime) -> str:
+    """Return why we reject an expired certificate; ``now`` is this machine's clock."""
     return (
-        "the replica's clock is wrong: it rejects our certificate as not valid now, but it is "
+        f"it expired at {_utc(ends)}, and this machine's clock says {_utc(now)}. If "
+        "that is right, replace the replica"
+    )
+
+
+def judged_there(ends: datetime.datetime, now: datetime.datetime) -> str:
+    """Return why a replica rejects our certificate as expired."""
+    valid, clock = f"valid to {_utc(ends)}", f"this machine's clock says {_utc(now)}"
+    if now >= ends:
+        return f"our certificate has expired ({valid}, {clock})"
+    return (
+        "the replica's clock is wrong: it rejects our certificate as expired, but it is "
         f"{valid}; {clock}"
     )
 

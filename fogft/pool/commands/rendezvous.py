@@ -19,6 +19,7 @@ from fogft.poolfile import config_file
 from fogft.process import Watchdog, ending_signals, notify, start_log
 from fogft.records import cache
 from fogft.records.exchange import Exchange
+from fogft.records.expiry import Expiry
 from fogft.records.record_set import RecordSet
 from fogft.records.server import RendezvousServer
 from fogft.records.signing import Verifier
@@ -39,6 +40,7 @@ class _Rendezvous:
     def __init__(self, config: RendezvousConfig) -> None:
         self._config = config
         self._status = disk.Report(config.status) if config.status else None
+        self._expiry = Expiry(config.credentials.certificate)
         verify = Verifier(config.credentials.ca)
         self._records = RecordSet(config.pool_uid, verify)
         cache.restore(config.records, self._records, config.credentials.ca)
@@ -66,6 +68,7 @@ class _Rendezvous:
             while not stop.is_set() and not serving.done():
                 self._save()
                 watchdog.work()
+                self._expiry.look()
                 with contextlib.suppress(asyncio.TimeoutError):
                     await asyncio.wait_for(stop.wait(), _SAVE_EVERY_S)
         finally:

@@ -6,6 +6,7 @@ from fogft.link.dial_out.replica import DialOut
 from fogft.model.plain import to_plain
 from fogft.model.proxy_config import ServerProxyConfig
 from fogft.records.client import Known, RendezvousClient
+from fogft.records.expiry import Expiry
 from fogft.records.record import RecordError, RecordKind
 from fogft.records.roster import SlotState, dial_in
 from fogft.records.signing import Signer
@@ -22,6 +23,7 @@ class Presence:
     def __init__(self, config: ServerProxyConfig, listening: str) -> None:
         ours = config.credentials
         self._config = config
+        self._expiry = Expiry(ours.certificate)
         self._port = listening.rpartition(":")[2]
         self._said: SlotState | None = None
         self._seen: Known | None = None
@@ -39,6 +41,7 @@ class Presence:
 
     def look(self, ready: frozenset[str], *, draining: bool) -> Known:
         """Publish changes, connect to new dial-in ports; return the known records."""
+        self._expiry.look()
         if self._client is None:
             return Known()
         known, id = self._client.known, self._config.id

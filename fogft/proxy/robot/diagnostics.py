@@ -14,6 +14,7 @@ from typing import Any
 from fogft.model.spec import ServiceSpec
 from fogft.model.topic import PREFIX
 from fogft.poolfile.policy_parameters import FieldCheck, Policies
+from fogft.records.expiry import SOON
 from fogft.ros.port import Level, Status
 from fogft.ros.visible import VisibleNode
 
@@ -88,6 +89,10 @@ class Diagnosis:
             else:
                 message += "; the cloud's credentials have expired: nothing is launched or ended"
             worst = max(worst, Level.WARN)
+        certificate_s = report.get("certificate_left_s")
+        if certificate_s is not None and certificate_s < SOON.total_seconds():
+            message += f"; this robot's certificate expires in {certificate_s / 86_400:.1f} days"
+            worst = max(worst, Level.WARN)
         values = {
             "replicas": len(links),
             "replicas reached": up,
@@ -95,6 +100,7 @@ class Diagnosis:
             "uplink suspected": report["uplink_suspected"],
             "replicas end without a manager in_s": left_s,
             "credentials end in_s": credentials_s,
+            "certificate ends in_s": certificate_s,
         }
         return self._status(worst, "pool", message, values, self._robot)
 

@@ -19,6 +19,7 @@ from fogft.model.proxy_config import ClientProxyConfig
 from fogft.model.replica import Member, Membership
 from fogft.records import roster
 from fogft.records.client import Known, RendezvousClient
+from fogft.records.expiry import Expiry
 from fogft.records.record import RecordKind, SignedRecord
 from fogft.records.record_set import RecordSet
 from fogft.records.signing import Signer, Verifier
@@ -37,6 +38,7 @@ class Following:
         self._clock = clock
         self._looks, self._looked_at = _LOOKS, clock()
         self._config = config
+        self._expiry = Expiry(config.credentials.certificate)
         self._file = disk.Watched(config.membership)
         self._from_file: Membership | None = None
         self._changed = threading.Event()
@@ -170,7 +172,7 @@ class Following:
         return named | self._known().revoked
 
     def report(self, newer: Iterable[SignedRecord] = ()) -> Mapping[str, Any]:
-        """Return the newest known manager epoch, each rendezvous' state, and the dial-in port's.
+        """Return the newest known manager epoch, and how certificate, rendezvous and port do.
 
         Only leases with a valid signature count, so a lying replica has no effect.
         """
@@ -178,7 +180,7 @@ class Following:
             self._signed.offer(one)
         leases = [*self._signed.of(RecordKind.LEASE), *self._known().of(RecordKind.LEASE)]
         epoch = max((lease.generation for lease in leases), default=0)
-        found: dict[str, Any] = {"manager_epoch": epoch}
+        found: dict[str, Any] = {"manager_epoch": epoch, "certificate_left_s": self._expiry.look()}
         if self._client is not None:
             found["records"] = self._client.status()
         if self.door is not None:

@@ -340,7 +340,7 @@ class _Running:
         return ends_at - time.time() if isinstance(ends_at, (int, float)) else None
 
     def _report(self, told: Mapping[str, Any], now: float) -> None:
-        seen = self.proxy.report()
+        seen = {**self.proxy.report(), **self.following.report(self.dialer.newer())}
         self.seen.diagnose(lambda: {**seen, "credentials_left_s": self._credentials_left_s()}, now)
         report = {
             "pid": os.getpid(),
@@ -349,7 +349,6 @@ class _Running:
             "version": __version__,
             **told,
             **seen,
-            **self.following.report(self.dialer.newer()),
             "callers": self.callers(),
         }
         self.told.write(report)

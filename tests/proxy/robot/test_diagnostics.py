@@ -144,3 +144,11 @@ def test_credentials_of_the_cloud_are_counted_down(left_s: float | None, level: 
     assert told.level is level
     assert said in told.message
     assert told.values.get("credentials end in_s") == (None if left_s is None else f"{left_s:g}")
+
+
+@pytest.mark.parametrize(("days", "level"), [(None, Level.OK), (31, Level.OK), (29, Level.WARN)])
+def test_the_last_month_of_its_certificate_is_counted_down(days: int | None, level: Level):
+    left_s = None if days is None else days * 86_400.0
+    told = look(Diagnosis("arm", "r"), {**report(link(0)), "certificate_left_s": left_s})["pool"]
+    assert told.level is level
+    assert ("certificate expires in 29.0 days" in told.message) == (days == 29)
