@@ -110,6 +110,8 @@ def _run(args: Sequence[str]) -> int:
         where = "an open file" if problem.filename is None else f"`{problem.filename}`"
         hint = "free some space, or set TMPDIR to a folder that has some"
         output.error(f"{where}: {problem.strerror}", hint if problem.filename is None else "")
+        if problem.filename is None:
+            output.discard(1)  # it may be this file
         return 1
     return 0
 

@@ -149,7 +149,7 @@ def silenced_stdout() -> bool:
         poll.register(sys.stdout.fileno(), 0)
         if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
             return False
-    _discard(1)
+    discard(1)
     return True
 
 
@@ -158,10 +158,11 @@ def _goes_on() -> Iterator[None]:
     try:
         yield
     except OSError:
-        _discard(2)  # with the buffer, which Python would fail to flush at exit
+        discard(2)
 
 
-def _discard(descriptor: int) -> None:
+def discard(descriptor: int) -> None:
+    """Discard what a stream still buffers, which Python would fail to flush at exit."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, descriptor)
     os.close(nowhere)

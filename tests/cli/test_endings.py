@@ -102,11 +102,12 @@ def test_without_stdout_or_stderr_the_work_is_done_all_the_same(home, tmp_path, 
 def test_a_full_disk_behind_stdout_is_an_error_and_no_trace(home, tmp_path):
     done = subprocess.run(
         ["sh", "-c", f"{sys.executable} -m fogft --help > /dev/full"],
-        env={**os.environ, "FOGFT_HOME": str(home)}, capture_output=True, text=True, check=False,
+        env={**os.environ, "FOGFT_HOME": str(home), "PYTHONUNBUFFERED": ""},
+        capture_output=True, text=True, check=False,
     )  # fmt: skip
-    assert done.returncode != 0
-    assert "No space left on device" in done.stderr
-    assert "Traceback" not in done.stderr
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: an open file: No space left on device\n\nhint: ")
+    assert len(done.stderr.splitlines()) == 3, done.stderr
 
 
 def test_a_broken_pipe_that_is_not_stdout_is_a_defect_of_ours(monkeypatch):
