@@ -18,6 +18,7 @@ from fogft.cloud import notice_formats
 from fogft.cloud.notice_formats import Notice, NoticeKind
 from fogft.errors import CloudError
 from fogft.model.names import NOTICE_SOURCES
+from fogft.process import on_thread
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +52,7 @@ class Watch:
         self._source: _Source | None = None
         self._closed = threading.Event()
         self.close = self._closed.set  # no new call after this, but one may still run; idempotent
-        threading.Thread(target=self._run, name="notice", daemon=True).start()
+        on_thread(self._run, name="notice")
 
     @property
     def silent(self) -> bool:

@@ -176,6 +176,15 @@ def test_an_unknown_source_is_refused_with_the_known_ones(source: str):
     assert "`auto`" in caught.value.hint
 
 
+def test_where_no_thread_can_start_it_says_what_to_check(monkeypatch: pytest.MonkeyPatch):
+    def start(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with pytest.raises(OSError, match="check `ulimit -u`"):
+        Watch("auto", lambda notice: None)
+
+
 READERS: list[Callable[[str], Any]] = [
     formats.aws_action,
     formats.aws_rebalance,
