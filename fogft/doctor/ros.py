@@ -41,7 +41,7 @@ def rclpy(_: Situation) -> Iterator[Finding]:
             "rclpy",
             f"ROS 2 cannot be used from this Python: {problem}",
             "source your installation (`. /opt/ros/DISTRO/setup.bash`), or run "
-            "`pip install 'fogft[ros]'`",
+            "`pip install 'fogft[ros]'` in a virtual environment (its wheels need one)",
         )
         return
     name = described["distribution"].capitalize()

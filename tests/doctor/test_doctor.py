@@ -266,7 +266,7 @@ def test_without_rclpy_it_says_how_to_get_it(tmp_path, monkeypatch):
     found = the_only(ros.rclpy(situation(tmp_path)))
     assert found.verdict is Verdict.FAIL
     assert found.text == "ROS 2 cannot be used from this Python: librcl.so: not found"
-    assert "fogft[ros]" in found.advice
+    assert "`pip install 'fogft[ros]'` in a virtual environment" in found.advice
 
 
 # --- pools
