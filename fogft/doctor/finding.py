@@ -58,5 +58,5 @@ def run(check: Check, situation: Situation) -> Iterator[Finding]:
         yield from check(situation)
     except Exception as error:
         what = f"the check itself failed: {type(error).__name__}: {error}"
-        advice = "report this as a bug in `fogft doctor`"
+        advice = "report this as a bug, unless processes, files or memory ran out (`ulimit -a`)"
         yield fail(check.__name__.replace("_", " "), what, advice)
