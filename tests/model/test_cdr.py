@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fogft.model.cdr import Shape
+from tests.needs import needs
 
 LITTLE, BIG = b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"
 SET_BOOL = Shape("response", {"response": (("success", "boolean"), ("message", "string"))})
@@ -156,8 +157,8 @@ TYPES = [
     "nav_msgs/srv/GetPlan",
     "nav_msgs/srv/SetMap",
     "sensor_msgs/srv/SetCameraInfo",
-    "test_msgs/srv/Arrays",
-    "test_msgs/srv/BasicTypes",
+    pytest.param("test_msgs/srv/Arrays", marks=needs("test_msgs")),
+    pytest.param("test_msgs/srv/BasicTypes", marks=needs("test_msgs")),
     "rcl_interfaces/srv/SetParameters",
     "rcl_interfaces/srv/DescribeParameters",
 ]
