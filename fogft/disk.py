@@ -31,12 +31,14 @@ T = TypeVar("T")
 def make_folder(path: Path) -> None:
     """Create a folder that only this user can enter, with its parents."""
     try:
+        made = [path, *(parent for parent in path.parents if not parent.exists())]
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         hint = "check the disk and the owner, or set FOGFT_HOME to another folder"
         raise StateError(f"`{path}` cannot be created: {error.strerror}", hint) from error
-    with contextlib.suppress(OSError):
-        path.chmod(0o700)
+    for folder in made:
+        with contextlib.suppress(OSError):
+            folder.chmod(0o700)
 
 
 def write_whole(path: Path, content: bytes | str, *, durable: bool = True) -> None:

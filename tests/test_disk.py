@@ -54,6 +54,14 @@ def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
         disk.make_folder(tmp_path / "file" / "home")
 
 
+def test_a_folder_and_the_parents_made_for_it_are_private_and_others_stay(tmp_path):
+    ours = tmp_path / "ours"
+    ours.mkdir(mode=0o755)
+    disk.make_folder(ours / "fogft" / "sky" / "locks")
+    made = [ours, ours / "fogft", ours / "fogft" / "sky", ours / "fogft" / "sky" / "locks"]
+    assert [one.stat().st_mode & 0o777 for one in made] == [0o755, 0o700, 0o700, 0o700]
+
+
 def test_json_goes_round_and_a_missing_file_is_none(tmp_path):
     disk.write_json(tmp_path / "x.json", {"a": [1, None]})
     assert disk.read_json(tmp_path / "x.json") == {"a": [1, None]}

@@ -183,7 +183,6 @@ def join(
     label = read_label(joining.read(bundle))
     whom = f"{label.holder.role.value} `{label.holder.short}` of pool `{label.pool}`"
     output.say(f"this bundle is for {whom}")
-    disk.make_folder(home())
     logging.getLogger("fogft.link").addHandler(logging.NullHandler())  # the error has the details
     joined = joining.join(bundle, _read_passphrase(passphrase_file), home(), time.time())
     output.data(str(joined.config))
@@ -248,7 +247,6 @@ def import_(
     if read_label(joining.read(file)).holder.role is not Role.MANAGER:
         raise FogftError(f"`{file}` lets a machine join a pool", "use it with `fogft join`")
     passphrase = _read_passphrase(passphrase_file)
-    disk.make_folder(home())
     store = moving.import_(file, passphrase, home(), time.time(), pool_file=pool_file)
     startup.start_manager(store)
     joining.destroy(file)

@@ -176,7 +176,6 @@ def _tree(asked: Mapping[str, Any], nodes: Sequence[NodeCommand]) -> dict[str, A
 
 def _written(tree: Mapping[str, Any]) -> Path:
     folder = home() / "launch"
-    make_folder(home())
     make_folder(folder)
     path = folder / f"{tree['name']}.yaml"
     write_whole(path, yaml.dump(dict(tree), Dumper=_Blocks, sort_keys=False))
