@@ -199,6 +199,7 @@ print(stop.is_set())
 @pytest.mark.parametrize("nohup", [False, True])
 def test_a_closed_terminal_ends_a_process_except_under_nohup(nohup: bool) -> None:
     words = [*(["nohup"] if nohup else []), sys.executable, "-c", _SURVIVES]
+    words = ["env", "--default-signal=HUP", *words]  # a `down` in this process ignores it
     ended = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
     assert ended.stdout.split() == [str(not nohup), "True"]
 
