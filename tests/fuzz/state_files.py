@@ -71,9 +71,9 @@ def _lay_down(home: Path) -> PoolPaths:
     paths.history.write_text("".join(json.dumps(to_plain(one)) + "\n" for one in events))
     authority.create_authority(paths.credentials, UID)
     ledger = Ledger(paths.credentials)
-    holder, _ = ledger.issue_next(Role.ROBOT, "ada", UID, days=1.0)
+    holder, _ = ledger.issue_next(Role.ROBOT, "ada", UID)
     ledger.revoke([holder])
-    ledger.issue_next(Role.REPLICA, "2000", UID, days=1.0)
+    ledger.issue_next(Role.REPLICA, "2000", UID)
     records_cache.write(paths.records, signed_records())
     return paths
 

@@ -40,7 +40,7 @@ def paths(tmp_path: Path) -> PoolPaths:
 
 def _robot(paths: PoolPaths, name: str, *, revoked: bool) -> CredentialPaths:
     ledger = Ledger(paths.credentials)
-    holder, issued = ledger.issue_next(Role.ROBOT, name, POOL_UID, days=1.0)
+    holder, issued = ledger.issue_next(Role.ROBOT, name, POOL_UID)
     pki.write(issued, paths.credentials, name)
     if revoked:
         ledger.revoke([holder])

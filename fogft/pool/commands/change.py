@@ -100,7 +100,7 @@ def rotate_robot(store: PoolStore) -> tuple[Holder, list[Holder], bool]:
     ones are in use; return the new holder, the old ones, and whether that has happened.
     """
     with disk.locked(store.paths.intent_lock):
-        holder = configuration.rotate_robot(store.paths, store.identity(), store.spec())
+        holder = configuration.rotate_robot(store.paths, store.identity())
     named = Ledger(store.paths.credentials).named(Role.ROBOT, holder.name)
     old = [one for one in named if one.generation < holder.generation]
     in_use = wait_for(lambda: _in_use(store.paths, holder), PUBLISH_LIMIT_S)

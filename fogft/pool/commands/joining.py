@@ -75,9 +75,8 @@ def issue(
     bundle.check_passphrase(passphrase)  # before a generation is used up
     with disk.locked(store.paths.intent_lock):
         store.identity()  # raises if it was exported meanwhile
-        holder, credential = Ledger(store.paths.credentials).issue_next(
-            role, name, identity.uid, days=configuration.certificate_days(spec)
-        )
+        ledger = Ledger(store.paths.credentials)
+        holder, credential = ledger.issue_next(role, name, identity.uid)
     label = Label(secrets.token_hex(16), identity.name, holder.common_name, now, now + open_for_s)
     content = {"files": _files(store, holder, credential), "rendezvous": list(spec.rendezvous)}
     return holder, bundle.seal(label, content, passphrase)

@@ -105,14 +105,12 @@ class Ledger:
         good = (e.holder for e in self.entries() if e.state(self._clock()) == "good")
         return [holder for holder in good if holder.role is role]
 
-    def issue(self, holder: Holder, *, days: float = authority.LEAF_DAYS) -> Credential:
+    def issue(self, holder: Holder) -> Credential:
         """Certify a holder, and record it."""
         with disk.locked(self._lock):
-            return self._issue(holder, self.entries(), days)
+            return self._issue(holder, self.entries())
 
-    def issue_next(
-        self, role: Role, name: str, pool_uid: str, *, days: float
-    ) -> tuple[Holder, Credential]:
+    def issue_next(self, role: Role, name: str, pool_uid: str) -> tuple[Holder, Credential]:
         """Certify the next generation of a name, and record it."""
         with disk.locked(self._lock):
             entries = self.entries()
@@ -128,15 +126,15 @@ class Ledger:
                     if role is Role.REPLICA
                     else "use letters, digits and dashes, 28 at most",
                 ) from None
-            return holder, self._issue(holder, entries, days)
+            return holder, self._issue(holder, entries)
 
-    def _issue(self, holder: Holder, entries: tuple[Entry, ...], days: float) -> Credential:
+    def _issue(self, holder: Holder, entries: tuple[Entry, ...]) -> Credential:
         if any(e.common_name == holder.common_name and e.revoked_at for e in entries):
             raise CredentialError(
                 f"the certificate of {holder.role.value} `{holder.short}` is revoked",
                 "`fogft credentials issue` makes its next generation",
             )
-        issued = authority.issue(self._folder, holder.common_name, role=holder.role, days=days)
+        issued = authority.issue(self._folder, holder.common_name, role=holder.role)
         said = authority.describe_pem(issued.certificate_pem)
         entry = Entry(holder.common_name, said.serial, self._clock(), said.not_after.timestamp())
         self._write((*self._kept(entries), entry))

@@ -31,8 +31,6 @@ from fogft.pool.manager.reconciler import bare_order
 from fogft.poolfile import config_file
 
 _BESIDE = PoolPaths(Path())  # files in the folder of a configuration
-# How long a certificate outlasts a pool with `max_hours`.
-MARGIN_DAYS = 30.0
 _CLIENT_HEADING = (
     "A client proxy, or a gateway. It is read again whenever it changes. Paths are relative to\n"
     "this file's folder; keys not set here have their defaults."
@@ -50,11 +48,6 @@ _REPLICA_HEADING = (
     "The server proxy of one replica. Options of `fogft serve` override it. Paths are relative to\n"
     "this file's folder; keys not set here have their defaults."
 )
-
-
-def certificate_days(spec: PoolSpec) -> float:
-    """Return the validity of a certificate: a year, and at least a month past `max_hours`."""
-    return max(authority.LEAF_DAYS, (spec.max_hours or 0.0) / 24 + MARGIN_DAYS)
 
 
 def robot_name() -> str:
@@ -100,26 +93,23 @@ def proxy_config(
     return config_file.document(config, _CLIENT_HEADING)
 
 
-def certify_robot(
-    paths: PoolPaths, identity: Identity, spec: PoolSpec, now: datetime.datetime
-) -> None:
+def certify_robot(paths: PoolPaths, identity: Identity, now: datetime.datetime) -> None:
     """Ensure that the client proxy has a valid certificate, and its key."""
     revoked = Ledger(paths.credentials).revoked()
     with disk.locked(paths.credentials / "robot.lock"):  # no rotation is under way
         if not authority.is_good(paths.credentials / "robot.crt", now, revoked):
-            _rotate(paths, identity, spec)
+            _rotate(paths, identity)
 
 
-def rotate_robot(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
+def rotate_robot(paths: PoolPaths, identity: Identity) -> Holder:
     """Issue new credentials to this machine's client proxy, which switches to them itself."""
     with disk.locked(paths.credentials / "robot.lock"):  # key and certificate are two files
-        return _rotate(paths, identity, spec)
+        return _rotate(paths, identity)
 
 
-def _rotate(paths: PoolPaths, identity: Identity, spec: PoolSpec) -> Holder:
-    holder, issued = Ledger(paths.credentials).issue_next(
-        Role.ROBOT, robot_name(), identity.uid, days=certificate_days(spec)
-    )
+def _rotate(paths: PoolPaths, identity: Identity) -> Holder:
+    ledger = Ledger(paths.credentials)
+    holder, issued = ledger.issue_next(Role.ROBOT, robot_name(), identity.uid)
     authority.write(issued, paths.credentials, "robot")
     return holder
 
@@ -130,7 +120,7 @@ def build_order(
     """Return the complete order of a planned launch, including the manager's `signed` records."""
     id = ReplicaId(identity.uid, planned.slot, planned.generation)
     holder = holder_of(id.certificate_name)
-    issued = Ledger(paths.credentials).issue(holder, days=certificate_days(spec))
+    issued = Ledger(paths.credentials).issue(holder)
     bare = bare_order(identity, spec, planned)
     config = replica_config(identity, spec, id, announcements=True)
     return replace(
@@ -159,7 +149,7 @@ def gateway_order(
     the gateway and the rendezvous. The certificates of earlier gateways are revoked.
     """
     id = ReplicaId(identity.uid, GATEWAY_SLOT, generation)
-    ledger, days = Ledger(paths.credentials), certificate_days(spec)
+    ledger = Ledger(paths.credentials)
     mine = Holder(Role.GATEWAY, LAUNCHED, generation, identity.uid)
     ledger.revoke(
         e.holder
@@ -172,7 +162,7 @@ def gateway_order(
         ("gateway", mine),
         ("rendezvous", replace(mine, role=Role.RENDEZVOUS)),
     ):
-        files |= ledger.issue(holder, days=days).files(stem)
+        files |= ledger.issue(holder).files(stem)
     listens, rendezvous, door = spec.gateway.endpoints("0.0.0.0")
     near = spec.gateway.endpoints("127.0.0.1")[1]
     gateway = ClientProxyConfig(

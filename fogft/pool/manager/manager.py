@@ -290,7 +290,7 @@ class Manager:
         due = self._certified_at is None or abs(now - self._certified_at) > CERTIFY_EVERY_S
         if due or seen != self._certified_for:
             utc = datetime.datetime.now(datetime.timezone.utc)
-            configuration.certify_robot(self._paths, self._identity, self.store.spec(), utc)
+            configuration.certify_robot(self._paths, self._identity, utc)
             self._certified_at, self._certified_for = now, seen
         configuration.write_proxy_config(self._paths, self._identity, self.store.spec())
         over = lifetime.is_over(self.store.spec(), self._begun_at(), time.time())

@@ -31,7 +31,7 @@ def made(tmp_path, monkeypatch):
     monkeypatch.setenv("FOGFT_HOME", str(tmp_path / "home"))
     paths = lay_down(tmp_path / "home", None)
     create_authority(paths.credentials, UID)
-    Ledger(paths.credentials).issue_next(Role.ROBOT, "ada", UID, days=1)
+    Ledger(paths.credentials).issue_next(Role.ROBOT, "ada", UID)
     return make_store("planner"), tmp_path / "planner.pool"
 
 

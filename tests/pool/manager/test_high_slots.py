@@ -79,7 +79,7 @@ def test_a_groups_machines_are_not_taken_for_replicas_by_hand(tmp_path: Path) ->
     authority.create_authority(tmp_path / "ca", UID)
     ledger = Ledger(tmp_path / "ca")
     for slot in SOME:
-        ledger.issue(holder_of(id_of(slot).certificate_name), days=30)
+        ledger.issue(holder_of(id_of(slot).certificate_name))
     assert ledger.by_hand() == {id_of(slot) for slot in SOME if slot >= FIRST_BY_HAND}
 
 
