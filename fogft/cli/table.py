@@ -3,21 +3,16 @@
 Numbers and words are never cut. Only an `optional` column without values is left out.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from rich.cells import cell_len
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
 from fogft.cli.output import cell
-
-if TYPE_CHECKING:
-    from rich.console import RenderableType
 
 _GAP = 2
 _LEAST = 18  # width of a folded column, unless a word is longer

@@ -8,11 +8,9 @@ import os
 import secrets
 import subprocess
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import fogft
 from fogft.child import how_it_ended, python
 from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.errors import RosError
@@ -151,7 +149,6 @@ def discovery(_: Situation) -> Iterator[Finding]:
         stdin=subprocess.PIPE,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        env=_environ(),
     ) as answering:
         try:
             result = _self_test("ask", name)
@@ -189,7 +186,6 @@ def _self_test(*arguments: str) -> dict[str, Any]:
             capture_output=True,
             text=True,
             timeout=_LIMIT_S,
-            env=_environ(),
             check=False,
         )
     except subprocess.TimeoutExpired:
@@ -205,9 +201,3 @@ def _self_test(*arguments: str) -> dict[str, Any]:
 def child_command(*arguments: str) -> list[str]:
     """Return the command that tests ROS in a separate process, which may crash."""
     return python("-m", "fogft.ros.self_test", *arguments)
-
-
-def _environ() -> dict[str, str]:
-    ours = str(Path(fogft.__file__).parent.parent)  # makes fogft importable there
-    path = filter(None, (ours, os.environ.get("PYTHONPATH")))
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
