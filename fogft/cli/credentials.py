@@ -11,9 +11,9 @@ from typing import Annotated
 import typer
 
 from fogft import disk
-from fogft.cli import options, output
+from fogft.cli import output
 from fogft.cli.commands import Command, group
-from fogft.cli.options import AsJson, PoolOption
+from fogft.cli.options import AsJson, PoolName, PoolOption
 from fogft.cli.status_text import show_table, utc
 from fogft.errors import CredentialError, FogftError
 from fogft.model.credentials import Holder, Role
@@ -193,9 +193,7 @@ def join(
 
 
 def export(
-    pool: Annotated[
-        str, typer.Argument(metavar="POOL", help="Pool name.", autocompletion=options.pools)
-    ],
+    pool: PoolName,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The file to write.")],
     *,
     hours: Hours = 24.0,

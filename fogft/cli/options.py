@@ -60,6 +60,7 @@ PoolOption = Annotated[
         metavar="NAME",
     ),
 ]
+PoolName = Annotated[str, typer.Argument(metavar="POOL", help="Pool name.", autocompletion=pools)]
 PoolArgument = Annotated[
     str | None,
     typer.Argument(help="Pool name; required if there are several.", autocompletion=pools),

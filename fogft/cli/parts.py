@@ -6,9 +6,9 @@ from typing import Annotated
 
 import typer
 
-from fogft.cli import options, output
+from fogft.cli import output
 from fogft.cli.commands import Command, group
-from fogft.cli.options import PoolOption
+from fogft.cli.options import PoolName, PoolOption
 from fogft.errors import FogftError
 from fogft.model.choices import Speaks
 from fogft.pool.commands import composition
@@ -105,9 +105,7 @@ def serve(
 
 
 def manager(
-    pool: Annotated[
-        str, typer.Argument(metavar="POOL", help="Pool name.", autocompletion=options.pools)
-    ],
+    pool: PoolName,
     *,
     metrics: Metrics = None,
     no_proxy: Annotated[

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from fogft import disk
+from fogft.model.plain import to_plain
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import Identity, write_identity
 from fogft.pool.manager.status import PoolStatus, ReplicaStatus, ServiceStatus
@@ -71,4 +72,4 @@ def _pool(home: Path) -> None:
         ready=_REPLICAS, uplink_suspected=False, usd_per_hour=0.3, proxy_pid=1, proxy_alive=True,
         replicas=replicas, services=[ServiceStatus("/flag", "std_srvs/srv/SetBool", _REPLICAS)],
     )  # fmt: skip
-    disk.write_json(paths.status, seen.to_json())
+    disk.write_json(paths.status, to_plain(seen))

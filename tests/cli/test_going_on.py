@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from fogft import disk
+from fogft.model.plain import to_plain
 from tests.fakes.pools import STATUS, alive, lay_down
 from tests.fakes.waiting import wait_for
 
@@ -67,7 +68,7 @@ def test_a_watched_status_is_said_again_and_again(home):
     with alive(paths), going_on("status", "--watch", "--json") as process:
         assert process.stdout is not None
         assert json.loads(process.stdout.readline())["target"] == 3
-        disk.write_json(paths.status, replace(STATUS, target=5).to_json())
+        disk.write_json(paths.status, to_plain(replace(STATUS, target=5)))
         while json.loads(process.stdout.readline())["target"] != 5:
             pass
         assert interrupted(process)

@@ -54,7 +54,7 @@ def test_every_status_is_valid(world: World) -> None:
         recent=[Event(NOW, EventKind.FAILED, 0, 1, "c/r/a", FULL)],
     ).joined(None, proxy_alive=True, links=world.observed.links)
     check(Seen(seen, None, manager_alive=True).to_json())
-    again = status.from_json(json.loads(json.dumps(seen.to_json())), Path("status.json"))
+    again = status.from_json(json.loads(json.dumps(to_plain(seen))), Path("status.json"))
     assert (again.reasons, again.events) == (seen.reasons, seen.events)
 
 

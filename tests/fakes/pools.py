@@ -137,7 +137,7 @@ def lay_down(
     paths.spec.write_text(SPEC.replace("planner\n", f"{name}\n", 1))
     paths.intent.write_text(json.dumps(to_plain(Intent())))
     if status is not None:
-        observed: dict[str, Any] = replace(status, observed_at=time.time() - age_s).to_json()
+        observed: dict[str, Any] = to_plain(replace(status, observed_at=time.time() - age_s))
         disk.write_json(paths.status, observed)
         report(paths, status)
     write_identity(paths, Identity(name, UID, cloud, str(file), time.time()))

@@ -93,8 +93,6 @@ class Chaos:
     def capacity(self, location: str, machines: int) -> None:
         """Set how many machines a location has room for; running ones stay."""
         place = self._location(location)
-        if machines < 0:
-            raise CloudError(f"`{place}` cannot hold {machines} machines", "give 0 or more")
         self._change_cloud(lambda old: replace(old, capacity={**old.capacity, place: machines}))
 
     def clear(self) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 from fogft import disk
 from fogft.errors import StateError
+from fogft.model.plain import to_plain
 from fogft.model.reason import Reason
 from fogft.model.replica import LinkReport, LinkState
 from fogft.pool.folder.paths import PoolPaths
@@ -65,7 +66,7 @@ class Seen:
     def to_json(self) -> dict[str, Any]:
         """Return the JSON form: that of `status.json` with the keys added here."""
         own = {name: value for name, value in vars(self).items() if name != "status"}
-        return {**self.status.to_json(), **own, "unanswered": list(self.unanswered)}
+        return {**to_plain(self.status), **own, "unanswered": list(self.unanswered)}
 
 
 def current(

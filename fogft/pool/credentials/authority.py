@@ -78,11 +78,6 @@ def create_authority(folder: Path, pool_uid: str) -> None:
     disk.write_whole(folder / AUTHORITY_CERTIFICATE, certificate)
 
 
-def end_of(folder: Path) -> float:
-    """Return when the CA expires, in seconds since the epoch."""
-    return describe(folder / AUTHORITY_CERTIFICATE).not_after.timestamp()
-
-
 def issue(folder: Path, common_name: str, *, role: Role, days: float = LEAF_DAYS) -> Credential:
     """Certify a new key under a name of 1 to 64 characters, for `days` or until the CA expires."""
     issuer, now = _load_authority(folder), datetime.datetime.now(datetime.timezone.utc)

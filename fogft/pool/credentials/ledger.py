@@ -90,7 +90,8 @@ class Ledger:
         last = {e.common_name: e for e in self.entries()}  # a stopped machine has several
         due = [e.holder for e in last.values() if e.state(soon) == "expired"]
         found = frozenset(_replica(holder) for holder in due if holder.role is Role.REPLICA)
-        if found and authority.end_of(self._folder) <= soon:
+        ca = self._folder / authority.AUTHORITY_CERTIFICATE
+        if found and authority.describe(ca).not_after.timestamp() <= soon:
             return frozenset()
         return found
 

@@ -21,6 +21,7 @@ from fogft import __version__, disk, logfile
 from fogft.cloud.port import Cloud, Launch, RealCloud
 from fogft.errors import FogftError, PoolBusy, PoolNotFound, StateError
 from fogft.metrics.scrape import Scrape
+from fogft.model.plain import to_plain
 from fogft.model.reason import Cause, Reason, because
 from fogft.model.replica import LinkReport, LinkState, Offer
 from fogft.model.spec import PoolSpec
@@ -341,7 +342,7 @@ class Manager:
             log.info("pool_ended pool=%s how=%r", self._identity.name, ended)
         self._told = seen
         self._tally.seen(seen.replicas, tick.observed.now)
-        self._report.write(seen.to_json())
+        self._report.write(to_plain(seen))
 
     def _rest(self, stop: threading.Event) -> None:
         """Wait for the next tick, or for something to react to."""

@@ -319,10 +319,6 @@ class PoolStatus:
             topology=topology,
         )
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the JSON form."""
-        return dict(to_plain(self))
-
 
 def from_json(raw: Any, path: Path) -> PoolStatus:
     """Read a status from a file."""

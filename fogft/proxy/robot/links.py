@@ -90,9 +90,6 @@ def _report(status: LinkStatus, gateway: str, one: GatewayView) -> dict[str, Any
         "leaving": one.draining,
         "state": state.value,
         "ready": sorted(one.ready) if up else [],
-        "disagrees": False,
-        "differs": False,
-        "offered": {},
         "heard_age_s": None
         if one.state is LinkState.CONNECTING or heard is None
         else heard + one.silent_for_s,

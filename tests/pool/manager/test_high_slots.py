@@ -18,6 +18,7 @@ from fogft.errors import FogftError
 from fogft.model import membership, names
 from fogft.model.credentials import Role, holder_of
 from fogft.model.groups import FIRST_BY_HAND, LAST_BY_HAND
+from fogft.model.plain import to_plain
 from fogft.model.replica import LinkReport, LinkState, Member, Membership, ReplicaId
 from fogft.model.spec import GroupSpec
 from fogft.pool.commands import change
@@ -144,7 +145,7 @@ def test_status_shows_replicas_by_hand_beside_the_managers(
         (2000, "ready", "up"),
         (2001, "starting", ""),
     ]
-    assert status.from_json(found.to_json(), Path("status.json")) == found
+    assert status.from_json(to_plain(found), Path("status.json")) == found
     output.show(status_text.rendered(Seen(found, 0.4, True), width=100))
     lines = capsys.readouterr().out.splitlines()
     first = next(n for n, line in enumerate(lines) if line.startswith("REPLICA"))
@@ -170,7 +171,7 @@ def test_the_doctor_does_not_promise_to_replace_what_was_started_by_hand() -> No
 def test_slots_are_listed_by_number(tmp_path: Path) -> None:
     """In hints and lists: 9 before 10, and 99 before 100."""
     rows = [replace(seen().replicas[0], slot=slot) for slot in (100, 9, 10, 99)]
-    disk.write_json(PoolPaths(tmp_path).status, replace(seen(), replicas=rows).to_json())
+    disk.write_json(PoolPaths(tmp_path).status, to_plain(replace(seen(), replicas=rows)))
     with pytest.raises(FogftError) as caught:
         change.generation_in(PoolPaths(tmp_path), 5, NOW)
     assert caught.value.hint == "slots in use: 9, 10, 99, 100"
