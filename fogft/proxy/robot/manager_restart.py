@@ -4,6 +4,7 @@ import logging
 import subprocess
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from fogft import disk
@@ -20,27 +21,25 @@ STEADY_S = 60.0
 HANGS_AFTER_S = 120.0  # it may be waiting for the cloud
 
 
+@dataclass(eq=False)
 class ManagerRestart:
     """Watches the manager of a pool's folder: kills it if it hangs, restarts it if it is gone.
 
     `environ` is for the manager: our own environment before ROS was prepared in it.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        environ: Mapping[str, str],
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        self._folder = folder
-        self._environ = dict(environ)
-        self._clock = clock
+    folder: Path
+    environ: Mapping[str, str]
+    clock: Callable[[], float] = time.monotonic
+
+    def __post_init__(self) -> None:
+        self._environ = dict(self.environ)
         self._look_at = 0.0
         self._started_at = float("-inf")
         self._wait_s = LOOK_S
         self._missing = False
-        self._lock = folder
-        self._hanging = Hanging(HANGS_AFTER_S, clock)
+        self._lock = self.folder
+        self._hanging = Hanging(HANGS_AFTER_S, self.clock)
         self.child: subprocess.Popen[bytes] | None = None
 
     def look(self) -> None:
@@ -48,20 +47,20 @@ class ManagerRestart:
 
         Raises StateError: It cannot be started, or its file is damaged.
         """
-        now = self._clock()
+        now = self.clock()
         if now < self._look_at:
             return
         self._look_at = now + LOOK_S
-        told = disk.read_json(self._folder / NAME)
+        told = disk.read_json(self.folder / NAME)
         if told is None or (self.child is not None and self.child.poll() is None):
             self._missing = False
             return
         try:
-            locks = [self._folder / str(told[key]) for key in ("lock", "changing")]
+            locks = [self.folder / str(told[key]) for key in ("lock", "changing")]
             command, folder = [str(word) for word in told["command"]], Path(told["folder"])
-            log_path = self._folder / str(told["log"])
+            log_path = self.folder / str(told["log"])
         except (TypeError, KeyError) as error:
-            raise StateError(f"`{self._folder / NAME}` is damaged: {error!r}") from error
+            raise StateError(f"`{self.folder / NAME}` is damaged: {error!r}") from error
         self._lock = locks[0]
         holder = disk.holder(self._lock, said=False)
         if self._hanging.end(holder):
@@ -72,12 +71,12 @@ class ManagerRestart:
         self._missing = missing
 
     def _start(self, command: list[str], folder: Path, log_path: Path) -> None:
-        now = self._clock()
+        now = self.clock()
         ran_s = now - self._started_at
         self._wait_s = LOOK_S if ran_s > STEADY_S else min(2 * self._wait_s, BACKOFF_LIMIT_S)
         self._look_at, self._started_at = now + self._wait_s, now
         try:
-            here = folder if folder.is_dir() else self._folder  # where `up` ran, if it still exists
+            here = folder if folder.is_dir() else self.folder  # where `up` ran, if it still exists
             self.child = detached(command, log_path, folder=here, environ=self._environ)
         except OSError as error:
             raise StateError(f"the manager cannot be restarted: {error}") from error
