@@ -14,10 +14,10 @@ import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fogft import child, disk, logfile
-from fogft.cloud.local import faults, processes, task_commands
+from fogft.cloud.local import faults, processes
 from fogft.cloud.local.ending import sweep_shared_memory
 from fogft.cloud.local.folder import END, LINK, LOCK, NOTICE, STATE, MachineFolder, Record, State
 from fogft.errors import FogftError, StateError, told
@@ -26,6 +26,7 @@ from fogft.model.reason import Cause, Reason
 from fogft.model.replica import MachinePhase
 from fogft.process import ending_signals, start_log
 from fogft.reason_words import words
+from fogft.ros.environment import child_environment
 from fogft.ros.reservations import Reservation, own_domain, reserve_domain, reserve_port
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ class Machine:
         self._say(State(MachinePhase.PROVISIONING, progress="setup", setting_up=True))
         log.info("setup_started command=%r", command)
         begin = logfile.size(self._folder.log)
-        environ = task_commands.environment(self._record.order.task)
+        environ = _setup_environment(self._record.order.task)
         pid = self._spawn(["bash", "-c", str(command)], workdir, environ)
         self._wait(lambda: pid in self._statuses)
         turn.release()
@@ -196,8 +197,8 @@ class Machine:
             *("--workdir", str(workdir)),
             *("--notice-file", str(folder / NOTICE)),
         ]
-        environ = task_commands.server_environment(self._record.order.task, domain.number)
-        return self._spawn(task_commands.sourced(command, workdir), folder, environ)
+        environ = _server_environment(self._record.order.task, domain.number)
+        return self._spawn(_sourced(command, workdir), folder, environ)
 
     def _spawn(self, command: list[str], workdir: Path, environ: Mapping[str, str]) -> int:
         try:
@@ -279,6 +280,36 @@ class Machine:
 
     def _on_signal(self, number: int, _: object) -> None:
         self._signal = number
+
+
+def _setup_environment(task: Mapping[str, Any]) -> dict[str, str]:
+    """Return the environment of `setup`: the user's own plus the task's variables."""
+    environ = child_environment(os.environ)
+    if sys.prefix != sys.base_prefix:
+        environ["PATH"] = f"{sys.prefix}/bin:{environ.get('PATH', os.defpath)}"
+    return environ | _variables(task)
+
+
+def _server_environment(task: Mapping[str, Any], domain: int) -> dict[str, str]:
+    """Return the server proxy's environment, including the service's `RMW_IMPLEMENTATION`."""
+    given = _variables(task)
+    if "PYTHONPATH" in given and "PYTHONPATH" in os.environ:  # fogft may be installed there
+        given["PYTHONPATH"] += os.pathsep + os.environ["PYTHONPATH"]
+    return {**os.environ, **given, "ROS_DOMAIN_ID": str(domain)}
+
+
+def _variables(task: Mapping[str, Any]) -> dict[str, str]:
+    """Return the variables in a task's `envs` and `secrets`."""
+    found = {**(task.get("envs") or {}), **(task.get("secrets") or {})}
+    return {str(k): "" if v is None else str(v) for k, v in found.items()}
+
+
+def _sourced(command: list[str], workdir: Path) -> list[str]:
+    """Return a command that runs with the folder's colcon workspace sourced, if it has one."""
+    setup = workdir / "install" / "setup.bash"
+    if not setup.is_file():
+        return command
+    return ["bash", "-c", '. "$0"; exec "$@"', str(setup), *command]
 
 
 if __name__ == "__main__":
