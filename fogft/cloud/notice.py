@@ -26,28 +26,19 @@ POLL_S = 1.0
 FILE_POLL_S = 0.1  # costs nothing, and a local machine may live for a second only
 LOST_POLL_S = 30.0
 _TIMEOUT_S = 2.0
-_METADATA = "169.254.169.254"
+METADATA = "169.254.169.254"  # ``host[:port]`` of the metadata server
 
 
 class Watch:
     """Polls for notices on its own thread and calls `on_notice` once for each kind of notice.
 
-    `source` is ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers;
-    `metadata` is ``host[:port]`` of the metadata server; None: the environment's, or the default.
+    `source` is ``file:PATH``, ``aws``, ``gcp``, ``azure``, or ``auto`` for whichever answers.
     """
 
-    def __init__(
-        self,
-        source: str,
-        on_notice: Callable[[Notice], None],
-        *,
-        poll_s: float | None = None,
-        metadata: str | None = None,
-    ) -> None:
-        self._sources = _sources(source, metadata)
+    def __init__(self, source: str, on_notice: Callable[[Notice], None]) -> None:
+        self._sources = _sources(source)
         self._on_notice = on_notice
-        usual_s = FILE_POLL_S if isinstance(self._sources[0], _File) else POLL_S
-        self._poll_s = usual_s if poll_s is None else poll_s
+        self._poll_s = FILE_POLL_S if isinstance(self._sources[0], _File) else POLL_S
         self._told: set[NoticeKind] = set()
         self._source: _Source | None = None
         self._closed = threading.Event()
@@ -86,7 +77,7 @@ class Watch:
             self._on_notice(notice)
 
 
-def _sources(source: str, metadata: str | None) -> list[_Source]:
+def _sources(source: str) -> list[_Source]:
     if source.startswith("file:") and source != "file:":
         return [_File(Path(source.removeprefix("file:")))]
     if source not in NOTICE_SOURCES:
@@ -96,15 +87,15 @@ def _sources(source: str, metadata: str | None) -> list[_Source]:
         )
     # The environment variables are those of the clouds' own clients. Azure's clients have none.
     known: dict[str, _Source] = {
-        "aws": _Aws(metadata or _address("AWS_EC2_METADATA_SERVICE_ENDPOINT")),
-        "gcp": _Gcp(metadata or _address("GCE_METADATA_HOST"), **{"Metadata-Flavor": "Google"}),
-        "azure": _Azure(metadata or _METADATA, Metadata="true"),
+        "aws": _Aws(_address("AWS_EC2_METADATA_SERVICE_ENDPOINT")),
+        "gcp": _Gcp(_address("GCE_METADATA_HOST"), **{"Metadata-Flavor": "Google"}),
+        "azure": _Azure(METADATA, Metadata="true"),
     }
     return list(known.values()) if source == "auto" else [known[source]]
 
 
 def _address(variable: str) -> str:
-    return os.environ.get(variable, "").split("//")[-1].rstrip("/") or _METADATA
+    return os.environ.get(variable, "").split("//")[-1].rstrip("/") or METADATA
 
 
 def _is_here(source: _Source) -> bool:

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fogft.cloud import notice
 from fogft.cloud import notice_formats as formats
 from fogft.cloud.notice import Watch
 from fogft.cloud.notice_formats import Notice, NoticeKind
@@ -26,20 +27,28 @@ WITHIN_S = 30.0
 class Heard:
     """Starts watches and keeps what they tell."""
 
-    def __init__(self) -> None:
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self._patch = patch
         self.notices: queue.Queue[Notice] = queue.Queue()
         self.watches: list[Watch] = []
 
-    def watch(self, source: str, metadata: str | None = "127.0.0.1:1") -> None:
-        self.watches.append(Watch(source, self.notices.put, poll_s=0.01, metadata=metadata))
+    def watch(self, source: str, metadata: str = "127.0.0.1:1") -> None:
+        self._patch.setattr(notice, "METADATA", metadata)
+        self.watches.append(Watch(source, self.notices.put))
 
     def next(self) -> Notice:
         return self.notices.get(timeout=WITHIN_S)
 
 
+@pytest.fixture(autouse=True)
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(notice, "POLL_S", 0.01)
+    monkeypatch.setattr(notice, "FILE_POLL_S", 0.01)
+
+
 @pytest.fixture
-def heard() -> Iterator[Heard]:
-    heard = Heard()
+def heard(monkeypatch: pytest.MonkeyPatch) -> Iterator[Heard]:
+    heard = Heard(monkeypatch)
     yield heard
     for one in heard.watches:
         one.close()
@@ -133,7 +142,7 @@ def test_the_environment_says_where_the_metadata_server_is(
     with serving(cloud) as fake:
         monkeypatch.setenv(variable, form.format(fake.address))
         give(fake)
-        heard.watch(cloud, None)
+        heard.watch(cloud)
         assert heard.next().kind is PREEMPTION
 
 
@@ -157,11 +166,12 @@ def test_a_file_that_appears_is_a_notice(
     assert heard.next() == expected
 
 
-def test_where_there_is_no_metadata_server_nothing_is_heard():
+def test_where_there_is_no_metadata_server_nothing_is_heard(monkeypatch: pytest.MonkeyPatch):
     """`auto` on a robot or a workstation is silent, and its thread ends when told to."""
     told: list[Notice] = []
     before = set(threading.enumerate())
-    one = Watch("auto", told.append, poll_s=0.01, metadata="127.0.0.1:1")
+    monkeypatch.setattr(notice, "METADATA", "127.0.0.1:1")
+    one = Watch("auto", told.append)
     [thread] = set(threading.enumerate()) - before
     one.close()
     thread.join(WITHIN_S)
