@@ -12,7 +12,7 @@ import contextlib
 import re
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -132,17 +132,8 @@ def _files(store: PoolStore, holder: Holder, credential: Credential) -> dict[str
     return {**files, **{f"{folder}{name}": text.decode() for name, text in own.items()}}
 
 
-def join(
-    file: Path,
-    passphrase: str,
-    root: Path,
-    now: float,
-    *,
-    claim: Callable[[Holder, str, list[str], CredentialPaths], None] = claiming.claim,
-) -> Joined:
+def join(file: Path, passphrase: str, root: Path, now: float) -> Joined:
     """Set up this machine from a bundle, and delete the bundle.
-
-    `claim` ensures that no other machine has joined with it.
 
     Raises:
         CredentialError: The file is no bundle, was used or is too old, or the passphrase is wrong;
@@ -165,7 +156,7 @@ def join(
         if endpoints:
             token = claiming.own_token(root / "joined" / "claims.json", label.id, now)
             with _on_disk(root / "joined", files, holder) as credentials:
-                claim(holder, token, endpoints, credentials)
+                claiming.claim(holder, token, endpoints, credentials)
         for name, text in files.items():
             place = folder / name
             disk.make_folder(place.parent)

@@ -46,13 +46,7 @@ def own_token(claims: Path, id: str, now: float) -> str:
 
 
 def claim(
-    holder: Holder,
-    token: str,
-    endpoints: Sequence[str],
-    credentials: CredentialPaths,
-    *,
-    limit_s: float = LIMIT_S,
-    settle_s: float = SETTLE_S,
+    holder: Holder, token: str, endpoints: Sequence[str], credentials: CredentialPaths
 ) -> None:
     """Claim a holder's certificate for this machine. Repeatable with the same token.
 
@@ -63,14 +57,14 @@ def claim(
         return
     # Two clients: the second receives what the rendezvous holds, whatever the first has published.
     speaker, hearer = (RendezvousClient(endpoints, credentials, holder.pool_uid) for _ in range(2))
-    until = time.monotonic() + limit_s
+    until = time.monotonic() + LIMIT_S
     speaker.start()
     hearer.start()
     try:
         about = SlotState() if holder.role is Role.REPLICA else DialIn()
         said = {**to_plain(about), _KEY: token}
         # The second record ranks above any other claim that comes later.
-        for sequence, pause_s in ((1, settle_s), (2, 0.0)):
+        for sequence, pause_s in ((1, SETTLE_S), (2, 0.0)):
             kind, generation = _KINDS[holder.role], holder.generation
             speaker.publish(kind, holder.name, generation, said, sequence=sequence)
             while _standing(hearer, holder, sequence) is None:

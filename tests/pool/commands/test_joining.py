@@ -287,7 +287,9 @@ def test_garbage_is_no_bundle(data: bytes) -> None:
         bundle.read_label(data)
 
 
-def test_a_join_that_is_killed_leaves_no_key_for_long(tmp_path: Path) -> None:
+def test_a_join_that_is_killed_leaves_no_key_for_long(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Neither a key of its own, nor that of one before it that was killed."""
     store = store_of(replace(SPEC, rendezvous=("10.0.0.9:7450",)), tmp_path)
     file = tmp_path / "ada.join"
@@ -302,7 +304,8 @@ def test_a_join_that_is_killed_leaves_no_key_for_long(tmp_path: Path) -> None:
         assert isinstance(place, CredentialPaths)
         seen.append((place.key.parent, place.key.read_text()))
 
-    joining.join(file, PASSPHRASE, tmp_path / "home", NOW, claim=claim)
+    monkeypatch.setattr(joining.claiming, "claim", claim)
+    joining.join(file, PASSPHRASE, tmp_path / "home", NOW)
     [(folder, key)] = seen
     assert folder == left
     assert "PRIVATE KEY" in key

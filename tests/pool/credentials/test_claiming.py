@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,6 @@ pytestmark = pytest.mark.timeout(180)
 NOW = 2e9
 PASSPHRASE = "correct-horse-battery"
 SPEC = PoolSpec("pool", (ServiceSpec("/s", "std_srvs/srv/SetBool"),), task={"run": "exec serve"})
-LIMIT_S = 60.0
 
 
 @dataclass
@@ -40,16 +38,13 @@ class Scene:
     def issue(self, role: Role, name: str) -> bytes:
         return joining.issue(self.store, role, name, PASSPHRASE, NOW, open_for_s=3600)[1]
 
-    def join(
-        self, machine: str, data: bytes, *, limit_s: float = LIMIT_S, settle_s: float = 0.5
-    ) -> Joined:
+    def join(self, machine: str, data: bytes) -> Joined:
         """Join on a machine of its own, from its own copy of a bundle."""
         home = self.folder / machine
         home.mkdir(exist_ok=True)
         file = home / "a.join"
         file.write_bytes(data)
-        claim = partial(claiming.claim, limit_s=limit_s, settle_s=settle_s)
-        return joining.join(file, PASSPHRASE, home, NOW, claim=claim)
+        return joining.join(file, PASSPHRASE, home, NOW)
 
     def keys(self, machine: str) -> list[Path]:
         return list((self.folder / machine).rglob("*.key"))
@@ -58,6 +53,7 @@ class Scene:
 @pytest.fixture
 def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Scene]:
     monkeypatch.setitem(bundle.SCRYPT, "n", 2)
+    monkeypatch.setattr(claiming, "LIMIT_S", 60.0)
     paths = PoolPaths(tmp_path / "pool")
     authority = Authority(tmp_path / "rendezvous", ca=paths.credentials)
     place = Rendezvous(authority, "a")
@@ -103,14 +99,17 @@ def test_a_copy_is_refused_once_the_first_machines_proxy_has_spoken(scene: Scene
         hearer.client.close()
 
 
-def test_of_machines_that_join_at_once_one_does(scene: Scene) -> None:
+def test_of_machines_that_join_at_once_one_does(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They settle for longer than this machine, however busy, takes to pass a word on."""
+    monkeypatch.setattr(claiming, "SETTLE_S", 4.0)
     data = scene.issue(Role.ROBOT, "ada")
     said: list[str] = []
 
     def join(machine: str) -> None:
         try:
-            said.append(scene.join(machine, data, settle_s=4.0).holder.short)
+            said.append(scene.join(machine, data).holder.short)
         except CredentialError as error:
             said.append(error.message)
 
@@ -123,12 +122,15 @@ def test_of_machines_that_join_at_once_one_does(scene: Scene) -> None:
     assert sorted(said) == ["ada.1", refused, refused]
 
 
-def test_nobody_joins_while_nobody_can_tell(scene: Scene) -> None:
+def test_nobody_joins_while_nobody_can_tell(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
     """No rendezvous is there: what to do is said, and the bundle stays valid."""
     data = scene.issue(Role.ROBOT, "ada")
     scene.place.kill()
-    with pytest.raises(CredentialError, match="no rendezvous of the pool could confirm") as caught:
-        scene.join("first", data, limit_s=2.0)
+    with monkeypatch.context() as patch:
+        patch.setattr(claiming, "LIMIT_S", 2.0)
+        refused = pytest.raises(CredentialError, match="no rendezvous of the pool could confirm")
+        with refused as caught:
+            scene.join("first", data)
     assert "refused" in caught.value.message
     assert "stays valid" in caught.value.hint
     assert (scene.folder / "first" / "a.join").read_bytes() == data
@@ -137,19 +139,25 @@ def test_nobody_joins_while_nobody_can_tell(scene: Scene) -> None:
     assert scene.join("first", data).holder.short == "ada.1"
 
 
-def test_whoever_was_ended_in_the_middle_joins_after_all(scene: Scene) -> None:
+def test_whoever_was_ended_in_the_middle_joins_after_all(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The claim was made and nothing was written: this machine's second try is the same claim."""
     data = scene.issue(Role.ROBOT, "ada")
     home = scene.folder / "first"
     home.mkdir()
     (home / "a.join").write_bytes(data)
 
+    claim = claiming.claim
+
     def claim_and_end(*given: object) -> None:
-        claiming.claim(*given)  # type: ignore[arg-type]
+        claim(*given)  # type: ignore[arg-type]
         raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
-        joining.join(home / "a.join", PASSPHRASE, home, NOW, claim=claim_and_end)
+    with monkeypatch.context() as patch:
+        patch.setattr(claiming, "claim", claim_and_end)
+        with pytest.raises(KeyboardInterrupt):
+            joining.join(home / "a.join", PASSPHRASE, home, NOW)
     assert scene.keys("first") == []
     assert scene.join("first", data).holder.short == "ada.1"
 
@@ -158,7 +166,7 @@ def test_a_rendezvous_joins_before_there_is_one(scene: Scene) -> None:
     """It has to: its own certificate can neither ask, answer nor sign."""
     data = scene.issue(Role.RENDEZVOUS, "b")
     scene.place.kill()
-    assert scene.join("meet", data, limit_s=0.0).command == "rendezvous"
+    assert scene.join("meet", data).command == "rendezvous"
 
 
 def test_of_two_claims_the_earlier_is_the_greater_text() -> None:
