@@ -16,9 +16,9 @@ import struct
 import time
 
 from fogft.process import on_thread
+from fogft.ros.vendors import CYCLONE_DDS, FAST_DDS
 
 PREFIX_BYTES = 12
-_FAST_DDS, _CYCLONE_DDS = b"\x01\x0f", b"\x01\x10"  # support by others is unknown
 _PARTICIPANT = b"\x00\x00\x01\xc1"
 _SPDP_WRITER, _SPDP_READER = b"\x00\x01\x00\xc2", b"\x00\x01\x00\xc7"
 _LITTLE_ENDIAN, _INLINE, _DATA, _KEY = 0x01, 0x02, 0x04, 0x08
@@ -34,7 +34,7 @@ _LOOK_S = 0.02
 
 def is_known(prefix: bytes) -> bool:
     """Whether a participant id belongs to a middleware that understands the message."""
-    return len(prefix) == PREFIX_BYTES and prefix.startswith((_FAST_DDS, _CYCLONE_DDS))
+    return len(prefix) == PREFIX_BYTES and prefix.startswith((FAST_DDS, CYCLONE_DDS))
 
 
 def _message(prefix: bytes, number: int, flags: int, parameters: bytes) -> bytes:
@@ -58,7 +58,7 @@ def _here(prefix: bytes, port: int) -> bytes:
     at = struct.pack("<iI12x", 1, port) + socket.inet_aton(_LOOPBACK)
     parameters = {
         0x15: b"\x02\x03\x00\x00",  # protocol version
-        0x16: _FAST_DDS + b"\x00\x00",  # vendor
+        0x16: FAST_DDS + b"\x00\x00",  # vendor
         0x50: prefix + _PARTICIPANT,
         0x32: at,  # for discovery
         0x31: at,  # for data
@@ -123,7 +123,7 @@ class Introduction:
         self._thread.join()
 
     def _run(self) -> None:
-        prefix = _FAST_DDS + os.urandom(PREFIX_BYTES - len(_FAST_DDS))
+        prefix = FAST_DDS + os.urandom(PREFIX_BYTES - len(FAST_DDS))
         with (
             contextlib.suppress(OSError),  # no descriptor: discovery then takes longer
             socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock,
