@@ -116,10 +116,7 @@ class Manager:
             build_order=self._build_order,
             prepare=prepared_thread,
             epoch=self._lease.epoch,
-            revoked=self._ledger.revoked,
-            by_hand=self._ledger.by_hand,
-            certificates_due=self._ledger.due,
-            gateways=self._ledger.gateways,
+            ledger=self._ledger,
             gateway=LaunchedGateway(
                 self.cloud, self._gateway_up, self._gateway_order, self.store.place_gateway
             ),

@@ -41,6 +41,7 @@ from fogft.planning.observed.refresh import Silent
 from fogft.planning.planner import Plan, PlannedLaunch, plan
 from fogft.planning.rollout import Update
 from fogft.planning.sizing import Inputs, cap_usd
+from fogft.pool.credentials.ledger import Ledger
 from fogft.pool.folder.store import Identity, PoolStore
 from fogft.pool.manager import offers
 from fogft.pool.manager.event_recorder import EventRecorder
@@ -96,12 +97,7 @@ def bare_order(identity: Identity, spec: PoolSpec, planned: PlannedLaunch) -> La
 
 @dataclass(eq=False)
 class Reconciler:
-    """Reconciles one pool with its spec.
-
-    `by_hand` returns the manually started replicas with valid certificates; `gateways` returns the
-    generations of each gateway's valid certificates, by name; `gateway` is the one to launch.
-    `certificates_due` returns the replicas whose certificates expire soon.
-    """
+    """Reconciles one pool with its spec; `ledger` has its certificates, `gateway` is to launch."""
 
     cloud: Cloud
     store: PoolStore
@@ -111,10 +107,7 @@ class Reconciler:
     build_order: BuildOrder = bare_order
     prepare: Prepare = lambda run: run
     epoch: int = 1
-    revoked: Callable[[], frozenset[str]] = frozenset
-    by_hand: Callable[[], frozenset[ReplicaId]] = frozenset
-    certificates_due: Callable[[float], frozenset[ReplicaId]] = lambda now: frozenset()
-    gateways: Callable[[], Mapping[str, tuple[int, ...]]] = dict
+    ledger: Ledger | None = None
     gateway: LaunchedGateway | None = None
     on_done: Callable[[], None] = lambda: None
     distances: Distances = lambda spec, *_: spec.placement.rtt_s
@@ -235,7 +228,7 @@ class Reconciler:
         doubt_s = self.timekeeping.watch.doubt_s
         due: frozenset[ReplicaId] = frozenset()
         with contextlib.suppress(FogftError):  # `_publish` reports it; machines must still end
-            due = self.certificates_due(min(now, now - doubt_s))
+            due = self.ledger.due(min(now, now - doubt_s)) if self.ledger else due
         seen = Observed(now, machines, links, sold, ending, {}, doubt_s, gateway, stopped, due)
         return replace(seen, rtt_s=self.distances(spec, seen)), trouble
 
@@ -338,10 +331,10 @@ class Reconciler:
                 self._recorder.add(EventKind.UNDRAINED, machine.id)
 
     def _publish(self, identity: Identity, spec: PoolSpec, observed: Observed, plan: Plan) -> None:
-        revoked = self.revoked()
-        # Otherwise they cannot be found.
-        by_hand = self.by_hand() if spec.rendezvous or spec.dial_in else frozenset()
-        gateways = self.gateways() if spec.topology else {}
+        ledger, are_found = self.ledger, bool(spec.rendezvous or spec.dial_in)
+        revoked: frozenset[str] = ledger.revoked() if ledger else frozenset()
+        by_hand: frozenset[ReplicaId] = ledger.by_hand() if ledger and are_found else frozenset()
+        gateways = ledger.gateways() if ledger and spec.topology else {}
         ending = {end.id for end in plan.terminations} | observed.ending
         machines = observed.machines or ()
         cause = self.epoch, spec, machines, plan.draining, ending, revoked, by_hand, gateways
