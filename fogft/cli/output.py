@@ -9,13 +9,13 @@ import contextlib
 import json
 import os
 import re
-import select
 import sys
 from collections.abc import Callable, Iterator
 from typing import IO, TYPE_CHECKING, Any
 
 import typer
 
+from fogft import poll
 from fogft.errors import FogftError
 
 if TYPE_CHECKING:
@@ -145,9 +145,7 @@ def redrawn(stream: IO[str]) -> Iterator[Callable[[RenderableType], None]]:
 def silenced_stdout() -> bool:
     """Discard buffered stdout if its reader is gone, as after ``| head``; return whether it is."""
     with contextlib.suppress(OSError, ValueError):
-        poll = select.poll()
-        poll.register(sys.stdout.fileno(), 0)
-        if not any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0)):
+        if not poll.is_ready(sys.stdout.fileno(), event=0):  # no event but an error
             return False
     discard(1)
     return True
