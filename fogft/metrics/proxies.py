@@ -37,6 +37,8 @@ _OF_LINK = {
         "Times that the connection to a replica was reopened.",
     ),
     "restarts": ("fogft_replica_restarts_total", "Restarts of a replica's command."),
+    "is_up": ("fogft_link_up", "Whether a replica answers probes."),
+    "services": ("fogft_link_ready_services", "Services that a replica can answer."),
 }
 _WORK_COUNTS = {
     "ran": ("fogft_requests_run_total", "Requests passed on to a service."),
@@ -56,21 +58,14 @@ _WORK_COUNTS = {
 
 def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
     """Yield the metrics of a client proxy or a gateway from its report."""
-    services, links = report["services"], _newest(report["links"])
-    yield from _requests(services)
+    yield from _requests(report["services"])
+    links = [
+        {**link, "is_up": link["state"] == "up", "services": len(link["ready"])}
+        for link in _newest(report["links"])
+    ]
     for key, (name, help) in _OF_LINK.items():
         known = (link for link in links if link.get(key) is not None)
         yield family(name, help, ((link[key], _slot(link)) for link in known))
-    yield family(
-        "fogft_link_up",
-        "Whether a replica answers probes.",
-        ((link["state"] == "up", _slot(link)) for link in links),
-    )
-    yield family(
-        "fogft_link_ready_services",
-        "Services that a replica can answer.",
-        ((len(link["ready"]), _slot(link)) for link in links),
-    )
     yield family(
         "fogft_topic_messages_total",
         "Messages of topics, by outcome.",
