@@ -190,7 +190,6 @@ class LinkReport:
     restarts: int = 0
     strangers: int = 0  # connections to its port by peers without a certificate
     version: str = ""  # of fogft on the replica; empty if unknown
-    lease_age_s: float | None = None  # since it last heard from the manager; None if it never did
     lease_left_s: float | None = None  # until it shuts down unless it hears from it; None: never
     answered: int = 0  # requests that it answered successfully, first or not
     failed: int = 0  # requests that ended in a crash, a refusal or a response that was not ok

@@ -31,17 +31,16 @@ _KINDS = {
 }
 
 
-def new_token(now: float) -> str:
-    """Return a claim's token: the earlier one is the greater text, and the greater record wins."""
-    return f"{_LATEST_MS - int(now * 1000):013d}.{secrets.token_hex(8)}"
-
-
 def own_token(claims: Path, id: str, now: float) -> str:
-    """Return this machine's token for a bundle; the same one after an interruption."""
+    """Return this machine's token for a bundle; the same one after an interruption.
+
+    The earlier one is the greater text, and the greater record wins.
+    """
     known = disk.read_as(dict[str, str], claims) or {}
     if id not in known:
+        token = f"{_LATEST_MS - int(now * 1000):013d}.{secrets.token_hex(8)}"
         latest = dict(list(known.items())[-_KEPT:])
-        disk.write_json(claims, known := {**latest, id: new_token(now)})
+        disk.write_json(claims, known := {**latest, id: token})
     return known[id]
 
 

@@ -169,7 +169,8 @@ def test_a_rendezvous_joins_before_there_is_one(scene: Scene) -> None:
     assert scene.join("meet", data).command == "rendezvous"
 
 
-def test_of_two_claims_the_earlier_is_the_greater_text() -> None:
-    tokens = [claiming.new_token(NOW + n / 1000) for n in range(5)]
+def test_of_two_claims_the_earlier_is_the_greater_text(tmp_path: Path) -> None:
+    claims = tmp_path / "claims.json"
+    tokens = [claiming.own_token(claims, str(n), NOW + n / 1000) for n in range(5)]
     assert tokens == sorted(tokens, reverse=True)
-    assert len({claiming.new_token(NOW) for _ in range(50)}) == 50
+    assert len({claiming.own_token(claims, f"at once {n}", NOW) for n in range(50)}) == 50
