@@ -14,10 +14,10 @@ from fogft import disk
 from fogft.cli import output
 from fogft.cli.commands import Command, group
 from fogft.cli.options import AsJson, PoolName, PoolOption
-from fogft.cli.status_text import show_table, utc
+from fogft.cli.status_text import show_table
 from fogft.errors import CredentialError, FogftError
 from fogft.model.credentials import Holder, Role
-from fogft.model.plain import to_plain
+from fogft.model.plain import to_plain, utc
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 

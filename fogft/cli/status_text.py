@@ -305,11 +305,6 @@ def show_table(header: Iterable[str], rows: Iterable[Iterable[str | Text]], **la
     output.show(table(header, rows, width=output.width(sys.stdout), **layout))
 
 
-def utc(seconds: float) -> str:
-    """Return a time as ``2026-11-23 18:05 UTC``."""
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(seconds))
-
-
 def price(usd: float) -> str:
     """Return an amount as ``$0.021``."""
     return f"${usd:.3f}"

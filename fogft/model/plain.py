@@ -6,6 +6,7 @@ written them.
 """
 
 import dataclasses
+import datetime
 import types
 import typing
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -65,6 +66,12 @@ def _check_line(text: str) -> None:
 Line = Annotated[str, _check_line]  # it may reach a terminal: no escape sequence, no line break
 Seconds = Annotated[float, within(0, 1e12)]  # a duration
 Moment = Annotated[float, within(0, 2.5e11)]  # seconds since the epoch: a year of four digits
+
+
+def utc(moment: float) -> str:
+    """Return a time as ``2026-11-23 18:05 UTC``."""
+    at = datetime.datetime.fromtimestamp(moment, datetime.timezone.utc)
+    return f"{at:%Y-%m-%d %H:%M} UTC"
 
 
 def to_plain(value: Any, *, omit_defaults: bool = False) -> Any:

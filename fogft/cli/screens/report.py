@@ -14,8 +14,9 @@ import typer
 
 from fogft.cli import options, output
 from fogft.cli.options import PoolArgument, PoolOption
-from fogft.cli.status_text import age, milliseconds, price, utc
+from fogft.cli.status_text import age, milliseconds, price
 from fogft.errors import FogftError
+from fogft.model.plain import utc
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import home
 

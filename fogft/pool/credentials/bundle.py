@@ -10,7 +10,6 @@ import base64
 import hashlib
 import json
 import secrets
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -18,7 +17,7 @@ from typing import Annotated, Any
 from fogft.errors import CredentialError
 from fogft.model.credentials import Holder, holder_of
 from fogft.model.keys import only
-from fogft.model.plain import Moment, from_plain, to_plain
+from fogft.model.plain import Moment, from_plain, to_plain, utc
 
 VERSION = 2
 SIZE_LIMIT = 32 << 20
@@ -106,8 +105,8 @@ def open_sealed(data: bytes, passphrase: str, now: float) -> tuple[Label, Any]:
         raise CredentialError("the bundle's content is unreadable") from None
     if now >= label.open_until:
         raise CredentialError(
-            f"this bundle for `{label.holder.short}` expired at {_utc(label.open_until)}",
-            f"this machine's clock says {_utc(now)}; if that is right, request a new one",
+            f"this bundle for `{label.holder.short}` expired at {utc(label.open_until)}",
+            f"this machine's clock says {utc(now)}; if that is right, request a new one",
         )
     return label, content
 
@@ -144,7 +143,3 @@ def _canonical(readable: Mapping[str, Any]) -> bytes:
 
 def _bytes(raw: Mapping[str, Any], key: str) -> bytes:
     return base64.b64decode(raw.get(key, ""), validate=True)
-
-
-def _utc(seconds: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(seconds))
