@@ -22,7 +22,12 @@ _LAST_REPLICA_PORT = 65535 - FIRST_BY_HAND
 
 def _service(section: Section, made: ServiceSpec) -> ServiceSpec:
     _stateful(section, made)
-    _with_quorum(section, made)
+    if made.tolerance and not section.has("quorum"):
+        what = "has no effect here: answers are compared only with a `quorum`"
+        raise section.error("tolerance", what, "write `quorum: 2`, or remove it")
+    if section.has("quorum"):
+        what = "cannot be combined with `quorum`: every replica is asked, and every answer counts"
+        _apart(section, made, NOT_WITH_QUORUM, what)
     if made.cancel == made.name:
         hint = f"write the name of its cancel service, such as `cancel: {made.name}_cancel`"
         raise section.error("cancel", "is the service itself", hint)
@@ -51,15 +56,6 @@ def _stateful(section: Section, made: ServiceSpec) -> None:
             "cannot be `fallback` for a service with `state`: the fallback does not have that state"
         )
         raise section.error("on_timeout", what, "write `silent` or `empty`")
-
-
-def _with_quorum(section: Section, made: ServiceSpec) -> None:
-    if made.tolerance and not section.has("quorum"):
-        what = "has no effect here: answers are compared only with a `quorum`"
-        raise section.error("tolerance", what, "write `quorum: 2`, or remove it")
-    if section.has("quorum"):
-        what = "cannot be combined with `quorum`: every replica is asked, and every answer counts"
-        _apart(section, made, NOT_WITH_QUORUM, what)
 
 
 def _apart(section: Section, made: ServiceSpec, keys: Sequence[str], what: str) -> None:

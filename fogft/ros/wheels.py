@@ -31,6 +31,8 @@ def lay_prefix(into: Path) -> Path:
             "the installed ROS 2 wheels cannot build interface packages",
             "`pip install 'fogft[ros-test]'` has what they lack",
         )
+    import numpy
+
     try:
         if into.exists():
             shutil.rmtree(into)
@@ -40,20 +42,14 @@ def lay_prefix(into: Path) -> Path:
                 (into / entry.name).symlink_to(entry)
         shutil.copytree(wheels / "share", into / "share", symlinks=True)
         for path in (into / "share").rglob("*.cmake"):
-            _name_this_python(path)
+            text = path.read_text()
+            named = _NUMPY.sub(str(numpy.get_include()), text)
+            named = _HEADERS.sub(sysconfig.get_path("include"), named)
+            if named != text:
+                path.write_text(named)
     except OSError as error:
         raise RosError(f"`{into}` cannot be written: {error}") from error
     return into
-
-
-def _name_this_python(path: Path) -> None:
-    import numpy
-
-    text = path.read_text()
-    named = _NUMPY.sub(str(numpy.get_include()), text)
-    named = _HEADERS.sub(sysconfig.get_path("include"), named)
-    if named != text:
-        path.write_text(named)
 
 
 def main(arguments: list[str]) -> int:

@@ -83,16 +83,6 @@ class Meter:
     def _add_pending(self) -> None:
         seconds, ready, wanted, usd_per_hour = self._pending
         self._pending = (0.0, ready, wanted, usd_per_hour)
-        self._add_to_days(seconds, ready, wanted, usd_per_hour)
-        self.sums.add(seconds, ready, wanted, usd_per_hour)
-        if ready or not wanted:
-            self._down_s = 0.0
-        elif seconds:
-            self.outages += self._down_s == 0.0
-            self._down_s += seconds
-            self.longest_outage_s = max(self.longest_outage_s, self._down_s)
-
-    def _add_to_days(self, seconds: float, ready: int, wanted: int, usd_per_hour: float) -> None:
         at = self.sums.seconds
         end = at + seconds
         while at < end:
@@ -101,6 +91,13 @@ class Meter:
             self.days += [Sums() for _ in range(len(self.days), index + 1)]
             self.days[index].add(part_s, ready, wanted, usd_per_hour)
             at += part_s
+        self.sums.add(seconds, ready, wanted, usd_per_hour)
+        if ready or not wanted:
+            self._down_s = 0.0
+        elif seconds:
+            self.outages += self._down_s == 0.0
+            self._down_s += seconds
+            self.longest_outage_s = max(self.longest_outage_s, self._down_s)
 
     def counts(self, now_s: float) -> bool:
         """Whether events now are counted."""
