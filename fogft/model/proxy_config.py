@@ -55,6 +55,10 @@ class ProxyConfig:
     topics: tuple[TopicSpec, ...] = ()
     rmw: Speaks = Speaks.RCLPY
 
+    def __post_init__(self) -> None:
+        if self.rmw is Speaks.ZENOH and self.topics:
+            raise ValueError("`rmw: zenoh` supports only services, no topics")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ClientProxyConfig(ProxyConfig):

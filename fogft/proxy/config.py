@@ -7,29 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fogft.errors import StateError
-from fogft.model.choices import Speaks
-from fogft.model.proxy_config import ClientProxyConfig, ProxyConfig, ServerProxyConfig
+from fogft.model.proxy_config import ClientProxyConfig, ServerProxyConfig
 from fogft.poolfile import config_file
 
 
 def read_client(path: Path, **override: Any) -> ClientProxyConfig:
     """Read the configuration of a client proxy or gateway; options that are not None override."""
-    config = config_file.read(ClientProxyConfig, path, override)
-    _check(path, config)
-    return config
+    return config_file.read(ClientProxyConfig, path, override)
 
 
 def read_server(path: Path, **override: Any) -> ServerProxyConfig:
     """Read a server proxy's configuration; options that are not None override it."""
     config = config_file.read(ServerProxyConfig, path, override)
-    _check(path, config)
     kind, _, file = config.notice.partition(":")
     if kind != "file":
         return config
     return replace(config, notice=f"file:{path.resolve().parent / file}")
-
-
-def _check(path: Path, config: ProxyConfig) -> None:
-    if config.rmw is Speaks.ZENOH and config.topics:
-        raise StateError(f"`{path}` cannot be used: `rmw: zenoh` supports only services, no topics")
