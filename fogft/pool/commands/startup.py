@@ -9,7 +9,6 @@ Not here: judging the file (`preview`), waiting for the services (`fogft.cli.pro
 import secrets
 import shutil
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from fogft import __version__, disk, logfile
@@ -105,7 +104,7 @@ def manager_version(paths: PoolPaths, pid: int | None = None) -> str:
     return str(said.get("manager_version", "before 0.2.0"))
 
 
-def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None = None) -> bool:
+def start_manager(store: PoolStore) -> bool:
     """Ensure that the pool has a manager of this version; return whether one was started.
 
     The version of a manager that has just started is awaited first: another `up` that ended the
@@ -113,7 +112,6 @@ def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None =
     """
     paths = store.paths
     name = paths.folder.name
-    words = command(name) if command else python("-m", "fogft", "manager", name)
     child = None
     end = time.monotonic() + MANAGER_LIMIT_S
     while time.monotonic() < end:
@@ -128,7 +126,7 @@ def start_manager(store: PoolStore, command: Callable[[str], list[str]] | None =
                 process_control.end_holder(paths.manager_lock, only=pid)
                 continue
         elif child is None:
-            child = detached(words, paths.manager_log)
+            child = detached(python("-m", "fogft", "manager", name), paths.manager_log)
         elif child.poll() is not None:
             break
         time.sleep(process_control.POLL_S)

@@ -264,21 +264,26 @@ def test_lease_survives_damage_and_ends_with_its_holder(scene: Scene) -> None:
     assert Lease(scene.paths).epoch == 9
 
 
-def test_start_manager_reports_why_it_did_not_start(scene: Scene) -> None:
+def test_start_manager_reports_why_it_did_not_start(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A manager that dies at once is an error with the end of its log."""
     scene.write()
+    dies = [sys.executable, "-c", "import sys; sys.exit('boom')"]
+    monkeypatch.setattr(startup, "python", lambda *_: dies)
     with pytest.raises(Exception, match="did not start:\nboom"):
-        startup.start_manager(
-            scene.store, lambda _: [sys.executable, "-c", "import sys; sys.exit('boom')"]
-        )
+        startup.start_manager(scene.store)
 
 
-def test_start_manager_starts_one_only_where_there_is_none(scene: Scene) -> None:
+def test_start_manager_starts_one_only_where_there_is_none(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """`up` on a managed pool starts nothing."""
     scene.write(replicas=1)
-    assert startup.start_manager(scene.store, scene.command)
+    monkeypatch.setattr(startup, "python", lambda *words: scene.command(words[-1]))
+    assert startup.start_manager(scene.store)
     scene.wait(lambda: scene.whole(1))
-    assert not startup.start_manager(scene.store, scene.command)
+    assert not startup.start_manager(scene.store)
     assert [what.split(" ")[0] for what in scene.end()] == ["manager", "client", "replica"]
 
 
@@ -295,7 +300,9 @@ signal.pause()
 """
 
 
-def test_of_two_that_upgrade_a_manager_one_ends_it_and_none_its_successor(scene: Scene) -> None:
+def test_of_two_that_upgrade_a_manager_one_ends_it_and_none_its_successor(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Two `up`s of a new version at once; the new manager has not written its status yet."""
     scene.write()
     paths = scene.paths
@@ -304,13 +311,12 @@ def test_of_two_that_upgrade_a_manager_one_ends_it_and_none_its_successor(scene:
         words = [str(paths.manager_lock), str(paths.status), version, str(delay_s)]
         return [sys.executable, "-c", SLOW_TO_TELL, *words]
 
-    assert startup.start_manager(scene.store, lambda _: command("0.0.9"))
+    monkeypatch.setattr(startup, "python", lambda *_: command("0.0.9"))
+    assert startup.start_manager(scene.store)
     old = scene.wait(lambda: disk.holder(paths.manager_lock) if paths.status.exists() else None)
+    monkeypatch.setattr(startup, "python", lambda *_: command(__version__, 1.0))
     with ThreadPoolExecutor() as both:
-        asked = [
-            both.submit(startup.start_manager, scene.store, lambda _: command(__version__, 1.0))
-            for _ in range(2)
-        ]
+        asked = [both.submit(startup.start_manager, scene.store) for _ in range(2)]
         started = [one.result() for one in asked]
     new = disk.holder(paths.manager_lock)
     try:
