@@ -121,7 +121,7 @@ def read_by() -> Mapping[str, tuple[Path, bytes, Callable[[], object]]]:
         found[path.name] = path, path.read_bytes(), read
 
     disk.write_json(latency_file(), {"aws/us-west-2": {"rtt_s": 0.02, "as_of": time.time()}})
-    latencies = Latencies(latency_file(), endpoint=lambda region: ("h", 1))
+    latencies = Latencies(latency_file())
     add(latency_file(), lambda: latencies.stale(["aws/us-west-2"]))
     claims = home / "claims.json"
     claiming.own_token(claims, CLAIM, time.time())

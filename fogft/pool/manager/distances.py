@@ -26,6 +26,7 @@ from fogft.model.choices import PlacementSpec
 from fogft.model.plain import Moment, stored, to_plain, within
 from fogft.model.replica import LinkState, Observed, Offer
 from fogft.model.spec import PoolSpec
+from fogft.process import on_thread
 
 _ENDPOINTS = {
     "aws": "ec2.{region}.amazonaws.com",
@@ -102,8 +103,6 @@ class Latencies:
     file: Path
     _: KW_ONLY
     clock: Callable[[], float] = time.time
-    endpoint: Callable[[str], tuple[str, int] | None] = endpoint
-    connect: Callable[[str, int], float] | None = None  # None: `connect_time`
 
     def measured(self) -> Mapping[str, Distance]:
         """Return the measured round trips, whatever their age. A damaged file counts as empty."""
@@ -118,13 +117,13 @@ class Latencies:
         return sorted(
             region
             for region in regions
-            if self.endpoint(region) is not None
+            if endpoint(region) is not None
             and not (region in kept and 0 <= now - kept[region].as_of < FRESH_S)
         )
 
     def measure(self, regions: Iterable[str]) -> Mapping[str, str]:
         """Measure regions in parallel and store the results; return failures with reasons."""
-        wanted = [(r, e) for r in sorted(set(regions)) if (e := self.endpoint(r)) is not None]
+        wanted = [(r, e) for r in sorted(set(regions)) if (e := endpoint(r)) is not None]
         if not wanted:
             return {}
         now, failed = self.clock(), {}
@@ -161,7 +160,7 @@ class Latencies:
 
     def _try(self, wanted: tuple[str, tuple[str, int]]) -> float | str:
         try:
-            return (self.connect or connect_time)(*wanted[1])
+            return connect_time(*wanted[1])
         except OSError as error:
             return str(error)
 
@@ -169,11 +168,8 @@ class Latencies:
 class Distances:
     """The manager's round trips for its planner. Measures in the background."""
 
-    def __init__(
-        self, latencies: Latencies, submit: Callable[[Callable[[], object]], object]
-    ) -> None:
+    def __init__(self, latencies: Latencies) -> None:
         self._latencies = latencies
-        self._submit = submit
         self._looked_at = -math.inf
         self._rtts: dict[str, deque[float]] = {}
         self._busy = threading.Lock()
@@ -184,7 +180,7 @@ class Distances:
         now = time.monotonic()
         if regions and now - self._looked_at >= RETRY_S:
             self._looked_at = now
-            self._submit(lambda: self._renew(regions))
+            on_thread(self._renew, regions)
         known = self._latencies.known(regions, spec.placement, self._from_links(seen))
         return {region: distance.rtt_s for region, distance in known.items()}
 

@@ -121,7 +121,7 @@ class Manager:
                 self.cloud, self._gateway_up, self._gateway_order, self.store.place_gateway
             ),
             on_done=self._wake.set,
-            distances=Distances(Latencies(latency_file()), on_thread),
+            distances=Distances(Latencies(latency_file())),
         )
 
     def run(self, stop: threading.Event) -> None:

@@ -65,11 +65,18 @@ def test_what_does_not_answer_is_an_error():
         connect_time(*closed_port())
 
 
-def test_measurements_are_kept_for_a_day(tmp_path: Path):
+@pytest.fixture
+def near(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every region answers soon."""
+    monkeypatch.setattr(distances, "connect_time", lambda host, port: 0.05)
+
+
+def test_measurements_are_kept_for_a_day(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     now = [NOW]
     with listening() as address:
         places = {NEAR: address, DEAD: closed_port()}
-        known = Latencies(tmp_path / "home" / "l.json", clock=lambda: now[0], endpoint=places.get)
+        monkeypatch.setattr(distances, "endpoint", places.get)
+        known = Latencies(tmp_path / "home" / "l.json", clock=lambda: now[0])
         assert known.stale([NEAR, DEAD, "local/x"]) == [DEAD, NEAR]
         failed = known.measure([NEAR, DEAD, "local/x"])
     assert list(failed) == [DEAD]
@@ -84,8 +91,8 @@ def test_measurements_are_kept_for_a_day(tmp_path: Path):
     assert NEAR in known.known([NEAR], PlacementSpec(), {})  # an old figure beats none
 
 
-def test_who_is_believed_first(tmp_path: Path):
-    known = Latencies(tmp_path / "l.json", connect=lambda host, port: 0.05, clock=lambda: NOW)
+def test_who_is_believed_first(tmp_path: Path, near: None):
+    known = Latencies(tmp_path / "l.json", clock=lambda: NOW)
     known.measure([NEAR, FAR])
     berkeley = (37.87, -122.26)
     told = PlacementSpec(robot_at=berkeley, rtt_s={NEAR: 0.001, "gcp": 0.2})
@@ -102,10 +109,10 @@ def test_who_is_believed_first(tmp_path: Path):
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"aws/us-west-1": {"rtt_s": "x"}}', "\x00"])
-def test_a_damaged_file_holds_nothing(tmp_path: Path, content: str):
+def test_a_damaged_file_holds_nothing(tmp_path: Path, near: None, content: str):
     file = tmp_path / "l.json"
     file.write_text(content)
-    known = Latencies(file, connect=lambda host, port: 0.05)
+    known = Latencies(file)
     assert known.measured() == {}
     assert known.measure([NEAR]) == {}
     assert known.measured()[NEAR].rtt_s == 0.05
@@ -131,10 +138,10 @@ def test_every_place_and_cloud_has_an_endpoint():
     assert distances.endpoint("local/us-west-1") is None
 
 
-def test_one_slow_probe_moves_nothing(tmp_path: Path):
+def test_one_slow_probe_moves_nothing(tmp_path: Path, near: None, monkeypatch: pytest.MonkeyPatch):
     """The manager takes the median of the last round trips to a region."""
-    latencies = Latencies(tmp_path / "l.json", connect=lambda host, port: 0.05)
-    distances = Distances(latencies, lambda run: run())
+    monkeypatch.setattr(distances, "on_thread", lambda run, *given: run(*given))
+    found = Distances(Latencies(tmp_path / "l.json"))
     place = Placement("aws", "us-west-1", "a", "m1")
     id = ReplicaId("0" * 16, 0, 1)
     machine = Machine(id, place, MachinePhase.RUNNING, 0.0)
@@ -143,7 +150,7 @@ def test_one_slow_probe_moves_nothing(tmp_path: Path):
     def look(rtt_s: float) -> float:
         link = LinkReport(id, LinkState.UP, rtt_s=rtt_s)
         seen = Observed(0.0, (machine,), (link,), (Offer(place, 0.1),))
-        return distances(spec, seen)[NEAR]
+        return found(spec, seen)[NEAR]
 
     for _ in range(5):
         assert look(0.02) == 0.02
@@ -151,10 +158,10 @@ def test_one_slow_probe_moves_nothing(tmp_path: Path):
 
 
 def test_of_two_managers_that_measure_at_once_neither_forgets_what_the_other_has(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, near: None, monkeypatch: pytest.MonkeyPatch
 ):
     """Its regions would be without a distance for a quarter of an hour."""
-    known = Latencies(tmp_path / "l.json", connect=lambda host, port: 0.05, clock=lambda: NOW)
+    known = Latencies(tmp_path / "l.json", clock=lambda: NOW)
     write, others = disk.write_json, list[Future[object]]()
 
     def written(*given: Any, **how: Any) -> None:
