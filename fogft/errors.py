@@ -44,6 +44,10 @@ class PoolBusy(FogftError):
     """Another process holds this pool (its lock or a newer lease)."""
 
 
+class NoThread(FogftError, OSError):
+    """The system allows no more threads."""
+
+
 class RosError(FogftError):
     """ROS 2, or one of its types, is not usable here."""
 

@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from fogft.errors import NoThread
+
 _STEP_S = 2.0
 
 
@@ -94,12 +96,12 @@ def _sleeps(pid: int | None) -> str:
 
 
 def on_thread(run: Callable[..., object], *arguments: Any, name: str = "") -> threading.Thread:
-    """Start a daemon thread. Raises OSError if the system allows no more threads."""
+    """Start a daemon thread. Raises NoThread."""
     thread = threading.Thread(target=run, args=arguments, name=name or None, daemon=True)
     try:
         thread.start()
     except RuntimeError as error:
-        raise OSError(f"{error}: check `ulimit -u`, TasksMax and the free memory") from error
+        raise NoThread(f"{error}: check `ulimit -u`, TasksMax and the free memory") from error
     return thread
 
 

@@ -15,7 +15,9 @@ import fogft
 from fogft.cli import main
 from fogft.errors import PoolNotFound
 from fogft.pool.commands import composition
+from fogft.process import on_thread
 from tests.fakes.pools import lay_down
+from tests.fakes.threads import no_more
 
 
 def run_failing(monkeypatch: pytest.MonkeyPatch, problem: BaseException) -> int:
@@ -37,6 +39,13 @@ def test_an_error_is_told_on_stderr_with_its_hint_after_a_blank_line(monkeypatch
 def test_an_error_without_a_hint_is_one_line(monkeypatch, capsys):
     assert run_failing(monkeypatch, PoolNotFound("there is no pool `a`")) == 1
     assert capsys.readouterr().err == "error: there is no pool `a`\n"
+
+
+def test_where_no_thread_can_start_it_is_an_error_that_says_what_to_check(monkeypatch, capsys):
+    with no_more(), pytest.raises(OSError) as caught:
+        on_thread(print)
+    assert run_failing(monkeypatch, caught.value) == 1
+    assert "check `ulimit -u`" in capsys.readouterr().err
 
 
 def test_a_defect_of_ours_keeps_its_trace(monkeypatch):
