@@ -21,7 +21,7 @@ from fogft.model.plain import stored
 if sys.platform != "win32":  # on Windows only one process uses the files
     import fcntl
 
-_PATIENCE_S = 0.2
+_TRIES = 20
 _ENDING_S = 1.0
 _PID_BYTES = 20
 _ROOM_BYTES = 64 << 10  # for a status file
@@ -164,11 +164,12 @@ class Lock:
     def acquire(self, *, wait: bool) -> bool:
         """Take the lock; without `wait`, return False if another process has it. Raises OSError."""
         # `is_locked` holds the lock for an instant, so one refusal proves nothing.
-        until = time.monotonic() + _PATIENCE_S
-        while not self.take(fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB):
-            if time.monotonic() > until:
-                return False
+        for _ in range(_TRIES):
+            if self.take(fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB):
+                break
             time.sleep(0.01)
+        else:
+            return False
         assert self._descriptor is not None
         _wait_for_end(self._descriptor)
         with contextlib.suppress(OSError):  # disk full: then the file names nobody
