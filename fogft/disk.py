@@ -22,6 +22,7 @@ if sys.platform != "win32":  # on Windows only one process uses the files
     import fcntl
 
 _TRIES = 20
+_LOOKS = 3
 _ENDING_S = 1.0
 _PID_BYTES = 20
 _ROOM_BYTES = 64 << 10  # for a status file
@@ -285,6 +286,15 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
     Taken from the kernel's list; in a container, where that may name another device, from what
     the holder wrote into the file, if that may be trusted (`said`).
     """
+    for _ in range(_LOOKS):  # a list in several pages lacks some if others end meanwhile
+        pid = _listed(lock)
+        if pid is not None or not is_locked(lock):
+            return pid or None
+    return said_holder(lock) if said else None
+
+
+def _listed(lock: Path) -> int | None:
+    """Return the pid in the kernel's list, 0 if of another namespace, None if there is none."""
     try:
         stat = lock.stat()
         lines = Path("/proc/locks").read_text().splitlines()
@@ -295,8 +305,8 @@ def holder(lock: Path, *, said: bool = True) -> int | None:
         fields = line.split()
         # A READ lock belongs to a process that only checks whether the file is locked.
         if len(fields) >= 6 and fields[1:4:2] == ["FLOCK", "WRITE"] and fields[5] == wanted:
-            return max(0, int(fields[4])) or None
-    return said_holder(lock) if said and is_locked(lock) else None
+            return max(0, int(fields[4]))
+    return None
 
 
 def said_holder(lock: Path) -> int | None:

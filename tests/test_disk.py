@@ -12,6 +12,7 @@ import stat
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -121,7 +122,8 @@ def test_a_lock_ends_with_its_process_whatever_ends_it(tmp_path):
 def test_who_waits_for_a_lock_gets_it_when_its_killed_holder_has_ended_completely(tmp_path):
     dying = """if True:
         import ctypes, os, sys, threading, time
-                from fogft.disk import Lock
+        from pathlib import Path
+        from fogft.disk import Lock
         lock = Lock(Path(sys.argv[1]))
         assert lock.acquire(wait=False)
         def end_slowly():
@@ -177,6 +179,19 @@ def test_a_glance_refuses_nobody_who_is_held_up_between_two_looks(tmp_path, monk
     monkeypatch.setattr("fogft.disk.time.monotonic", lambda: next(now))
     monkeypatch.setattr("fogft.disk.time.sleep", lambda _: glance.release())
     assert disk.Lock(path).acquire(wait=False)
+
+
+def test_a_holder_is_known_though_the_kernels_list_lacks_it(tmp_path, monkeypatch):
+    """A long list is read page by page, and skips some where others let go meanwhile."""
+    read, lists = Path.read_text, ["", ""]
+
+    def lacking(path: Path) -> str:
+        return lists.pop() if lists and path == Path("/proc/locks") else read(path)
+
+    monkeypatch.setattr(Path, "read_text", lacking)
+    with disk.locked(tmp_path / "lock"):
+        assert disk.holder(tmp_path / "lock", said=False) == os.getpid()
+    assert not lists
 
 
 def test_who_only_glances_is_not_taken_for_a_holder(tmp_path):
@@ -254,6 +269,7 @@ done
 """
 TRIES = """
 import sys
+from pathlib import Path
 from fogft import disk
 from fogft.errors import StateError
 folder, state = Path(sys.argv[1]), sys.argv[2]
