@@ -16,7 +16,8 @@ import pytest
 
 from fogft.child import python
 from fogft.process import Hanging, begin_start, end_start, load_numpy
-from tests.fakes.waiting import paced, wait_for
+from tests.fakes.waiting import let_come_round, paced, wait_for
+from tests.link.freezing import freeze
 from tests.needs import needs
 
 LIMIT_S = 10.0
@@ -29,8 +30,10 @@ class Looks:
         self.now = 0.0
         self.hanging = Hanging(LIMIT_S, lambda: self.now)
 
-    def found_after(self, pid: int | None, limit: int = 20, step_s: float = 1.0) -> int | None:
-        """Return how many looks it took to see it hang; None where it was never seen."""
+    def found_after(
+        self, pid: int | None, limit: int | None = None, step_s: float = 1.0
+    ) -> int | None:
+        """Return how many looks it took to see it hang; None where so many did not show it."""
         for count in itertools.islice(paced(0.03), limit):
             if self.hanging.look(pid):
                 return count
@@ -69,16 +72,16 @@ COMES_ROUND = "import time\nwhile True: time.sleep(0.005)"
     ],
 )
 def test_one_whose_main_thread_never_comes_round_hangs(start, code):
-    found = Looks().found_after(start(code))
-    assert found is not None
-    assert found > LIMIT_S
+    assert Looks().found_after(start(code)) > LIMIT_S
 
 
 def test_one_that_comes_round_does_not_hang_and_a_stopped_one_does(start):
     looks, pid = Looks(), start(COMES_ROUND)
-    assert looks.found_after(pid) is None
-    os.kill(pid, signal.SIGSTOP)
-    assert looks.found_after(pid) is not None
+    for _ in range(20):
+        let_come_round(pid)
+        assert looks.found_after(pid, limit=1) is None
+    freeze(pid)
+    assert looks.found_after(pid) > 0
     os.kill(pid, signal.SIGCONT)
     wait_for(lambda: not looks.hanging.look(pid), 60.0, "a turn of its")
     assert looks.found_after(pid, limit=5) is None
@@ -87,14 +90,14 @@ def test_one_that_comes_round_does_not_hang_and_a_stopped_one_does(start):
 def test_a_pause_of_our_own_is_not_held_against_it(start):
     """A suspend of minutes stops both, and we may be the first to wake."""
     looks, pid = Looks(), start(COMES_ROUND)
-    os.kill(pid, signal.SIGSTOP)
+    freeze(pid)
     assert looks.found_after(pid, limit=3, step_s=600.0) is None
 
 
 def test_who_is_not_there_or_has_just_come_does_not_hang(start):
     looks = Looks()
-    assert looks.found_after(None) is None
-    assert looks.found_after(2**22 + 1) is None
+    assert looks.found_after(None, limit=20) is None
+    assert looks.found_after(2**22 + 1, limit=20) is None
     for _ in range(3):
         pid = start("import threading; threading.Event().wait()")
         assert looks.found_after(pid, limit=8) is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 T = TypeVar("T")
@@ -36,3 +37,14 @@ def paced(pause_s: float, *, seconds: float = float("inf")) -> Iterator[int]:
         yield turn
         turn += 1
         time.sleep(pause_s)
+
+
+def let_come_round(pid: int) -> None:
+    """Return once a process has gone to sleep again, by the kernel's count."""
+
+    def sleeps() -> int:
+        told = Path(f"/proc/{pid}/status").read_text()
+        return int(told.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
+
+    before = sleeps()
+    wait_for(lambda: sleeps() > before)

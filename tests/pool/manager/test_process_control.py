@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 import signal
 import subprocess
@@ -18,7 +17,8 @@ from fogft.model.reason import Cause
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.manager import process_control
 from fogft.pool.manager.proxy_supervisor import BACKOFF_LIMIT_S, STEADY_S, ProxySupervisor
-from tests.fakes.waiting import paced, wait_for
+from tests.fakes.waiting import let_come_round
+from tests.link.freezing import freeze
 from tests.needs import needs
 
 HOLD = """
@@ -217,12 +217,6 @@ def test_a_proxy_that_was_replaced_is_counted(tmp_path: Path) -> None:
         proxy.supervisor.look()
 
 
-def switches(pid: int) -> int:
-    """Return how often a process has gone to sleep."""
-    told = Path(f"/proc/{pid}/status").read_text()
-    return int(told.partition("\nvoluntary_ctxt_switches:")[2].split()[0])
-
-
 @pytest.mark.parametrize("which", ["proxy_lock", "standby_lock", "spare_lock"])
 def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
     """Stopped, it holds its place for ever, and nobody can take over; one that works is let be."""
@@ -232,16 +226,15 @@ def test_a_proxy_that_hangs_is_killed(tmp_path: Path, which: str) -> None:
     try:
         assert works.stdout is not None
         works.stdout.readline()
-        for number in (signal.SIGCONT, signal.SIGSTOP):
-            os.kill(works.pid, number)
-            for _ in itertools.islice(paced(0.05), 15):
-                if number == signal.SIGCONT:
-                    before = switches(works.pid)
-                    wait_for(lambda before=before: switches(works.pid) > before)
-                proxy.supervisor.look()
-                proxy.now += 1.0
-            if number == signal.SIGCONT:
-                assert works.poll() is None
+        for _ in range(15):
+            let_come_round(works.pid)
+            proxy.supervisor.look()
+            proxy.now += 1.0
+        assert works.poll() is None
+        freeze(works.pid)
+        for _ in range(15):
+            proxy.supervisor.look()
+            proxy.now += 1.0
         assert works.wait(20) == -signal.SIGKILL
     finally:
         works.kill()
