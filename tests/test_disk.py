@@ -12,13 +12,14 @@ import stat
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
-from fogft import disk
+from fogft import disk, poll
 from fogft.errors import StateError
-from tests.fakes.threads import waits_for
+from tests.fakes.threads import amid, waits_for
 from tests.fakes.waiting import wait_for
 from tests.needs import needs
 
@@ -119,7 +120,9 @@ def test_a_lock_ends_with_its_process_whatever_ends_it(tmp_path):
     assert not disk.is_locked(path)
 
 
-def test_who_waits_for_a_lock_gets_it_when_its_killed_holder_has_ended_completely(tmp_path):
+def test_who_waits_for_a_lock_gets_it_when_its_killed_holder_has_ended_completely(
+    tmp_path, monkeypatch
+):
     dying = """if True:
         import ctypes, os, sys, threading, time
         from pathlib import Path
@@ -127,21 +130,26 @@ def test_who_waits_for_a_lock_gets_it_when_its_killed_holder_has_ended_completel
         lock = Lock(Path(sys.argv[1]))
         assert lock.acquire(wait=False)
         def end_slowly():
-            while Path("/proc/self/statm").read_bytes().split()[0] != b"0":
+            dead, waited_for, ended = map(Path, ["/proc/self/statm", *sys.argv[2:]])
+            while dead.read_bytes().split()[0] != b"0" or not waited_for.exists():
                 time.sleep(0.01)
-            time.sleep(0.2)
             lock.release()
             time.sleep(0.2)
-            Path(sys.argv[2]).touch()
+            ended.touch()
             os._exit(0)
         threading.Thread(target=end_slowly).start()
         ctypes.CDLL(None).pthread_exit(None)
     """
-    path, ended = tmp_path / "lock", tmp_path / "ended"
-    holder = subprocess.Popen([sys.executable, "-c", dying, str(path), str(ended)])
+    is_ready = poll.is_ready  # on a busy machine its end takes longer
+    monkeypatch.setattr(poll, "is_ready", lambda process, _: is_ready(process, 60.0))
+    path, waited_for, ended = (tmp_path / name for name in ("lock", "waited-for", "ended"))
+    holder = subprocess.Popen([sys.executable, "-c", dying, path, waited_for, ended])
     try:
         wait_for(lambda: disk.is_locked(path))
-        assert disk.Lock(path).acquire(wait=True)
+        with ThreadPoolExecutor(1) as threads:
+            taken = amid(threads, lambda: disk.Lock(path).acquire(wait=True), path)
+            waited_for.touch()
+            assert taken.result()
         assert ended.exists()
     finally:
         holder.kill()
@@ -270,7 +278,7 @@ done
 TRIES = """
 import sys
 from pathlib import Path
-from fogft import disk
+from fogft import disk, poll
 from fogft.errors import StateError
 folder, state = Path(sys.argv[1]), sys.argv[2]
 writes = {"report": disk.Report(folder / "report").write}
