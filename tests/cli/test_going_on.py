@@ -94,17 +94,18 @@ def test_a_pool_is_shut_down_though_nobody_reads_it(home, hangs_up):
     holds += "signal.signal(15, lambda *_: (sys.stdin.read(), sys.exit())); print(flush=True);"
     holds += "signal.pause()"
     command = [sys.executable, "-c", holds, str(paths.manager_lock)]
-    with subprocess.Popen(command, stdin=-1, stdout=-1) as manager, going_on("down") as process:
+    with subprocess.Popen(command, stdin=-1, stdout=-1) as manager:
         assert manager.stdout is not None
         assert manager.stdin is not None
-        manager.stdout.readline()
-        assert process.stderr is not None
-        if hangs_up:
-            wait_for(lambda: ignores_hang_up(process.pid), 20)
-            process.send_signal(signal.SIGHUP)
-        process.stderr.close()
-        manager.stdin.close()
-        assert process.wait(30) == 0
+        assert manager.stdout.readline() == b"\n"  # `down` would end a pool without a manager
+        with going_on("down") as process:
+            assert process.stderr is not None
+            if hangs_up:
+                wait_for(lambda: ignores_hang_up(process.pid), 20)
+                process.send_signal(signal.SIGHUP)
+            process.stderr.close()
+            manager.stdin.close()
+            assert process.wait(30) == 0
     assert not paths.folder.exists()
 
 
