@@ -260,3 +260,14 @@ def test_a_process_that_a_machine_forks_while_it_is_frozen_is_frozen_as_well(loc
     assert len(frozen) >= 4
     assert all(map(processes.stopped, frozen))
     local.cloud.terminate(id)
+
+
+def test_what_is_forked_as_the_last_one_stops_is_frozen_as_well(local, monkeypatch):
+    """It runs on, though all that were found before have stopped."""
+    id, sent, found = local.running().id, [], iter([[1], [1, 2], [1, 2]])
+    with monkeypatch.context() as seen:
+        seen.setattr(processes, "find", lambda **_: next(found))
+        seen.setattr(processes, "stopped", lambda pid: True)
+        seen.setattr(processes, "send", lambda pids, number: sent.append(pids))
+        assert local.chaos.freeze(id) == 2
+    assert sent == [[1], [1, 2]]

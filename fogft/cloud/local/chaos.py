@@ -45,11 +45,11 @@ class Chaos:
     def freeze(self, id: ReplicaId) -> int:
         """Stop all processes of a machine (SIGSTOP); return how many. Its kernel still answers."""
         self._living(id)
-        pids = processes.find(machine=str(id))
-        while not all(map(processes.stopped, pids)):  # including new forks
+        frozen: list[int] = []
+        while (pids := processes.find(machine=str(id))) != frozen:  # including new forks
             processes.send(pids, signal.SIGSTOP)
             time.sleep(0.002)
-            pids = processes.find(machine=str(id))
+            frozen = pids if all(map(processes.stopped, pids)) else []
         return len(pids)
 
     def thaw(self, id: ReplicaId) -> int:
