@@ -38,9 +38,17 @@ class Path:
             self.relay.step(0.01)
         self.relay.close()
 
-    def set(self, **faults) -> None:
+    def set(self, *, once_held: int = 0, **faults) -> None:
+        """Have its thread set the faults; at the moment at which so many bytes are held, if any."""
         done = threading.Event()
-        self._commands.append(lambda: (self.relay.set_faults(LinkFaults(**faults)), done.set()))
+
+        def change() -> None:
+            while held_bytes(self.relay) < once_held:
+                self.relay.step(0)
+            self.relay.set_faults(LinkFaults(**faults))
+            done.set()
+
+        self._commands.append(change)
         assert done.wait(30)
 
     def client(self, source: str = "127.0.0.1") -> socket.socket:
@@ -255,8 +263,7 @@ def test_what_a_delay_holds_back_stays_in_a_blackhole(path):
     client, server = path.pair()
     path.set(delay_s=0.1)
     client.sendall(b"late")
-    wait_for(lambda: held_bytes(path.relay) == 4)
-    path.set(blackhole=True)
+    path.set(blackhole=True, once_held=4)
     assert silent(server)
     path.set()
     assert receive(server, 4) == b"late"
