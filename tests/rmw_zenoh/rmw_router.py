@@ -17,6 +17,7 @@ from fogft.link.zenoh.settings import to_zenoh
 session = zenoh.open(to_zenoh({
     "mode": "router", "listen/endpoints": [sys.argv[1]], "scouting/multicast/enabled": False,
     "scouting/gossip/target": {"router": ["router", "peer"], "peer": ["router"]},
+    "transport/shared_memory/enabled": False,  # killed, it would leave a file in /dev/shm
 }))
 print("ready", flush=True)
 sys.stdin.read()
