@@ -22,7 +22,7 @@ from fogft.cli import main, status
 from fogft.cli.status_text import age, milliseconds, number
 from fogft.pool.commands.status import Seen
 from fogft.pool.manager.status import PoolStatus
-from tests.fakes.pools import STATUS, alive, lay_down, report
+from tests.fakes.pools import STATUS, alive, lay_down, report, reporting
 
 SCREEN = """\
 planner  answering  1 of 3 ready  $0.063/h on local  seen 0.4 s ago
@@ -269,7 +269,7 @@ def test_a_narrow_terminal_is_redrawn_with_all_that_a_wide_one_shows(home):
     environ = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
     watch = [sys.executable, "-m", "fogft", "status", "--watch"]
     sent = b""
-    with alive(paths):
+    with reporting(paths):
         with subprocess.Popen(
             watch, stdout=follower, stderr=subprocess.PIPE, env={**environ, "TERM": "xterm"}
         ) as process:
@@ -316,11 +316,9 @@ def test_a_terminal_is_spared_columns_that_say_nothing(home, capsys, monkeypatch
 
 
 def test_a_terminal_gets_colour_unless_it_wants_none(home):
-    paths = lay_down(home, age_s=0.0)
-    with alive(paths):
+    with reporting(lay_down(home)):
         assert "\033[32mready" in on_a_terminal(home)
         for environ in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
-            report(paths)  # anew: on a busy machine each start takes seconds
             plain = on_a_terminal(home, **environ)
             assert "\033" not in plain
             assert "0.1      ready" in plain
@@ -328,8 +326,7 @@ def test_a_terminal_gets_colour_unless_it_wants_none(home):
 
 def test_colour_moves_nothing(home, capsys):
     """The coloured screen without its codes is the plain one."""
-    paths = lay_down(home)
-    with alive(paths):
+    with reporting(lay_down(home)):
         coloured = on_a_terminal(home).replace("\r\n", "\n")
     stripped = re.sub(r"\033\[[0-9;]*m", "", coloured)
     lines = [

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -120,6 +122,25 @@ def alive(paths: PoolPaths) -> Iterator[None]:
     """Hold the locks of a manager and a client proxy, as long as these would live."""
     with disk.locked(paths.manager_lock), disk.locked(paths.proxy_lock):
         yield
+
+
+@contextmanager
+def reporting(paths: PoolPaths) -> Iterator[None]:
+    """As `alive`, with ever new reports: a busy machine takes seconds to start a command."""
+    enough = threading.Event()
+
+    def report_on() -> None:
+        while not enough.wait(0.1):
+            disk.write_json(paths.status, replace(STATUS, observed_at=time.time()).to_json())
+            report(paths)
+
+    with alive(paths), ThreadPoolExecutor(1) as threads:
+        reports = threads.submit(report_on)
+        try:
+            yield
+        finally:
+            enough.set()
+            reports.result()
 
 
 def lay_down(
