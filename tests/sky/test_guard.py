@@ -16,15 +16,17 @@ from tests.fakes.waiting import wait_for
 LIMIT_S = 60.0
 
 
-def machine(folder: Path) -> dict[str, str]:
+def machine(folder: Path, long_minute: int = 0) -> dict[str, str]:
     """Return the environment of a machine whose `shutdown` only writes.
 
-    A minute passes there in a moment, and is counted.
+    A minute passes there in a moment, and is counted; the long one ends when there is a file `on`.
     """
+    waits = f'[ "$(wc -l < {folder}/minutes)" -ne {long_minute} ] || '
+    waits += f"until [ -e {folder}/on ]; do /bin/sleep 0.01; done"
     programs = {
         "shutdown": f'#!/bin/sh\necho "$@" > {folder}/down\n',
         "poweroff": "#!/bin/sh\nexit 1\n",
-        "sleep": f'#!/bin/sh\necho "$1" >> {folder}/minutes\nexec /bin/sleep 0.05\n',
+        "sleep": f'#!/bin/sh\necho "$1" >> {folder}/minutes\n{waits}\nexec /bin/sleep 0.05\n',
     }
     for name, text in programs.items():
         (folder / name).write_text(text)
@@ -32,12 +34,12 @@ def machine(folder: Path) -> dict[str, str]:
     return {**os.environ, "PATH": f"{folder}:{os.environ['PATH']}"}
 
 
-def start(folder: Path, minutes: int) -> subprocess.Popen[bytes]:
+def start(folder: Path, minutes: int, long_minute: int = 0) -> subprocess.Popen[bytes]:
     text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(minutes))
     script = folder / "guard"
     # What other tests on this machine run is no replica of this one.
     script.write_text(text.replace("fogft[ ]serve", f"fogft[ ]serve-{folder.name}"))
-    return subprocess.Popen(["sh", script, "stay"], env=machine(folder))
+    return subprocess.Popen(["sh", script, "stay"], env=machine(folder, long_minute))
 
 
 def minutes(folder: Path) -> int:
@@ -59,17 +61,17 @@ def test_a_machine_whose_replica_runs_stays_and_its_time_begins_anew(tmp_path: P
     replica = subprocess.Popen(
         [sys.executable, "-c", "input()", "fogft", f"serve-{tmp_path.name}"], stdin=subprocess.PIPE
     )
-    guarded = start(tmp_path, minutes=6)
+    guarded = start(tmp_path, minutes=6, long_minute=12)
     try:
         until_minutes(tmp_path, 12)
         assert guarded.poll() is None
     finally:
         replica.kill()
         replica.wait()
-    begun = minutes(tmp_path)
+        (tmp_path / "on").touch()
     assert guarded.wait(LIMIT_S) == 0
     assert (tmp_path / "down").exists()
-    assert minutes(tmp_path) - begun >= 5
+    assert minutes(tmp_path) == 11 + 6
 
 
 def test_its_command_returns_at_once_and_is_plain_text_for_every_reader(tmp_path: Path):
