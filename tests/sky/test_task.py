@@ -491,7 +491,8 @@ def test_a_hanging_setup_is_ended_by_the_machine_itself(vm: Path):
     script = built({"setup": HANGING})["setup"]
     limit = f"read -rt {SETUP_LIMIT_S} "
     assert limit in script
-    done = shell(vm, script.replace(limit, "read -rt 4 "))
+    begun = "until [ -s ~/apart ]; do sleep 0.1; done; read -rt 0.1 "
+    done = shell(vm, script.replace(limit, begun))
     assert done.returncode != 0
     assert "the set-up took more than 3600 s" in done.stdout
     assert not (vm / "went-on").exists()
