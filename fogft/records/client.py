@@ -70,7 +70,7 @@ class RendezvousClient:
         self._own: dict[tuple[RecordKind, str], _Own] = {}
         self._details: dict[str, str] = dict.fromkeys(self.endpoints, "not reached yet")
         self._seen_host = ""
-        self._cached = False
+        self._cached, self._saving = False, threading.Lock()
         self.known = Known()
         if self.cache is not None and restore(self.cache, self._records, self.credentials.ca):
             self._cached = True
@@ -242,13 +242,14 @@ class RendezvousClient:
                 await asyncio.get_running_loop().run_in_executor(None, self._save)
 
     def _save(self) -> None:
-        if self.cache is None or self._cached:
-            return
-        self._cached = True
-        try:
-            write(self.cache, self._records.lacking({}))
-        except StateError as error:
-            log.error("cache_not_written reason=%r", error.message)
+        with self._saving:  # at the end, wait for a write under way: it would replace the last
+            if self.cache is None or self._cached:
+                return
+            self._cached = True
+            try:
+                write(self.cache, self._records.lacking({}))
+            except StateError as error:
+                log.error("cache_not_written reason=%r", error.message)
 
 
 @dataclass

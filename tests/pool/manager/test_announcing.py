@@ -6,6 +6,7 @@ import asyncio
 import tempfile
 import threading
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -95,6 +96,35 @@ def test_every_change_is_published_and_the_next_manager_goes_on(paths, place):
     second.look((place.endpoint,), membership(2, 1, 0), LEASE)
     wait_for(lambda: place.admitted() == membership(2, 1, 0))
     second.close()
+    assert {r.body for r in cache.read(paths.manager_records)} == {
+        r.body for r in place.records.lacking({})
+    }
+
+
+def test_a_slow_disk_leaves_no_older_records_than_those_of_the_end(paths, place, monkeypatch):
+    """What is being written when it ends would take the place of what is written last."""
+    begun, go_on, done = (threading.Event() for _ in range(3))
+
+    def slow(*given: Any) -> None:
+        if begun.is_set():
+            return cache.write(*given)
+        begun.set()
+        go_on.wait(30)
+        cache.write(*given)
+        return done.set()
+
+    monkeypatch.setattr("fogft.records.client.write", slow)
+    manager = ManagerRecords(paths, UID, 1)
+    manager.look((place.endpoint,), membership(1, 1), LEASE)
+    assert begun.wait(30)
+    manager.look((place.endpoint,), membership(1, 2, 0), LEASE)
+    wait_for(lambda: place.admitted() == membership(1, 2, 0))
+    closing = threading.Thread(target=manager.close)
+    closing.start()
+    closing.join(0.2)  # or until then, where it has to wait
+    go_on.set()
+    closing.join()
+    assert done.wait(30)
     assert {r.body for r in cache.read(paths.manager_records)} == {
         r.body for r in place.records.lacking({})
     }
