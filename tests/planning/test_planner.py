@@ -364,6 +364,7 @@ def test_no_report_doubts_nobody_but_still_fills_gaps() -> None:
     """Without the client proxy's report nothing is ended, and what is missing is launched."""
     world = replace(World(spec(2)).having(replica(0), replica(1), replica(2)), links=None)
     assert (launches(world), ends(world)) == ([], [])
+    assert world.plan().notes == (Reason(Cause.NOBODY_HEARD),)
     assert launches(replace(world, spec=spec(4))) == ["3.1"]
 
 
