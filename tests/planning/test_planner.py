@@ -352,6 +352,8 @@ def test_all_silent_is_the_uplink_and_is_said() -> None:
     planned = World(spec(3)).having(*parts).plan()
     assert (planned.launches, planned.terminations) == ((), ())
     assert planned.notes[0] == Reason(Cause.UPLINK_SUSPECTED)
+    surplus = World(spec(1)).having(*parts[:2], replica(2, state="starting"))
+    assert (ends(surplus), ends(replace(surplus, links=None))) == ([], [])
 
 
 def test_vanished_machine_is_replaced_even_behind_a_dead_uplink() -> None:
