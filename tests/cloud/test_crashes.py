@@ -97,6 +97,26 @@ def test_a_machine_outlives_its_launcher(local, step):
     assert processes.find(pool_uid=local.uid) == []
 
 
+def test_what_a_launcher_spawns_while_its_machine_is_ended_ends_as_well(local, monkeypatch):
+    id, end, spawned = killed_at(local, "spawn"), processes.end_machine, []
+
+    def spawns(machine: str) -> bool:
+        ended = end(machine)
+        if not spawned:
+            environ = {**os.environ, processes.MACHINE: machine}
+            spawned.append(subprocess.Popen(["sleep", "60"], env=environ))
+            wait_for(lambda: processes.find(machine=machine))
+        return ended
+
+    monkeypatch.setattr(processes, "end_machine", spawns)
+    try:
+        local.cloud.terminate(id)
+        assert processes.find(machine=str(id)) == []
+    finally:
+        spawned[0].kill()
+        spawned[0].wait()
+
+
 def test_a_full_disk_is_told_and_nothing_is_started(local):
     (local.root / "machines").mkdir()
     process = launcher(local, "full")
