@@ -233,21 +233,38 @@ while True:
 """
 
 
-def test_a_proxy_that_is_ended_finds_nobody_to_hand_over_to(scene: Scene) -> None:
+@pytest.mark.parametrize("stands_by", [False, True])
+def test_a_proxy_that_is_ended_finds_nobody_to_hand_over_to(scene: Scene, stands_by: bool) -> None:
     """Else it would wait for its successor, and be killed."""
     scene.write()
-    proxy = subprocess.Popen(
-        [sys.executable, "-c", HAND_OVER, scene.paths.proxy_lock, scene.paths.standby_lock],
-        stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    works, waits = scene.paths.proxy_lock, scene.paths.standby_lock
+    places = [(waits, works)] if stands_by else []
+    line = [
+        subprocess.Popen(
+            [sys.executable, "-c", HAND_OVER, *place], stdout=subprocess.PIPE, text=True
+        )
+        for place in [*places, (works, waits)]
+    ]
     try:
-        assert proxy.stdout is not None
-        assert proxy.stdout.readline() == "works\n"
+        for one in line:
+            assert one.stdout is not None
+            assert one.stdout.readline() == "works\n"
+        proxy = line[-1]
         assert scene.end() == [f"client proxy (pid {proxy.pid})"]
+        assert proxy.stdout is not None
         assert proxy.stdout.readline() == "nobody\n"
     finally:
-        proxy.kill()
-        proxy.communicate()
+        for one in line:
+            one.kill()
+            one.communicate()
+
+
+def test_no_client_proxy_can_take_a_place_in_line_meanwhile(scene: Scene) -> None:
+    scene.write()
+    line = scene.paths.proxy_lock, scene.paths.standby_lock, scene.paths.spare_lock
+    with shutdown.without_client_proxy(scene.paths, print):
+        assert all(map(disk.is_locked, line))
+    assert not any(map(disk.is_locked, line))
 
 
 WRITE = """
