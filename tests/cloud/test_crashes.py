@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from fogft import disk
+from fogft.cloud.local import ending, processes
 from fogft.cloud.local import folder as folders
-from fogft.cloud.local import processes
 from fogft.model.replica import MachinePhase, ReplicaId
 from tests.fakes.waiting import wait_for
 
@@ -229,6 +230,16 @@ def test_a_killed_machine_is_cleared_away_by_the_next_list(local):
     processes.end(processes.find(machine=str(id)))
     wait_for(lambda: local.machine(id) is None and not local.folder(id).exists())
     assert local.cloud.log(id) is not None
+
+
+def test_a_dead_machine_that_another_process_looks_at_is_left_to_it(local):
+    id = killed_at(local, "spawn")
+    folder = folders.MachineFolder(local.folder(id), id)
+    with disk.locked(folder.path / folders.LOCK):
+        assert not ending.bury(local.root, folder)
+        assert folder.path.exists()
+    assert ending.bury(local.root, folder)
+    assert not folder.path.exists()
 
 
 def test_a_signal_ends_a_machine_in_order(local):
