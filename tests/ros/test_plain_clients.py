@@ -70,9 +70,14 @@ def answers(domain: int, *clients: tuple[int, float, int]) -> list[int]:
     """Run clients beside each other; return how many answers each got."""
     started = [start(domain, f"plain_{n}", client) for n, client in enumerate(clients)]
     time.sleep(1.0)
-    for one in started:
-        begin(one)
-    return [int(one.communicate(timeout=120)[0]) for one in started]
+    try:
+        for one in started:
+            begin(one)
+        return [int(one.communicate(timeout=120)[0]) for one in started]
+    finally:
+        for one in started:
+            one.kill()
+            one.wait()
 
 
 def start(domain: int, name: str, client: tuple[int, float, int], *service: str) -> Any:
