@@ -264,6 +264,17 @@ def test_lease_survives_damage_and_ends_with_its_holder(scene: Scene) -> None:
     assert Lease(scene.paths).epoch == 9
 
 
+def test_who_holds_a_lease_whose_lock_was_removed_steps_down(scene: Scene) -> None:
+    """Another manager may hold that of a new file in its place."""
+    scene.write()
+    lease = Lease(scene.paths)
+    lease.beat()
+    scene.paths.manager_lock.unlink()
+    with pytest.raises(PoolBusy, match="a later manager has taken over"):
+        lease.beat()
+    lease.release()
+
+
 def test_start_manager_reports_why_it_did_not_start(
     scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
