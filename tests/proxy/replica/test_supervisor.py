@@ -102,6 +102,14 @@ def test_stop_ends_what_ignores_signals_and_what_it_started(supervise, tmp_path)
     assert not supervisor.alive
 
 
+def test_what_a_dead_command_had_started_does_not_run_beside_the_next(supervise, tmp_path):
+    supervisor = supervise("sleep 64 & echo $! >> children; exit 3")
+    supervisor.poll()
+    wait_for(lambda: supervisor.poll())
+    first = int((tmp_path / "children").read_text().split()[0])
+    wait_for(lambda: not alive(first))
+
+
 def test_a_command_that_cannot_be_started_is_tried_again(supervise, tmp_path):
     supervisor = supervise("true", tmp_path / "missing")
     assert not supervisor.poll()
