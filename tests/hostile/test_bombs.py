@@ -13,6 +13,8 @@ import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import zenoh
+
 from fogft.link import frame
 from fogft.link.compression import unpack
 from fogft.link.zenoh.robot.link import ZenohLink
@@ -129,7 +131,10 @@ def test_a_robot_that_asks_with_bombs_slows_no_other_robot(
             thrown += 1
             header = frame.encode_request(request_id(1 << 64 | thrown), 20.0, origin, packed=True)
             # Cut short: it is unpacked to its end, and then refused.
-            session.put(keys(0)[SERVICE], bomb[:-1], attachment=header)
+            session.put(
+                keys(0)[SERVICE], bomb[:-1], attachment=header,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )  # fmt: skip
 
         attacked_s = round_trips_s(1000, throw)
         wait_for(lambda: replica.count("malformed") == thrown)
