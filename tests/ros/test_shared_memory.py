@@ -13,6 +13,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -400,8 +401,10 @@ node = rclpy.create_node("caller")
 client = node.create_client(SetBool, "/left")
 client.wait_for_service()
 rclpy.spin_until_future_complete(node, client.call_async(SetBool.Request(data=True)))
-for _ in sys.stdin:
-    print(shared_memory.reopen_ports()[1], flush=True)
+for asked in sys.stdin:
+    while not (found := shared_memory.reopen_ports()[1]) and asked == "until found\\n":
+        pass
+    print(found, flush=True)
 """
 
 
@@ -416,26 +419,27 @@ def test_a_port_that_a_successor_removed_is_known_by_its_bytes(ros_domain: int) 
     command, pipe = [sys.executable, "-c", CALLER], subprocess.PIPE
     killed = _other_node(ros_domain, ORDINARY)
     caller = subprocess.Popen(command, env=environ, stdin=pipe, stdout=pipe, text=True)
+    threads = ThreadPoolExecutor(1)
     try:
         assert _broken(caller) == 0
-        found, left = 0, 10  # on a busy machine Fast DDS was first three times in a row
-        while not found and left:
-            left -= 1
+        found = threads.submit(_broken, caller, "until found")
+        while not found.done():
             killed.kill()
             killed.wait()
             killed = _other_node(ros_domain, ORDINARY)
-            found = _broken(caller)
-        assert found > 0
+            wait([found], 0.5)
+        assert found.result() > 0
     finally:
         for process in (killed, caller):
             process.kill()
             process.wait()
+        threads.shutdown()
 
 
-def _broken(process: subprocess.Popen[str]) -> int:
+def _broken(process: subprocess.Popen[str], asked: str = "now") -> int:
     assert process.stdin is not None
     assert process.stdout is not None
-    process.stdin.write("\n")
+    process.stdin.write(f"{asked}\n")
     process.stdin.flush()
     return int(process.stdout.readline())
 
