@@ -131,8 +131,7 @@ def test_a_slow_link_delays_each_way_until_cleared(local, call):
     machine = local.running()
     caller = call(machine.endpoint)
     local.chaos.slow(machine.id, delay_s=0.3)
-    begin = time.monotonic()
-    wait_for(lambda: not caller.echo(within_s=0.2) or time.monotonic() > begin + 20)
+    wait_for(lambda: not caller.echo(within_s=0.2))
     assert caller.echo(), "it does come, later"
     local.chaos.clear()
     fresh = call(machine.endpoint)
