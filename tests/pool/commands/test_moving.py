@@ -25,6 +25,14 @@ SECRET = "correct horse battery staple"
 NOW = 1_000_000.0
 
 
+@pytest.fixture(autouse=True)
+def quick():
+    """A passphrase is not made slow to guess here, whatever a test undoes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(bundle.SCRYPT, "n", 2)
+        yield
+
+
 @pytest.fixture
 def made(tmp_path, monkeypatch):
     """A pool without processes, and where its file would be."""
