@@ -13,6 +13,7 @@ from fogft import disk
 from fogft.cli import main, progress
 from fogft.pool.commands.status import Seen
 from tests.fakes.pools import FILE, REPLICA, SPEC, STATUS, alive, lay_down
+from tests.fakes.threads import amid
 
 
 def wish(paths):
@@ -36,8 +37,7 @@ def test_scale_counts_from_what_an_up_meanwhile_has_asked_for(home, capsys):
     paths = lay_down(home)
     with disk.locked(paths.manager_lock), ThreadPoolExecutor() as threads:
         with disk.locked(paths.intent_lock):
-            scaled = threads.submit(main.run, ["scale", "up", "1"])
-            time.sleep(0.3)
+            scaled = amid(threads, lambda: main.run(["scale", "up", "1"]), paths.intent_lock)
             text = paths.spec.read_text()
             paths.spec.write_text(text.replace("replicas: 3", "replicas: 4"))
             assert paths.spec.read_text() != text

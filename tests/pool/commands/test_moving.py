@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -20,6 +20,7 @@ from fogft.pool.folder.lease import read_epoch
 from fogft.pool.folder.paths import PoolPaths
 from fogft.pool.folder.store import read_identity
 from tests.fakes.pools import UID, lay_down
+from tests.fakes.threads import amid
 
 SECRET = "correct horse battery staple"
 NOW = 1_000_000.0
@@ -221,12 +222,10 @@ def test_certificates_do_not_change_while_the_pool_is_exported(made, what):
         except FogftError as error:
             failures.append(error)
 
-    with disk.locked(store.paths.intent_lock):
-        thread = threading.Thread(target=asked)
-        thread.start()
-        thread.join(0.3)
-        store.paths.identity.rename(store.paths.exported)
-    thread.join(30)
-    assert not thread.is_alive()
+    with ThreadPoolExecutor(1) as threads:
+        with disk.locked(store.paths.intent_lock):
+            asking = amid(threads, asked, store.paths.intent_lock)
+            store.paths.identity.rename(store.paths.exported)
+        asking.result(30)
     assert [type(failure) for failure in failures] == [PoolBusy]
     assert store.paths.credentials.joinpath("issued.json").read_bytes() == before
