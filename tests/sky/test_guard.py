@@ -38,7 +38,7 @@ def start(folder: Path, minutes: int, long_minute: int = 0) -> subprocess.Popen[
     text = template_files.read_text("vm_guard.sh").replace("@ALONE_MINUTES@", str(minutes))
     script = folder / "guard"
     # What other tests on this machine run is no replica of this one.
-    script.write_text(text.replace("fogft[ ]serve", f"fogft[ ]serve-{folder.name}"))
+    script.write_text(text.replace("fogft[ ]serve", f"fogft[ ]serve-{folder}"))
     return subprocess.Popen(["sh", script, "stay"], env=machine(folder, long_minute))
 
 
@@ -59,7 +59,7 @@ def test_a_machine_without_a_replica_shuts_down_at_its_limit(tmp_path: Path):
 
 def test_a_machine_whose_replica_runs_stays_and_its_time_begins_anew(tmp_path: Path):
     replica = subprocess.Popen(
-        [sys.executable, "-c", "input()", "fogft", f"serve-{tmp_path.name}"], stdin=subprocess.PIPE
+        [sys.executable, "-c", "input()", "fogft", f"serve-{tmp_path}"], stdin=subprocess.PIPE
     )
     guarded = start(tmp_path, minutes=6, long_minute=12)
     try:
