@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from fogft.cloud.local import processes
 from tests import own_process, own_process_tried
+from tests.fakes.waiting import wait_for
 
 
 @pytest.mark.timeout(180)
@@ -31,3 +33,24 @@ def test_each_has_a_process_of_its_own_and_its_end_is_told(tmp_path):
     assert [name for name, _ in where] == ["here", "there", "there"]
     assert len({pid for _, pid in where}) == 3
     assert Path(f"/proc/{where[0][1]}").exists() is False
+
+
+ORDERS = """
+import signal
+from tests.link.forked import Forked
+print(Forked("waits", [], 2).pid, flush=True)
+signal.pause()
+"""
+
+
+def test_what_a_run_has_forked_ends_though_it_is_killed(tmp_path):
+    (tmp_path / "waits.py").write_text("import signal\ndef main():\n    signal.pause()\n")
+    environ = {**os.environ, "PYTHONPATH": f"{own_process.ROOT}{os.pathsep}{tmp_path}"}
+    with subprocess.Popen(
+        [sys.executable, "-c", ORDERS],
+        env=environ, cwd=own_process.ROOT, stdout=subprocess.PIPE, text=True,
+    ) as run:  # fmt: skip
+        forked = int(run.stdout.readline())
+        assert processes.alive(forked)
+        run.kill()
+    wait_for(lambda: not processes.alive(forked))

@@ -136,6 +136,11 @@ class _Children:
                 self._codes[found[0]] = os.waitstatus_to_exitcode(found[1])
         self._tell()
 
+    def kill(self) -> None:
+        """End those that still run: whoever ordered them is gone."""
+        for pid in self._told:
+            os.kill(pid, signal.SIGKILL)
+
     def _tell(self) -> None:
         for pid in self._told.keys() & self._codes.keys():
             file, code = self._told.pop(pid, -1), self._codes.pop(pid, 0)
@@ -173,6 +178,7 @@ def main() -> None:
         orders.send(str(pid).encode())
         children.add(pid, ended)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    children.kill()
     with contextlib.suppress(ChildProcessError):
         while True:
             os.wait()
