@@ -131,7 +131,7 @@ def reporting(paths: PoolPaths) -> Iterator[None]:
 
     def report_on() -> None:
         while not enough.wait(0.1):
-            disk.write_json(paths.status, replace(STATUS, observed_at=time.time()).to_json())
+            disk.write_json(paths.status, to_plain(replace(STATUS, observed_at=time.time())))
             report(paths)
 
     with alive(paths), ThreadPoolExecutor(1) as threads:

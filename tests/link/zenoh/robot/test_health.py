@@ -41,6 +41,7 @@ def test_a_killed_replica_is_noticed_by_the_lost_connection(
     start_replica: Callable[..., ReplicaProcess], dial: Callable[..., ZenohLink], owner: Owner
 ) -> None:
     """Not by silence: suspicion is set so late here that it could not have helped."""
+    others = {thread for thread in threading.enumerate() if "fogft-send" in thread.name}
     replica = start_replica(delay_s=3600.0)
     with no_more():
         dial(replica.endpoint).close()
@@ -54,7 +55,15 @@ def test_a_killed_replica_is_noticed_by_the_lost_connection(
     with no_more():  # threads: the lost connection is closed, and the link goes on, without
         replica.kill()
         wait_for(lambda: owner.of(1))
-        wait_for(lambda: not [t for t in threading.enumerate() if "fogft-send" in t.name])
+        wait_for(
+            lambda: (
+                not [
+                    thread
+                    for thread in threading.enumerate()
+                    if "fogft-send" in thread.name and thread not in others
+                ]
+            )
+        )
     assert link.status().state is LinkState.SUSPECT
     again = start_replica(endpoint=replica.endpoint)
     wait_for(lambda: link.usable)
