@@ -173,7 +173,11 @@ class Reconciler:
         decided = decided._replace(notes=(*map(self._with_log, decided.notes), *trouble))
         if observed.machines is not None:
             try:
-                awaited = self._tend_gateway(inputs)
+                try:
+                    awaited = self._tend_gateway(inputs)
+                except (FogftError, OSError):  # machines must end nevertheless
+                    self._apply(identity, inputs, decided._replace(launches=()))
+                    raise
                 if awaited is not None:
                     decided = decided._replace(launches=(), notes=(awaited, *decided.notes))
                 self._apply(identity, inputs, decided)

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import logging
 import threading
+from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 
 from fogft.errors import CloudUnreachable, NoCapacity, StateError
 from fogft.model.reason import Cause, Reason
 from fogft.model.replica import LinkReport, LinkState, ReplicaId
+from fogft.model.topology import LaunchedGateway
 from fogft.planning.observed.clock_jumps import Reading
 from fogft.planning.observed.history import Event, EventKind
 from fogft.planning.planner import PlannedLaunch
@@ -291,6 +294,26 @@ def test_a_full_disk_keeps_no_machine() -> None:
         bench.run()
     assert bench.cloud.calls.terminated == [ID]
     assert bench.kinds()[1:] == [EventKind.FAILED, EventKind.ENDING, EventKind.ENDED]
+
+
+def test_a_gateway_that_cannot_be_launched_keeps_no_machine() -> None:
+    """Its order may fail for as long as the disk is full; status says why replicas wait."""
+    bench = Bench()
+    bench.cloud.zones["east/one/a"].fails = "error"
+    bench.reconciler.tick()
+    bench.run()
+    bench.now += 100.0
+
+    def full(inputs: object) -> None:
+        raise StateError("no space left")
+
+    pool = replace(bench.store.spec(), gateway=LaunchedGateway(launch=True))
+    bench.store.spec = lambda: pool  # type: ignore[method-assign]
+    bench.reconciler.gateway = SimpleNamespace(look=full)  # type: ignore[assignment]
+    tick = bench.reconciler.tick()
+    bench.run()
+    assert tick.plan.notes[-1].words == "no space left"
+    assert (bench.cloud.calls.launched, bench.cloud.calls.terminated) == ([ID], [ID])
 
 
 def test_prices_are_kept_while_the_cloud_is_away_for_prices() -> None:
