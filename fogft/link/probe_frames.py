@@ -37,15 +37,16 @@ def decode_probe(frame: bytes) -> Probe:
 def encode_probe_answer(answer: ProbeAnswer) -> bytes:
     """Return a probe's answer as compact JSON; a long `detail` is cut.
 
-    If it does not fit, type definitions are left out, then the second half of `behind`, then of
-    the rest. Raises ValueError: it names more services than any pool file may.
+    If it does not fit, the second half of the type definitions is left out, then of the rest; then
+    so is `behind`. Raises ValueError: it names more services than any pool file may.
     """
     behind = tuple(_shortened(one) for one in answer.behind)
     written = replace(answer, detail=as_line(answer.detail[:DETAIL_LIMIT]), behind=behind)
     frame = _encoded(written)
     while len(frame) > PROBE_ANSWER_LIMIT and (written.types or written.behind):
         kept = written.behind if written.types else written.behind[: len(written.behind) // 2]
-        written = replace(written, types={}, behind=kept)
+        types = dict(list(written.types.items())[: len(written.types) // 2])
+        written = replace(written, types=types, behind=kept)
         frame = _encoded(written)
     if len(frame) > PROBE_ANSWER_LIMIT:
         raise ValueError(f"a probe's answer of {len(frame)} bytes")

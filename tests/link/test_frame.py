@@ -294,7 +294,8 @@ def test_definitions_that_do_not_fit_are_left_out_and_the_answer_still_travels()
     """Health never depends on how long a type is."""
     large = {"a/srv/B": Definition("h", {"request": (("x" * 300_000, "int32"),)})}
     small = {"a/srv/B": Definition("h", {"request": (("x", "int32"),)})}
-    for types, told in ((large, {}), (small, small)):
+    both = {**small, "a/msg/C": large["a/srv/B"]}  # those of topics come last
+    for types, told in ((large, {}), (small, small), (both, small)):
         answer = ProbeAnswer(
             slot=0,
             generation=1,
