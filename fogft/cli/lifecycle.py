@@ -16,6 +16,7 @@ from fogft import __version__, logfile
 from fogft.cli import options, output, progress, status_text
 from fogft.cli.options import DEFAULT_FILE, Cloud, PoolArgument, PoolFile, PoolOption, Yes
 from fogft.errors import FogftError
+from fogft.model.topic import PREFIX
 from fogft.pool.commands import composition
 from fogft.pool.folder.paths import PoolPaths
 
@@ -138,7 +139,7 @@ def up(
 
 def services_at_fault(status: PoolStatus) -> list[str]:
     """Return the services that do not answer; if types differ, only those that differ."""
-    differing = {name for one in status.replicas for name in one.differing}
+    differing = {n for one in status.replicas for n in one.differing if not n.startswith(PREFIX)}
     return sorted(differing) or [one.name for one in status.services if not one.answers]
 
 

@@ -83,11 +83,13 @@ def test_a_service_with_fewer_ready_replicas_than_its_quorum_does_not_answer():
 
 def test_only_services_whose_type_differs_are_named():
     """The others wait for the same replicas, and nothing is wrong with them."""
-    replica = replace(REPLICA, differs=True, differing=("/odd",), detail="`a/srv/B` differs")
+    differing = ("/odd", "topic /scan")
+    replica = replace(REPLICA, differs=True, differing=differing, detail="`a/srv/B` differs")
     services = tuple(ServiceStatus(name, SETBOOL, 0) for name in ("/even", "/odd"))
     status = replace(STATUS, replicas=(replica,), services=services)
     assert services_at_fault(status) == ["/odd"]
-    assert services_at_fault(replace(status, replicas=(REPLICA,))) == ["/even", "/odd"]
+    for other in (REPLICA, replace(REPLICA, differing=("topic /scan",))):
+        assert services_at_fault(replace(status, replicas=(other,))) == ["/even", "/odd"]
 
 
 def shown_lines(seen: Seen) -> list[str]:

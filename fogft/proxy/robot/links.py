@@ -15,6 +15,7 @@ from typing import Any
 from fogft.link.port import Dialer, GatewayView, Link, LinkEvents, LinkStatus, Peer
 from fogft.metrics.outcomes import OfReplica
 from fogft.model.replica import LinkState, Member, ReplicaId
+from fogft.model.topic import PREFIX
 from fogft.model.type_definition import Definition, difference
 from fogft.proxy.robot.dispatcher import Dispatcher
 from fogft.proxy.robot.sending import key_of
@@ -32,21 +33,23 @@ def link_report(
     draining: bool,
     misread: bool,
 ) -> dict[str, Any]:
-    """Return the report of a link; `differ`: services it cannot answer, with reasons."""
+    """Return the report of a link; `differ`: services and topics not usable there, with reasons."""
     status, id = link.status(), link.peer.id
     answer = status.probe_answer
-    ours = next(iter(differ.values()), "") if link.usable else ""
+    told = differ if link.usable else {}
+    ours = next((why for name, why in told.items() if not name.startswith(PREFIX)), "")
     key = key_of(link)
     misread = misread or any(one.misreads(key) for one in dispatchers)
     ended = [one.outcomes.of.get(key, OfReplica()) for one in dispatchers]
     down = [f"uplink `{u['interface']}`: {u['detail']}" for u in status.uplinks if u["detail"]]
+    down += told.values()
     return {
         "slot": id.slot,
         "generation": id.generation,
         "state": status.state.value,
         "ready": sorted(link.ready - differ.keys()),
         "differs": bool(ours),
-        "differing": sorted(differ) if ours else [],
+        "differing": sorted(told),
         "offered": dict(answer.offered) if answer and link.usable else {},
         "leaving": link.leaving,
         "draining": draining,
