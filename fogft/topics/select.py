@@ -52,9 +52,9 @@ class Selection:
     def __init__(self, select: Select) -> None:
         self._select = select
         self._leader = Leader()
-        # The replicas that sent each stamp. One that repeats it has a clock that was set back or
-        # stands still, as a simulation's may: it is the stamp of a new message.
-        self._stamps: OrderedDict[bytes, set[int]] = OrderedDict()
+        # How often each replica sent each stamp, and when one passed last. A repeated one is of a
+        # new message: one of several at once, or a simulation's clock was set back or stands still.
+        self._stamps: OrderedDict[bytes, tuple[dict[int, int], float]] = OrderedDict()
         self._goals: OrderedDict[bytes, Leader] = OrderedDict()
 
     def passes(self, replica: int, message: bytes, now: float) -> bool:
@@ -73,10 +73,14 @@ class Selection:
         stamp = message[:2] + message[_STAMP]
         if not any(message[_STAMP]):  # not set: it identifies nothing
             return self._leader.passes(replica, now)
-        if replica not in self._stamps.get(stamp, (replica,)):
-            self._stamps[stamp].add(replica)
+        counts, passed_at = self._stamps.get(stamp, ({}, now))
+        if replica in counts and now - passed_at > QUIET_S:
+            counts = {}
+        most = max(counts.values(), default=0)
+        counts[replica] = counts.get(replica, 0) + 1
+        if counts[replica] <= most:
             return False
-        self._stamps[stamp] = {replica}
+        self._stamps[stamp] = counts, now
         if len(self._stamps) > _KEPT:
             self._stamps.popitem(last=False)
         return True

@@ -50,8 +50,16 @@ def test_a_stamp_that_a_replica_repeats_is_a_new_one():
     """A simulation's clock jumps back to 7, then stands still at 8; another one comes later."""
     selection = Selection(Select.STAMP)
     said = [(0, 7), (1, 7), (0, 8), (1, 8), (1, 7), (0, 7), (1, 8), (0, 8), (1, 8), (0, 8)]
-    passed = [(r, s) for r, s in [*said, (2, 8), (2, 8)] if selection.passes(r, message(s), 0.0)]
-    assert passed == [(0, 7), (0, 8), (1, 7), (1, 8), (1, 8), (2, 8)]
+    passed = [(r, s) for r, s in said if selection.passes(r, message(s), 0.0)]
+    assert passed == [(0, 7), (0, 8), (1, 7), (1, 8), (1, 8)]
+    assert [selection.passes(2, message(8), 1.1) for _ in range(3)] == [False, True, True]
+
+
+def test_of_several_messages_with_one_stamp_each_passes_once():
+    """As of several cameras, whose detections a replica publishes together."""
+    selection = Selection(Select.STAMP)
+    said = [0, 0, 0, 1, 1, 2, 1, 2, 2]
+    assert [r for r in said if selection.passes(r, message(7), 0.0)] == [0, 0, 0]
 
 
 def test_without_a_stamp_one_replica_leads():
