@@ -13,7 +13,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Any, TypeVar
 
@@ -62,7 +62,7 @@ class SerialisedNode:
         self._stopping = False
         self._ended = threading.Event()
         self._visible: VisibleNode | None = None
-        self._probes = NodeProbes(self.client, self.same_node_serves, self._is_found)
+        self._probes = NodeProbes(self.client, self.same_node_serves, self._found)
         self._timers = Timers()
         try:
             self._start_ros(name, domain_id, early)
@@ -224,21 +224,20 @@ class SerialisedNode:
         `client` is the first 16 bytes of a request's handle: the GID of the reader of its
         responses or, under CycloneDDS, an id for the writer of its requests.
         """
-        end = self._end_of(service, client)
+        end = self._found(service, [client]).get(client)
         return None if end is None else self._same_node(what, end)
 
-    def _is_found(self, service: str, client: bytes) -> bool:
-        return self._end_of(service, client) is not None
-
-    def _end_of(self, service: str, client: bytes) -> Any:
-        """Return what discovery tells of a client; None if it does not list it."""
+    def _found(self, service: str, clients: Collection[bytes]) -> dict[bytes, Any]:
+        """Return what discovery tells of those clients of a service that it lists."""
+        ends = dict(zip(clients, clients, strict=True))
         if self._middleware == cyclone.MIDDLEWARE:
-            client = cyclone.writer_of(client, self._context.get_domain_id())
+            domain_id = self._context.get_domain_id()
+            ends = {client: cyclone.writer_of(client, domain_id) for client in clients}
             find, topic = self._node.get_publishers_info_by_topic, f"rq{service}Request"
         else:
             find, topic = self._node.get_subscriptions_info_by_topic, f"rr{service}Reply"
-        listed = self._endpoints(find, topic)
-        return next((end for end in listed if bytes(end.endpoint_gid)[:16] == client), None)
+        listed = {bytes(end.endpoint_gid)[:16]: end for end in self._endpoints(find, topic)}
+        return {client: listed[end] for client, end in ends.items() if end in listed}
 
     def _beside_server(self, what: str, service: str) -> str | None:
         """Like `same_node_serves`, for the last node that discovery lists as a server."""

@@ -12,7 +12,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from operator import itemgetter
@@ -47,12 +47,12 @@ class NodeProbes:
         make_client: As `RosNode.client`.
         same_node_serves: Takes a service's last name, another service and a client of the latter.
             Returns the first one's full name on the client's node; None: unknown, empty: none.
-        is_found: Whether discovery lists this client of a service.
+        found: Returns those of these clients of a service that discovery lists.
     """
 
     make_client: Callable[[str, str], RosClient]
     same_node_serves: Callable[[str, str, bytes], str | None]
-    is_found: Callable[[str, bytes], bool] = lambda service, client: True
+    found: Callable[[str, Collection[bytes]], Collection[bytes]] = lambda service, clients: clients
 
     def __post_init__(self) -> None:
         self._by_name: dict[str, RosClient] = {}
@@ -112,6 +112,7 @@ class Pacer:
         self._asked: dict[bytes, float] = {}  # clients to check for probes: until when
         self._lock = threading.Lock()
         self._wake = threading.Condition(self._lock)
+        self._find_at = self.clock()
         self._thread: threading.Thread | None = None  # started on demand
         self._closed = False
 
@@ -177,7 +178,7 @@ class Pacer:
                     self._wake.wait(wait_s)
                     due, probed, wait_s = self._step(self.clock())
                 asked = list(self._asked)
-                finding = [(i, c) for i, c in self._held.items() if c.finding_until is not None]
+                finding = {i: c for i, c in self._held.items() if c.finding_until is not None}
                 if self._closed:
                     return
             for id, client, handle, payload in due:
@@ -189,9 +190,11 @@ class Pacer:
                 self.probes.send(id, partial(self._answered, id))
             for id in asked:
                 self._ask(id)
-            for id, client in finding:
-                if self.probes.is_found(self.service, id):
-                    client.find_again_at = self.clock()
+            if finding and (now := self.clock()) >= self._find_at:
+                for id in self.probes.found(self.service, finding):
+                    finding[id].find_again_at = now
+                # Among many clients it takes long: at most a tenth of the time.
+                self._find_at = now + max(_ASK_EVERY_S, 10 * (self.clock() - now))
 
     def _step(self, now: float) -> tuple[list[_Due], list[bytes], float | None]:
         """Return the due responses, a client id per probe, and how long to wait if none."""

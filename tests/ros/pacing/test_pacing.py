@@ -38,12 +38,14 @@ class _NoNodes:
 
     def __init__(self) -> None:
         self.hidden: set[bytes] = set()  # clients that discovery does not list
+        self.looks = 0
 
     def answers(self, service, client):
         return False
 
-    def is_found(self, service, client):
-        return client not in self.hidden
+    def found(self, service, clients):
+        self.looks += 1
+        return set(clients) - self.hidden
 
 
 UNKNOWN = _NoNodes()
@@ -532,6 +534,11 @@ def test_clients_that_are_gone_hold_up_nobody():
     for n in range(40):
         pacer.respond(handle(8, n), b"")
     assert all_sent.wait(30)
+    looks, began = probes.looks, time.monotonic()
+    for n in range(40):
+        pacer.requested(handle(0, n))
+        time.sleep(0.002)
+    assert probes.looks - looks <= 1 + (time.monotonic() - began) / 0.02  # however busy it is
     pacer.close()
     assert tries == {**dict.fromkeys(range(8), 1), 8: 40}
 
