@@ -202,7 +202,7 @@ class Pacer:
         in_the_way: dict[bytes, ClientPace] = {}
         for id, client in list(self._held.items()):
             finding = client.finding_until is not None
-            if finding and now < client.find_again_at:
+            if finding and (now < client.find_again_at or any(c.finding_until for _, c, *_ in due)):
                 continue
             while client.waiting and self._pace.take(client, now):
                 due.append((id, client, *client.next(now)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import random
 import threading
@@ -541,6 +542,35 @@ def test_clients_that_are_gone_hold_up_nobody():
     assert probes.looks - looks <= 1 + (time.monotonic() - began) / 0.02  # however busy it is
     pacer.close()
     assert tries == {**dict.fromkeys(range(8), 1), 8: 40}
+
+
+def test_clients_that_are_given_up_hold_up_others_one_at_a_time():
+    """ROS waits for each; responses to others go in between."""
+    probes, ahead_s, tries, both = _NoNodes(), 0.0, list[int](), threading.Event()
+
+    def send(handle: bytes, payload: bytes) -> None:
+        who = handle[0]
+        tries.append(who)
+        if who < 8:
+            time.sleep(0.02)
+            raise NotFoundYet("client will not receive response")
+        if len(tries) >= 200:
+            both.set()
+
+    pacer = Pacer(send, probes, "/s", clock=lambda: ahead_s + time.monotonic())
+    probes.hidden = {handle(who, 0)[:16] for who in range(8)}
+    for who in range(8):
+        pacer.respond(handle(who, 0), b"")
+    for n in range(200):
+        pacer.requested(handle(8, n))
+    for n in range(200):
+        pacer.respond(handle(8, n), b"")
+    began, ahead_s = len(tries), 11.0
+    assert both.wait(30)
+    pacer.close()
+    given_up = [at for at, who in enumerate(tries) if who < 8 and at >= began]
+    assert len(given_up) == 8
+    assert all(later - at > 1 for at, later in itertools.pairwise(given_up))
 
 
 def test_what_waits_for_a_client_to_be_found_does_not_come_all_at_once():
