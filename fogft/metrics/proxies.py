@@ -65,7 +65,7 @@ def of_client(report: Mapping[str, Any]) -> Iterator[Metric]:
     ]
     for key, (name, help) in _OF_LINK.items():
         known = (link for link in links if link.get(key) is not None)
-        yield family(name, help, ((link[key], _slot(link)) for link in known))
+        yield family(name, help, ((link[key], {"slot": str(link["slot"])}) for link in known))
     yield family(
         "fogft_topic_messages_total",
         "Messages of topics, by outcome.",
@@ -138,10 +138,6 @@ def _newest(links: Iterable[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
     """Return each slot's link of the newest generation: a series has only one sample."""
     ranked = sorted(links, key=lambda link: (link["generation"], link["state"] == "up"))
     return list({link["slot"]: link for link in ranked}.values())
-
-
-def _slot(link: Mapping[str, Any]) -> dict[str, str]:
-    return {"slot": str(link["slot"])}
 
 
 def of_server(report: Mapping[str, Any]) -> Iterator[Metric]:

@@ -336,10 +336,8 @@ class SkyCloud:
         more = True
         try:
             more = not self._closed and self._following.step(id)
-        except CloudUnreachable as error:
+        except CloudError as error:  # no answer, or an unexpected one: time limits end the launch
             log.warning("launch_unknown replica=%s reason=%r", id.short, error.message)
-        except CloudError as error:  # an unexpected answer; the time limits end the launch
-            log.warning("launch_unclear replica=%s reason=%r", id.short, error.message)
         except StateError:  # the journal cannot be read: `machines` says so to the user
             more = False
         finally:

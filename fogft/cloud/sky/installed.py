@@ -280,11 +280,8 @@ class InstalledSky:
         self.load()
         out = io.StringIO()
         with contextlib.suppress(CloudError):  # a log that is missing must not hide the failure
-            self.within(
-                JOB_LIMIT_S,
-                f"log {id(out)}",
-                lambda: read(follow=False, tail=lines, output_stream=out),
-            )
+            tail = functools.partial(read, follow=False, tail=lines, output_stream=out)
+            self.within(JOB_LIMIT_S, f"log {id(out)}", tail)
         return out.getvalue()
 
     def load(self) -> None:

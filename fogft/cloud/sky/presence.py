@@ -46,8 +46,7 @@ def of_entry(entry: Entry, cluster: Cluster | None, instance: Instance | None) -
         progress = stage.value if stage is Stage.SETTING_UP else ""
     else:
         phase = MachinePhase.PROVISIONING
-        progress = cluster.progress if cluster else ""
-        progress = progress or stage.value
+        progress = (cluster.progress if cluster else "") or stage.value
     placement = entry.placement
     if cluster is not None and cluster.placement is not None:
         placement = _as_found(entry, cluster.placement)

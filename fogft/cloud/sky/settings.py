@@ -50,13 +50,11 @@ class Settings:
         config = importlib.import_module("sky.skypilot_config")
         with self._lock:
             self._launched |= ENDED_BY_FILES.intersection(clouds)
-            changes: list[str] = []
-            if id is not None:
-                changes += _with_group(config, f"{naming.PREFIX}{id.pool_uid}-*", group)
+            clusters = f"{naming.PREFIX}{id.pool_uid}-*" if id is not None else ""
+            changes = _with_group(config, clusters, group) if clusters else []
             given = list(config.get_nested(GUARD, []) or [])
             if guard() not in given:
-                value = json.dumps([*given, guard()])
-                changes.append(f"{'.'.join(GUARD)}={value}")
+                changes.append(f"{'.'.join(GUARD)}={json.dumps([*given, guard()])}")
             for cloud in () if _is_elsewhere() else _with_identity():
                 wanted = UPLOAD if cloud in self._launched else NO_UPLOAD
                 found = _identity(config, cloud)

@@ -277,12 +277,9 @@ class ClientProxy:
             now = self.clock()
         self._look_now = False
 
-    def _differences(self, link: Link) -> Mapping[str, str]:
-        return self._type_check.differences(link, self._types())
-
     def _route(self) -> None:
         links = list(self.links)
-        differ = {key_of(link): self._differences(link) for link in links}
+        differ = {key_of(link): self._type_check.differences(link, self._types()) for link in links}
         self._topics.route({key_of(link): link for link in links}, differ)
         versions = {id: member.version for id, member in self.links.members.items()}
         draining = frozenset(link.peer.id for link in links if self.links.draining(link))
@@ -324,7 +321,7 @@ class ClientProxy:
         for link in sorted(self.links, key=lambda link: link.peer.id):
             member = self.links.members[link.peer.id]
             report = link_report(
-                *(link, dispatchers, self._differences(link)),
+                *(link, dispatchers, self._type_check.differences(link, self._types())),
                 draining=self.links.draining(link),
                 misread=self._topics.misreads(key_of(link)),
             )
