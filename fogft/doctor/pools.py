@@ -13,6 +13,7 @@ from fogft.doctor.finding import Finding, Situation, fail, ok, warn
 from fogft.errors import CredentialError, FogftError, StateError
 from fogft.model.choices import Speaks
 from fogft.model.groups import FIRST_BY_HAND
+from fogft.model.plain import utc
 from fogft.model.replica import LinkState, Phase
 from fogft.pool.commands import status
 from fogft.pool.commands.status import Seen
@@ -132,7 +133,7 @@ def judge_folder(whose: str, folder: Path, now: datetime, anew: str) -> Iterator
         elif said.not_after - now < SOON:
             yield warn(
                 "credentials",
-                f"{whose}: `{certificate.name}` expires at {said.not_after:%Y-%m-%d %H:%M} UTC",
+                f"{whose}: `{certificate.name}` expires at {utc(said.not_after.timestamp())}",
                 anew,
             )
 

@@ -13,12 +13,12 @@ SOON = datetime.timedelta(days=30)  # a running manager renews a month earlier
 log = logging.getLogger(__name__)
 
 
-def end_of(certificate: bytes) -> datetime.datetime | None:
-    """Return when a certificate (PEM) expires; None if it cannot be read."""
+def end_of(certificate: bytes) -> float | None:
+    """Return when a certificate (PEM) expires, in Unix time; None if it cannot be read."""
     from cryptography import x509
 
     try:
-        return x509.load_pem_x509_certificate(certificate).not_valid_after_utc
+        return x509.load_pem_x509_certificate(certificate).not_valid_after_utc.timestamp()
     except Exception:  # the parser may raise anything on hostile bytes
         return None
 
@@ -28,7 +28,7 @@ class Expiry:
 
     def __init__(self, certificate: Path) -> None:
         self._file = disk.Watched(certificate)
-        self._end: datetime.datetime | None = None
+        self._end: float | None = None
         self._told_days: int | None = None
 
     def look(self) -> float | None:
@@ -38,7 +38,7 @@ class Expiry:
                 self._end = end_of(self._file.path.read_bytes())
         if self._end is None:
             return None
-        left_s = self._end.timestamp() - time.time()
+        left_s = self._end - time.time()
         days = int(left_s // 86_400)
         if days < SOON.days and days != self._told_days:
             self._told_days = days

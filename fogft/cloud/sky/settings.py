@@ -50,8 +50,7 @@ class Settings:
         config = importlib.import_module("sky.skypilot_config")
         with self._lock:
             self._launched |= ENDED_BY_FILES.intersection(clouds)
-            clusters = f"{naming.PREFIX}{id.pool_uid}-*" if id is not None else ""
-            changes = _with_group(config, clusters, group) if clusters else []
+            changes = [] if id is None else _with_group(config, id, group)
             given = list(config.get_nested(GUARD, []) or [])
             if guard() not in given:
                 changes.append(f"{'.'.join(GUARD)}={json.dumps([*given, guard()])}")
@@ -76,8 +75,9 @@ class Settings:
         return sorted(mounts)
 
 
-def _with_group(config: Any, clusters: str, group: str) -> list[str]:
-    """Return the setting that gives clusters a security group; empty if it is set already."""
+def _with_group(config: Any, id: ReplicaId, group: str) -> list[str]:
+    """Return the setting that gives a pool's clusters a security group; empty if set already."""
+    clusters = f"{naming.PREFIX}{id.pool_uid}-*"
     found = config.get_nested(GROUP, None) or []
     given = [{"*": found}] if isinstance(found, str) else list(found)
     wanted = [one for one in given if clusters not in one]

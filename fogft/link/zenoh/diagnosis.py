@@ -4,11 +4,11 @@ After a failure only, connects to the endpoint again with plain TCP and TLS.
 """
 
 import contextlib
-import datetime
 import errno
 import os
 import socket
 import ssl
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -17,6 +17,7 @@ from fogft.link.port import Peer
 from fogft.link.zenoh.settings import LinkSettings
 from fogft.model.credentials import CredentialPaths
 from fogft.model.names import host_and_port
+from fogft.model.plain import utc
 from fogft.records.dialling import client_context
 from fogft.records.expiry import end_of
 
@@ -100,7 +101,7 @@ def wrong_name(found: str | None, peer: Peer) -> str:
 
 def _clock_words(error: ssl.SSLError, peer: Peer, credentials: CredentialPaths) -> str:
     """Return whose clock is wrong if a certificate was rejected as expired, else ""."""
-    now = datetime.datetime.now(datetime.timezone.utc)
+    now = time.time()
     if isinstance(error, ssl.SSLCertVerificationError):
         if error.verify_code != _EXPIRED:
             return ""
@@ -138,27 +139,23 @@ def _tls_words(error: ssl.SSLError) -> str:
     return f"TLS failed: {error.reason or error}"
 
 
-def judged_here(ends: datetime.datetime, now: datetime.datetime) -> str:
+def judged_here(ends: float, now: float) -> str:
     """Return why we reject an expired certificate; ``now`` is this machine's clock."""
     return (
-        f"it expired at {_utc(ends)}, and this machine's clock says {_utc(now)}. If "
+        f"it expired at {utc(ends)}, and this machine's clock says {utc(now)}. If "
         "that is right, replace the replica"
     )
 
 
-def judged_there(ends: datetime.datetime, now: datetime.datetime) -> str:
+def judged_there(ends: float, now: float) -> str:
     """Return why a replica rejects our certificate as expired."""
-    valid, clock = f"valid to {_utc(ends)}", f"this machine's clock says {_utc(now)}"
+    valid, clock = f"valid to {utc(ends)}", f"this machine's clock says {utc(now)}"
     if now >= ends:
         return f"our certificate has expired ({valid}, {clock})"
     return (
         "the replica's clock is wrong: it rejects our certificate as expired, but it is "
         f"{valid}; {clock}"
     )
-
-
-def _utc(time: datetime.datetime) -> str:
-    return f"{time:%Y-%m-%d %H:%M} UTC"
 
 
 _EXPLAIN_EVERY_S = 5.0

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from fogft import disk
 from fogft.errors import CredentialError
 from fogft.model.credentials import Role, holder_of
+from fogft.model.plain import utc
 from fogft.records.signing import Signer, attribute
 
 if TYPE_CHECKING:
@@ -60,9 +61,9 @@ class Description:
     def problem(self, now: datetime.datetime) -> str:
         """Return the problem with its validity at `now`, or an empty text."""
         if now < self.not_before:
-            return f"not valid before {self.not_before:%Y-%m-%d %H:%M} UTC"
+            return f"not valid before {utc(self.not_before.timestamp())}"
         if now >= self.not_after:
-            return f"expired at {self.not_after:%Y-%m-%d %H:%M} UTC"
+            return f"expired at {utc(self.not_after.timestamp())}"
         return ""
 
 

@@ -279,7 +279,8 @@ class ClientProxy:
 
     def _route(self) -> None:
         links = list(self.links)
-        differ = {key_of(link): self._type_check.differences(link, self._types()) for link in links}
+        types = self._types()
+        differ = {key_of(link): self._type_check.differences(link, types) for link in links}
         self._topics.route({key_of(link): link for link in links}, differ)
         versions = {id: member.version for id, member in self.links.members.items()}
         draining = frozenset(link.peer.id for link in links if self.links.draining(link))
@@ -317,11 +318,12 @@ class ClientProxy:
     def _link_reports(self) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
         """Return reports of replicas, including those behind gateways, and of gateways."""
         dispatchers = [service.dispatcher for service in self._services.values()]
+        types = self._types()
         replicas, gateways, behind = [], [], []
         for link in sorted(self.links, key=lambda link: link.peer.id):
             member = self.links.members[link.peer.id]
             report = link_report(
-                *(link, dispatchers, self._type_check.differences(link, self._types())),
+                *(link, dispatchers, self._type_check.differences(link, types)),
                 draining=self.links.draining(link),
                 misread=self._topics.misreads(key_of(link)),
             )

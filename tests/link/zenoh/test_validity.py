@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from fogft.link.zenoh.diagnosis import judged_here, judged_there
 
-DAY = datetime.timedelta(days=1)
-NOW = datetime.datetime(2026, 11, 21, 12, 0, tzinfo=datetime.timezone.utc)
+DAY = 86_400.0
+NOW = datetime.datetime(2026, 11, 21, 12, 0, tzinfo=datetime.timezone.utc).timestamp()
 
 
 def test_a_certificate_of_yesterday_names_both_clocks() -> None:

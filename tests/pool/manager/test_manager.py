@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -45,6 +47,20 @@ def test_manager_brings_up_what_the_file_asks_for(scene: Scene) -> None:
         "replica.key",
         "replica.yaml",
     ]
+
+
+@contextlib.contextmanager
+def on_a_thread(scene: Scene) -> Iterator[threading.Thread]:
+    """Run a manager in this process, where a test can replace parts of it; then stop it."""
+    stop = threading.Event()
+    manager = Manager(scene.store, scene.cloud, keeps_proxy=False)
+    running = threading.Thread(target=manager.run, args=(stop,))
+    running.start()
+    try:
+        yield running
+    finally:
+        stop.set()
+        running.join()
 
 
 def with_a_second_manager(scene: Scene, replicas: int) -> int:
@@ -384,19 +400,12 @@ def test_a_manager_steps_back_from_a_later_import_and_from_no_other(scene: Scene
 def test_no_certificate_is_issued_while_no_thread_can_be_started(scene: Scene) -> None:
     """Each tick tries to launch; status says why none succeeds, until one does."""
     scene.write(replicas=1)
-    stop = threading.Event()
-    manager = Manager(scene.store, scene.cloud, keeps_proxy=False)
-    running = threading.Thread(target=manager.run, args=(stop,))
-    running.start()
-    try:
+    with on_a_thread(scene):
         with no_more():
             scene.wait(lambda: any("TasksMax" in n for n in scene.status().get("notes", [])))
             issued = Ledger(scene.paths.credentials).entries()
             assert Role.REPLICA not in {entry.holder.role for entry in issued}
         scene.wait(lambda: scene.running() == ["0.1"])
-    finally:
-        stop.set()
-        running.join()
 
 
 def test_a_tick_that_fails_keeps_no_lease_from_the_replicas(
@@ -409,15 +418,8 @@ def test_a_tick_that_fails_keeps_no_lease_from_the_replicas(
 
     monkeypatch.setattr(Reconciler, "tick", full)
     scene.write(replicas=1)
-    stop = threading.Event()
-    manager = Manager(scene.store, scene.cloud, keeps_proxy=False)
-    running = threading.Thread(target=manager.run, args=(stop,))
-    running.start()
-    try:
+    with on_a_thread(scene):
         scene.wait(scene.paths.announcements.exists)
-    finally:
-        stop.set()
-        running.join()
 
 
 def test_an_up_beside_a_manager_whose_pool_is_just_over_has_a_manager(
@@ -436,14 +438,7 @@ def test_an_up_beside_a_manager_whose_pool_is_just_over_has_a_manager(
             ups.append(startup.start_manager(scene.store))
 
     monkeypatch.setattr(teardown, "end_machines", ended)
-    stop = threading.Event()
-    manager = Manager(scene.store, scene.cloud, keeps_proxy=False)
-    running = threading.Thread(target=manager.run, args=(stop,))
-    running.start()
-    try:
+    with on_a_thread(scene) as running:
         scene.wait(lambda: scene.running() or not running.is_alive())
         assert scene.running() == ["0.1"]
         assert ups == [False]
-    finally:
-        stop.set()
-        running.join()
